@@ -1,0 +1,68 @@
+# gsbake: everything sets itself up in .venv; nothing but Python 3.11–3.13 is needed beforehand.
+#   make PYTHON=/path/to/python3.12 …   chooses the Python
+#   make DEMO_OUT=… demo                chooses where the demo goes
+
+SHELL := /bin/sh
+VENV := .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.stamp
+IN_RANGE := import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))
+PYTHON ?= $(shell for p in python3.11 python3.12 python3.13 python3 python; do \
+	command -v $$p >/dev/null 2>&1 && $$p -c '$(IN_RANGE)' 2>/dev/null && echo $$p && break; done)
+TORCH := $(shell grep '^torch==' constraints.txt)
+DEMO_OUT ?= out/demo
+
+# The scorer is a program of its own with an environment of its own (Blender as a module needs Python 3.11).
+SCORE_DIR ?= ../shared/score
+SCORE_GT ?= ../shared/captures/boombox/gt
+SCORE_ASSET ?= out/boombox/asset.glb
+SCORE_ARGS ?=
+
+.PHONY: help setup demo test check bench stress score clean
+
+help: ## Show this
+	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 10
+
+setup: $(STAMP) ## Make .venv with exactly the versions in constraints.txt
+
+$(STAMP): pyproject.toml constraints.txt
+	@test -n "$(PYTHON)" || { echo "gsbake needs Python 3.11, 3.12 or 3.13, and none is on the PATH; name one: make PYTHON=/path/to/python3.12" >&2; exit 1; }
+	@"$(PYTHON)" -c '$(IN_RANGE)' || { echo "gsbake needs Python 3.11, 3.12 or 3.13 (xatlas has no wheel for newer ones); $(PYTHON) is `"$(PYTHON)" --version 2>&1`" >&2; exit 1; }
+	@test -x $(BIN)/python || "$(PYTHON)" -m venv $(VENV) || { rm -rf $(VENV); echo "$(PYTHON) cannot make a virtual environment; on Debian: sudo apt-get install python3-venv" >&2; exit 1; }
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt $(TORCH)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[dev]'
+	@touch $@
+
+demo: setup ## Bake the built-in capture with the smallest profile
+	$(BIN)/gsbake synth $(DEMO_OUT)/capture
+	$(BIN)/gsbake run $(DEMO_OUT)/capture --profile smoke --out $(DEMO_OUT)
+	@echo "The asset is $(DEMO_OUT)/asset.glb; open $(DEMO_OUT)/report.html in a browser."
+
+check: setup ## Lint and types
+	$(BIN)/ruff check .
+	$(BIN)/mypy
+
+test: check ## Lint, types and the quick tests
+	$(BIN)/pytest -m "not slow"
+
+stress: setup ## The slow tests: kills at random moments, whole bakes of development captures where they are present
+	$(BIN)/pytest -m slow
+
+bench: setup ## Time the rasteriser
+	$(BIN)/python -m benchmarks.raster
+
+score: .score/.stamp ## Score an asset against its truth: SCORE_GT=capture/gt SCORE_ASSET=asset.glb SCORE_ARGS=--no-render
+	.score/bin/python $(SCORE_DIR)/score.py $(SCORE_GT) $(SCORE_ASSET) $(SCORE_ARGS)
+
+.score/.stamp: $(SCORE_DIR)/requirements.txt
+	@command -v python3.11 >/dev/null || { echo "the scorer needs Python 3.11, because Blender's module does" >&2; exit 1; }
+	python3.11 -m venv .score
+	.score/bin/python -m pip install --quiet --disable-pip-version-check -r $(SCORE_DIR)/requirements.txt
+	@touch $@
+
+$(SCORE_DIR)/requirements.txt:
+	@echo "there is no scorer in $(SCORE_DIR); say where it is: make score SCORE_DIR=…" >&2; exit 1
+
+clean: ## Delete the environments and caches (results in out/ stay)
+	rm -rf $(VENV) .score .mypy_cache .ruff_cache .pytest_cache .hypothesis dist
+	find gsbake stages profiles tests benchmarks -name __pycache__ -type d -prune -exec rm -rf {} +

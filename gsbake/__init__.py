@@ -1,0 +1,3 @@
+"""gsbake: photos in, relightable game-ready asset out."""
+
+__version__ = "0.1.0"

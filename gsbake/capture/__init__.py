@@ -1,0 +1,1 @@
+"""Photos, masks, cameras and structure from motion."""

@@ -1,0 +1,171 @@
+"""Pinhole cameras, the similarity between frames, and their JSON form.
+
+OpenCV axes (x right, y down, z forward), world→camera `R, t`; pixel (i, j) has its centre at (i + .5, j + .5).
+A `CameraSet` also carries the similarity from its frame to the world frame, so that no artifact loses its scale.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+#: OpenCV camera axes → OpenGL camera axes (flip y and z).
+OPENGL = np.diag([1.0, -1.0, -1.0])
+
+
+@dataclass(frozen=True)
+class Similarity:
+    """x_world = scale * rotation @ x + translation."""
+
+    scale: float = 1.0
+    rotation: Array = field(default_factory=lambda: np.eye(3))
+    translation: Array = field(default_factory=lambda: np.zeros(3))
+
+    def apply(self, points: Array) -> Array:
+        """Map points (..., 3) from the inner frame to the outer one."""
+        return self.scale * points @ self.rotation.T + self.translation
+
+    def inverse(self) -> Similarity:
+        """The map from the outer frame back to the inner one."""
+        rot = self.rotation.T
+        return Similarity(1.0 / self.scale, rot, -(rot @ self.translation) / self.scale)
+
+    def then(self, outer: Similarity) -> Similarity:
+        """First self, then `outer`."""
+        return Similarity(outer.scale * self.scale, outer.rotation @ self.rotation, outer.apply(self.translation))
+
+    def matrix(self) -> Array:
+        """The homogeneous (4, 4) matrix."""
+        out = np.eye(4)
+        out[:3, :3] = self.scale * self.rotation
+        out[:3, 3] = self.translation
+        return out
+
+
+@dataclass(frozen=True)
+class Camera:
+    """One photo's camera; `distortion` holds OpenCV coefficients (k1, k2, p1, p2[, k3…]) or is empty for a pinhole."""
+
+    name: str
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    R: Array
+    t: Array
+    distortion: tuple[float, ...] = ()
+
+    @property
+    def centre(self) -> Array:
+        """Camera position (3,) in the frame of the set."""
+        return -self.R.T @ self.t
+
+    @property
+    def K(self) -> Array:
+        """Intrinsic matrix (3, 3) in pixels."""
+        return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1.0]])
+
+    @property
+    def view_direction(self) -> Array:
+        """Unit vector (3,) the camera looks along."""
+        return self.R[2]
+
+    def scaled(self, width: int, height: int) -> Camera:
+        """The same camera for the photo resampled to width x height."""
+        sx, sy = width / self.width, height / self.height
+        return replace(
+            self, width=width, height=height, fx=self.fx * sx, fy=self.fy * sy, cx=self.cx * sx, cy=self.cy * sy
+        )
+
+    def project(self, points: Array) -> tuple[Array, Array]:
+        """Pixels (n, 2) and depths (n,) of points (n, 3), distortion ignored; depth ≤ 0 lies behind the camera."""
+        cam = points @ self.R.T + self.t
+        z = cam[:, 2]
+        safe = np.where(np.abs(z) < 1e-12, 1e-12, z)
+        return np.stack([self.fx * cam[:, 0] / safe + self.cx, self.fy * cam[:, 1] / safe + self.cy], 1), z
+
+    def rays(self) -> Array:
+        """Directions (height, width, 3) in the set's frame through pixel centres, scaled so that depth z = 1."""
+        x = (np.arange(self.width) + 0.5 - self.cx) / self.fx
+        y = (np.arange(self.height) + 0.5 - self.cy) / self.fy
+        grid = np.stack(np.broadcast_arrays(x[None, :], y[:, None], np.ones(())), -1)
+        return grid @ self.R
+
+    def moved(self, frame: Similarity) -> Camera:
+        """The same camera after its frame is mapped by `frame` (inner → outer); depths scale with it."""
+        rot = self.R @ frame.rotation.T
+        centre = frame.apply(self.centre)
+        return replace(self, R=rot, t=-rot @ centre)
+
+    def camera_to_world_opengl(self) -> Array:
+        """The (4, 4) camera-to-world matrix with OpenGL axes, as `transforms.json` stores it."""
+        out = np.eye(4)
+        out[:3, :3] = self.R.T @ OPENGL
+        out[:3, 3] = self.centre
+        return out
+
+    @staticmethod
+    def pose_from_opengl(matrix: Array) -> tuple[Array, Array]:
+        """`R, t` (world→camera, OpenCV axes) from a camera-to-world OpenGL matrix (≥ 3x4)."""
+        rot = (np.asarray(matrix, float)[:3, :3] @ OPENGL).T
+        return rot, -rot @ np.asarray(matrix, float)[:3, 3]
+
+
+@dataclass(frozen=True)
+class CameraSet:
+    """Cameras of one capture in one frame.
+
+    `to_world` maps that frame to the Z-up world frame; `poses` says where they come from ("given" or "solved");
+    `metric` is True when world units are metres.
+    """
+
+    cameras: tuple[Camera, ...]
+    to_world: Similarity = Similarity()
+    poses: str = "given"
+    metric: bool = False
+
+    def save(self, path: Path) -> None:
+        """Write as JSON."""
+        body = {
+            "poses": self.poses,
+            "metric": self.metric,
+            "to_world": {
+                "scale": self.to_world.scale,
+                "rotation": self.to_world.rotation.tolist(),
+                "translation": self.to_world.translation.tolist(),
+            },
+            "cameras": [
+                {k: getattr(c, k) for k in ("name", "width", "height", "fx", "fy", "cx", "cy")}
+                | {"R": c.R.tolist(), "t": c.t.tolist(), "distortion": list(c.distortion)}
+                for c in self.cameras
+            ],
+        }
+        path.write_text(json.dumps(body, indent=1))
+
+    @staticmethod
+    def load(path: Path) -> CameraSet:
+        """Read what `save` wrote."""
+        body = json.loads(path.read_text())
+        sim = body["to_world"]
+        return CameraSet(
+            cameras=tuple(
+                Camera(
+                    **{k: c[k] for k in ("name", "width", "height", "fx", "fy", "cx", "cy")},
+                    R=np.array(c["R"], float),
+                    t=np.array(c["t"], float),
+                    distortion=tuple(c["distortion"]),
+                )
+                for c in body["cameras"]
+            ),
+            to_world=Similarity(sim["scale"], np.array(sim["rotation"], float), np.array(sim["translation"], float)),
+            poses=body["poses"],
+            metric=body["metric"],
+        )

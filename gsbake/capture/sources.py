@@ -1,0 +1,110 @@
+"""Finding the photos, masks and poses that belong to one capture.
+
+The person names one folder; what lies in it by the usual names is taken along. Only names listed here are ever looked at, so that
+reference data kept beside a capture (a `gt/` folder, say) is never read.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from gsbake.pipeline.errors import BadInputError
+
+#: What counts as a photo, by the end of the file name.
+PHOTO_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".exr", ".webp"})
+#: Sub-folders that hold the photos of a capture folder, in the order they are tried.
+PHOTO_FOLDERS = ("images", "photos")
+#: Never taken for photos when a photo folder is read with its sub-folders.
+NOT_PHOTOS = frozenset({"masks", "gt", "sparse", "depths", "depth"})
+_MODEL_FILES = ("cameras.bin", "cameras.txt")
+_MODEL_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse")
+
+
+@dataclass(frozen=True)
+class Sources:
+    """Where a capture's photos lie, and its masks and poses where there are any."""
+
+    photos: Path
+    masks: Path | None = None
+    poses: Path | None = None
+
+
+def list_photos(folder: Path) -> list[Path]:
+    """Photos of a folder, sorted by path; the sub-folders too when the folder is called `images` or `photos`.
+
+    Raises BadInputError when the folder does not exist or holds no photo.
+    """
+    if not folder.is_dir():
+        kind = "is a file, not a folder" if folder.exists() else "does not exist"
+        raise BadInputError(f"The photo folder {folder} {kind}; give the folder that holds the photos.")
+    pattern = "**/*" if folder.name in PHOTO_FOLDERS else "*"
+    found = [
+        path
+        for path in folder.glob(pattern)
+        if path.suffix.lower() in PHOTO_SUFFIXES
+        and not path.name.startswith(".")
+        and not NOT_PHOTOS.intersection(path.relative_to(folder).parts[:-1])
+        and path.is_file()
+    ]
+    if not found:
+        kinds = ", ".join(sorted(s[1:] for s in PHOTO_SUFFIXES))
+        raise BadInputError(f"The folder {folder} holds no photos ({kinds}); give the folder that holds them.")
+    return sorted(found)
+
+
+def is_colmap_model(folder: Path) -> bool:
+    """Whether a folder is a COLMAP sparse model (binary or text)."""
+    return any((folder / name).is_file() for name in _MODEL_FILES)
+
+
+def find_poses(folder: Path) -> Path | None:
+    """The pose file or COLMAP model folder inside `folder`, or None: transforms.json, a sparse model, poses_bounds.npy."""
+    if (folder / "transforms.json").is_file():
+        return folder / "transforms.json"
+    for name in _MODEL_FOLDERS:
+        if is_colmap_model(folder / name):
+            return folder / name
+    if (folder / "poses_bounds.npy").is_file():
+        return folder / "poses_bounds.npy"
+    return None
+
+
+def _given_poses(path: Path) -> Path:
+    """The pose file a person named, which may be the folder around it."""
+    if not path.exists():
+        raise BadInputError(f"The poses {path} do not exist; give a transforms.json, a COLMAP model folder or a poses_bounds.npy.")
+    if path.is_dir():
+        found = path if is_colmap_model(path) else find_poses(path)
+        if found is None:
+            raise BadInputError(f"The folder {path} holds no poses (transforms.json, a COLMAP model or poses_bounds.npy).")
+        return found
+    if path.suffix.lower() not in (".json", ".npy"):
+        raise BadInputError(f"The poses {path} are of no known format; give a transforms.json, a COLMAP model folder or a poses_bounds.npy.")
+    return path
+
+
+def discover(photos: Path, masks: Path | None = None, poses: Path | None = None) -> Sources:
+    """Find what belongs to a capture.
+
+    `photos` is a capture folder (photos in `images/` or `photos/`, beside them `masks/` and poses) or the photo folder itself; then its own
+    `masks/` and poses are taken, else those of its parent. `masks` and `poses` override what is found.
+    Raises BadInputError when a folder named does not exist or there is no photo.
+    """
+    photos, holders = Path(photos), []
+    if photos.is_dir():
+        inner = next((photos / name for name in PHOTO_FOLDERS if (photos / name).is_dir()), None)
+        if inner is not None:
+            photos, holders = inner, [inner, photos]
+        else:
+            holders = [photos, photos.resolve().parent]
+    list_photos(photos)
+    if masks is None:
+        masks = next((h / "masks" for h in holders if (h / "masks").is_dir()), None)
+    elif not Path(masks).is_dir():
+        raise BadInputError(f"The mask folder {masks} does not exist.")
+    if poses is None:
+        poses = next((found for h in holders if (found := find_poses(h)) is not None), None)
+    else:
+        poses = _given_poses(Path(poses))
+    return Sources(photos, None if masks is None else Path(masks), poses)

@@ -1,0 +1,51 @@
+"""The command line. Nothing heavy is imported until a command needs it."""
+
+from __future__ import annotations
+
+import signal
+import sys
+from types import FrameType
+
+
+def main() -> None:
+    """Entry point of `gsbake`: every end has a documented exit code (0, 2, 42, 75; 1 for the unforeseen) and one sentence on stderr."""
+    from gsbake.pipeline.errors import GsbakeError, InterruptedRun
+
+    def interrupted(number: int, frame: FrameType | None) -> None:
+        raise InterruptedRun("Stopped on request; the same command goes on from here.")
+
+    signal.signal(signal.SIGINT, interrupted)
+    signal.signal(signal.SIGTERM, interrupted)
+    try:
+        from gsbake.cli.app import app
+
+        app()
+    except GsbakeError as error:
+        _end(str(error), error.exit_code)
+    except BrokenPipeError:
+        sys.stderr.close()  # the reader of our output went away: nothing is left to say, nor anyone to say it to
+        raise SystemExit(1) from None
+    except Exception as error:
+        _end(_save_traceback(error), 1)
+
+
+def _end(message: str, code: int) -> None:
+    """Say how it ended, as JSON too when that was asked for, and leave."""
+    from rich.console import Console
+
+    if "--json" in sys.argv[1:]:
+        import json
+
+        sys.stdout.write(json.dumps({"error": message, "exit_code": code}, ensure_ascii=False) + "\n")
+    Console(stderr=True, highlight=False, soft_wrap=True).print(f"gsbake: {message}", markup=False)
+    raise SystemExit(code)
+
+
+def _save_traceback(error: Exception) -> str:
+    import tempfile
+    import traceback
+
+    with tempfile.NamedTemporaryFile("w", prefix="gsbake-error-", suffix=".txt", delete=False) as file:
+        file.write("".join(traceback.format_exception(error)))
+    text = " ".join(f"{type(error).__name__}: {error}".split())
+    return f"Something nobody foresaw happened ({text[:300]}); the traceback is in '{file.name}'."

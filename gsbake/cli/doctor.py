@@ -1,0 +1,143 @@
+"""`gsbake doctor`: what is installed, what runs where, what is missing and what to do about it."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import psutil
+import typer
+from rich import box
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from gsbake.cli.wording import size
+from gsbake.pipeline.machine import cpu_name, cuda_devices, default_threads, torch_cuda_build, versions
+
+#: Library (as pip calls it) → module that is imported to see whether it works.
+MODULES = {
+    "numpy": "numpy", "scipy": "scipy", "numba": "numba", "torch": "torch", "pycolmap": "pycolmap", "opencv-contrib-python-headless": "cv2",
+    "OpenImageIO": "OpenImageIO", "scikit-image": "skimage.measure", "trimesh": "trimesh", "pymeshlab": "pymeshlab", "xatlas": "xatlas",
+    "embreex": "embreex", "safetensors": "safetensors", "jinja2": "jinja2",
+}  # fmt: skip
+
+#: Shared library that may be missing → Debian package that brings it.
+DEBIAN = {
+    "libGL.so": "libgl1", "libOpenGL.so": "libopengl0", "libEGL.so": "libegl1", "libGLX.so": "libglx0", "libX11.so": "libx11-6",
+    "libfontconfig.so": "libfontconfig1", "libfreetype.so": "libfreetype6", "libglib-2.0.so": "libglib2.0-0", "libgomp.so": "libgomp1",
+    "libxcb.so": "libxcb1", "libstdc++.so": "libstdc++6",
+}  # fmt: skip
+
+_TIMED_IMPORT = """
+import sys, time, zlib
+start = time.perf_counter()
+__import__(sys.argv[1])
+sys.stdout.write(f"seconds={time.perf_counter() - start}")
+"""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One line of the report; `advice` is empty when all is well."""
+
+    what: str
+    found: str
+    ok: bool
+    advice: str = ""
+
+
+def doctor(as_json: bool, out: Path) -> None:
+    """Print the findings; exit code 1 when something gsbake needs is missing."""
+    findings = [*machine_findings(out), *library_findings()]
+    good = all(f.ok for f in findings)
+    if as_json:
+        typer.echo(json.dumps({"ok": good, "findings": [asdict(f) for f in findings]}, indent=1, ensure_ascii=False))
+    else:
+        table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
+        for column in ("", "what", "found", "what to do"):
+            table.add_column(column, overflow="fold")
+        for f in findings:
+            table.add_row(Text("✓" if f.ok else "✗", style="green" if f.ok else "red"), f.what, f.found, f.advice)
+        Console(highlight=False).print(table)
+    if not good:
+        raise typer.Exit(1)
+
+
+def machine_findings(out: Path) -> list[Finding]:
+    """Python, cores, memory, disk and the backend."""
+    version = ".".join(map(str, sys.version_info[:3]))
+    supported = (3, 11) <= sys.version_info[:2] <= (3, 13)
+    memory = psutil.virtual_memory()
+    place = next(p for p in (out.absolute(), *out.absolute().parents) if p.exists())
+    free = shutil.disk_usage(place).free
+    writable = os.access(place, os.W_OK)
+    return [
+        Finding("Python", version, supported, "" if supported else "use Python 3.11, 3.12 or 3.13"),
+        Finding("processor", f"{cpu_name()}, {default_threads()} cores used", True),
+        Finding(
+            "memory", f"{size(memory.available)} of {size(memory.total)} free", memory.available > 2e9,
+            "" if memory.available > 2e9 else "close other programs: preview needs about 2 GB, relight more",
+        ),
+        Finding(
+            "disk", f"{size(free)} free in {place}{'' if writable else ', not writable'}", writable and free > 2e9,
+            "" if writable and free > 2e9 else "choose another folder with --out, or free 2 GB",
+        ),
+        backend_finding(),
+    ]  # fmt: skip
+
+
+def backend_finding() -> Finding:
+    """Which device `--device auto` takes, and what would bring the other."""
+    build, devices = torch_cuda_build(), cuda_devices()
+    if build is not None and devices:
+        return Finding("backend", f"cuda (torch for CUDA {build}, {devices} GPU)", True)
+    if devices:
+        return Finding("backend", "cpu; a GPU is there, but torch is a CPU build", True, "for the GPU, install a CUDA build of torch")
+    return Finding("backend", "cpu (no NVIDIA GPU)", True)
+
+
+def library_findings() -> list[Finding]:
+    """Import each library in a process of its own, so that one that crashes is found too."""
+    known = versions(tuple(MODULES))
+    with ThreadPoolExecutor(2) as pool:
+        tried = pool.map(_try_import, MODULES.values())
+    findings = []
+    for (library, _), (seconds, error) in zip(MODULES.items(), tried, strict=True):
+        if seconds is not None:
+            findings.append(Finding(library, f"{known.get(library, '?')}, loads in {seconds:.1f} s", True))
+        else:
+            found = f"{known[library]}, does not load: {error}" if library in known else "not installed"
+            findings.append(Finding(library, found, False, advice_for(library, error, installed=library in known)))
+    return findings
+
+
+def advice_for(library: str, error: str, *, installed: bool) -> str:
+    """What to do about a library that does not load."""
+    if not installed:
+        return f"pip install {library} (or run `make setup` again)"
+    missing = re.search(r"(lib[\w.+-]+?\.so)[.\d]*: cannot open shared object file", error)
+    if missing:
+        package = DEBIAN.get(missing.group(1))
+        return f"sudo apt-get install {package}" if package else f"install the system library {missing.group(1)}"
+    return f"pip install --force-reinstall {library}"
+
+
+def _try_import(module: str) -> tuple[float | None, str]:
+    """Seconds the import takes, or None and the last line of its error."""
+    try:
+        done = subprocess.run([sys.executable, "-c", _TIMED_IMPORT, module], capture_output=True, text=True, timeout=120, check=False)
+    except subprocess.TimeoutExpired:
+        return None, "importing it takes more than two minutes"
+    found = re.search(r"seconds=([\d.]+)", done.stdout)
+    if done.returncode == 0 and found:
+        return float(found.group(1)), ""
+    lines = done.stderr.strip().splitlines()
+    return None, lines[-1] if lines else f"exit code {done.returncode}"

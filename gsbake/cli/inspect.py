@@ -1,0 +1,150 @@
+"""`gsbake status`, `explain` and `profiles`: what is there, what would run, and why."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import typer
+from rich import box
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from gsbake.cli.options import Options
+from gsbake.cli.session import Session, open_session
+from gsbake.cli.wording import duration, figures, size
+from gsbake.pipeline.plan import StageState
+from gsbake.profile.load import LoadedProfile, bounds, fields, load_profile, shipped
+
+_WORDS = {"cached": "cached", "replaced": "by hand", "run": "will run", "waits": "will run"}
+_STYLES = {"cached": "green", "replaced": "cyan", "run": "yellow", "waits": "yellow"}
+
+
+def _table(*columns: str) -> Table:
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
+    for column in columns:
+        table.add_column(column, overflow="fold")
+    return table
+
+
+def print_plan(states: list[StageState]) -> None:
+    """A table of the stages: state, time, memory and why."""
+    table = _table("stage", "state", "time", "memory", "why, or what came out")
+    for state in states:
+        manifest = state.artifact.manifest if state.artifact is not None else None
+        table.add_row(
+            state.name,
+            Text(_WORDS[state.status], style=_STYLES[state.status]),
+            duration(manifest["seconds"]) if manifest else "",
+            size(manifest["peak_bytes"]) if manifest else "",
+            Text(figures(manifest["results"]) if manifest and state.status == "cached" else "; ".join(state.reasons)),
+        )
+    Console(highlight=False).print(table)
+
+
+def plan_document(session: Session, states: list[StageState]) -> dict[str, Any]:
+    """The plan as JSON."""
+    return {
+        "out": str(session.out),
+        "profile": session.profile.name,
+        "stages": [
+            {
+                "name": state.name,
+                "status": state.status,
+                "will_run": state.artifact is None,
+                "reasons": list(state.reasons),
+                "key": state.ingredients.key if state.ingredients is not None else None,
+                "folder": str(state.artifact.folder) if state.artifact is not None else None,
+                "settings": dict(state.settings),
+                "inputs": dict(state.ingredients.inputs) if state.ingredients is not None else {},
+                "results": state.artifact.manifest.get("results", {}) if state.artifact is not None else {},
+            }
+            for state in states
+        ],
+    }
+
+
+def status(options: Options) -> None:
+    """Print the state of every stage."""
+    session = open_session(options)
+    states = session.engine.plan()
+    if options.as_json:
+        typer.echo(json.dumps(plan_document(session, states), indent=1, ensure_ascii=False))
+        return
+    project = session.project
+    if not options.quiet:
+        typer.echo(f"{session.out}: photos {project.photos}, profile {project.profile} {' '.join(project.overrides)}".rstrip())
+    print_plan(states)
+
+
+def explain(options: Options, stage: str | None) -> None:
+    """Print for one stage, or all, what its key is made of and why it would run."""
+    session = open_session(options)
+    session.engine.registry.up_to(stage)  # says so when there is no such stage
+    states = [s for s in session.engine.plan(stage) if stage is None or s.name == stage]
+    if options.as_json:
+        typer.echo(json.dumps(plan_document(session, states), indent=1, ensure_ascii=False))
+        return
+    console = Console(highlight=False, soft_wrap=True)
+    origins = session.profile.origins
+    for state in states:
+        console.print(Text(f"{state.name}: {_WORDS[state.status]}", style=f"bold {_STYLES[state.status]}"))
+        for reason in state.reasons:
+            console.print(Text(f"  because {reason}"))
+        if state.artifact is not None:
+            console.print(Text(f"  in {state.artifact.folder}"))
+        if state.ingredients is not None:
+            what = state.ingredients
+            console.print(Text(f"  key {what.key[:16]} from stage version {what.version}"))
+            for name, digest in what.inputs.items():
+                console.print(Text(f"    input {name}: content {digest[:16]}"))
+            if what.backend is not None:
+                console.print(Text(f"    device {what.backend}"))
+            if what.seed is not None:
+                console.print(Text(f"    seed {what.seed}"))
+        for name, value in state.settings.items():
+            console.print(Text(f"    {name} = {value}  ({origins[name]})"))
+
+
+def list_profiles(as_json: bool) -> None:
+    """Print the profiles that come with gsbake."""
+    found = {name: load_profile(name).profile.description for name in shipped()}
+    if as_json:
+        typer.echo(json.dumps(found, indent=1, ensure_ascii=False))
+        return
+    table = _table("profile", "what for")
+    for name, description in found.items():
+        table.add_row(name, description)
+    Console(highlight=False).print(table)
+
+
+def show_profile(name: str, overrides: list[str], as_json: bool) -> None:
+    """Print every setting of a profile with its value, where that comes from, and its help."""
+    loaded = load_profile(name, overrides)
+    values = setting_values(loaded)
+    known = fields()
+    if as_json:
+        document = {
+            key: {"value": value, "origin": loaded.origins[key], "allowed": bounds(known[key]), "help": known[key].description}
+            for key, value in values.items()
+        }
+        typer.echo(json.dumps(document, indent=1, ensure_ascii=False))
+        return
+    table = _table("setting", "value", "from", "help")
+    for key, value in values.items():
+        allowed = bounds(known[key])
+        text = f"{known[key].description}{f' ({allowed})' if allowed else ''}"
+        table.add_row(key, json.dumps(value, ensure_ascii=False), loaded.origins[key], text)
+    Console(highlight=False).print(table)
+
+
+def setting_values(loaded: LoadedProfile) -> dict[str, Any]:
+    """{"section.key": value} of all settings."""
+    body = loaded.profile.model_dump(mode="json")
+    out = {}
+    for key in fields():
+        section, dot, name = key.partition(".")
+        if dot:
+            out[key] = body[section][name]
+    return out

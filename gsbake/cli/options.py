@@ -1,0 +1,100 @@
+"""The options that commands share, once each."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+class Device(StrEnum):
+    """Where heavy kernels run."""
+
+    auto = "auto"
+    cpu = "cpu"
+    cuda = "cuda"
+
+
+def complete_profile(incomplete: str) -> list[str]:
+    """Shell completion of profile names."""
+    from gsbake.profile.load import shipped
+
+    return [name for name in shipped() if name.startswith(incomplete)]
+
+
+def complete_setting(incomplete: str) -> list[str]:
+    """Shell completion of section.key=."""
+    from gsbake.profile.load import fields
+
+    return [f"{name}=" for name in fields() if "." in name and name.startswith(incomplete)]
+
+
+def complete_stage(incomplete: str) -> list[str]:
+    """Shell completion of stage names."""
+    from stages import REGISTRY
+
+    return [name for name in REGISTRY.names if name.startswith(incomplete)]
+
+
+PhotosArgument = Annotated[
+    Path | None,
+    typer.Argument(
+        metavar="PHOTOS",
+        help="Folder of photos, or a capture folder with images/, masks/ and poses. Needed the first time only.",
+        show_default=False,
+    ),
+]
+OutOption = Annotated[
+    Path | None, typer.Option("--out", "-o", metavar="DIR", help="Output folder.  [default: out/<name of PHOTOS>]", show_default=False)
+]
+ProfileOption = Annotated[
+    str | None,
+    typer.Option(
+        "--profile", "-p", metavar="NAME|FILE", help="Profile (see `gsbake profiles`).  [default: relight]", show_default=False,
+        autocompletion=complete_profile,
+    ),
+]  # fmt: skip
+SetOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--set", metavar="SECTION.KEY=VALUE", help="Change one setting; repeatable.", show_default=False, autocompletion=complete_setting
+    ),
+]
+MasksOption = Annotated[
+    Path | None, typer.Option("--masks", metavar="DIR", help="Masks, one per photo, white where the object is.", show_default=False)
+]
+PosesOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--poses", metavar="PATH", help="Known poses: transforms.json, a COLMAP model folder or poses_bounds.npy.", show_default=False
+    ),
+]
+InvertOption = Annotated[bool, typer.Option("--invert-masks", help="Masks are white where the background is.")]
+DeviceOption = Annotated[Device, typer.Option("--device", help="Where heavy kernels run.")]
+ThreadsOption = Annotated[int, typer.Option("--threads", min=0, help="Threads; 0 takes the physical cores.", show_default=False)]
+SeedOption = Annotated[int | None, typer.Option("--seed", help="Seed of everything random.  [default: 0]", show_default=False)]
+DryRunOption = Annotated[bool, typer.Option("--dry-run", "-n", help="Say what would be done, and why; do nothing.")]
+QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="Say nothing but warnings and errors.")]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON document instead of text.")]
+
+
+@dataclass(frozen=True)
+class Options:
+    """The shared options of one call."""
+
+    photos: Path | None = None
+    out: Path | None = None
+    profile: str | None = None
+    overrides: list[str] = field(default_factory=list)
+    masks: Path | None = None
+    poses: Path | None = None
+    invert_masks: bool = False
+    device: str = "auto"
+    threads: int = 0
+    seed: int | None = None
+    dry_run: bool = False
+    quiet: bool = False
+    as_json: bool = False

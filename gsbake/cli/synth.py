@@ -1,0 +1,32 @@
+"""`gsbake synth`: writes the built-in capture."""
+
+from __future__ import annotations
+
+import json
+import time
+from pathlib import Path
+
+import typer
+
+from gsbake.cli.wording import duration
+from gsbake.pipeline.errors import BadInputError
+from gsbake.pipeline.files import disk_error
+
+
+def synth(
+    folder: Path, *, views: int, size: int, seed: int, poses: bool, background: bool, dry_run: bool, quiet: bool, as_json: bool
+) -> None:
+    """Write the capture and say where it is."""
+    start = time.perf_counter()
+    if not dry_run:
+        from gsbake.synth.capture import write_capture
+
+        try:
+            write_capture(folder, views=views, size=size, seed=seed, poses=poses, background=background)
+        except OSError as error:
+            raise disk_error(error, folder) or BadInputError(f"The capture cannot be written to '{folder}': {error.strerror}.") from error
+    if as_json:
+        typer.echo(json.dumps({"folder": str(folder), "views": views, "size": size, "seed": seed, "written": not dry_run}))
+    elif not quiet:
+        done = "would be written" if dry_run else f"written in {duration(time.perf_counter() - start)}"
+        typer.echo(f"{folder}: {views} photos of {size} × {size} pixels {done}")

@@ -1,0 +1,1 @@
+"""The GLB file: writer, tangents, audit."""

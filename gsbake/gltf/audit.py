@@ -1,0 +1,188 @@
+"""The asset checked against the rules gsbake keeps for its own output.
+
+Rules of severity "error" must hold or the export fails; "warning" is told to the person; "info" is for the record. They follow the glTF 2.0
+specification, the Khronos *3D Commerce Asset Creation Guidelines 1.0* and what the Khronos validator reports, and are read from the bytes
+of the finished file, not from what the writer meant to write.
+"""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import asdict, dataclass
+from typing import Any, Literal
+
+import numpy as np
+
+from gsbake.gltf.read import GltfAsset, parse_glb
+from gsbake.pipeline.errors import BadInputError
+from gsbake.texture.texels import overlapping
+
+Severity = Literal["error", "warning", "info"]
+
+#: Usual edge of a texture, in texels.
+USUAL_SIZES = (512, 2048)
+#: sRGB codes a real surface's base colour lies within.
+PLAUSIBLE_COLOUR = (30, 243)
+#: Resolution at which overlaps of the UV layout are looked for.
+OVERLAP_SIZE = 2048
+#: Share of that many texels which may overlap, for rounding at shared edges.
+OVERLAP_SHARE = 1e-5
+#: PNG chunks that make viewers disagree about colour.
+COLOUR_CHUNKS = ("gAMA", "iCCP", "cHRM", "sRGB")
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One rule and whether it holds."""
+
+    rule: str
+    passed: bool
+    detail: str
+    severity: Severity
+
+
+def audit(data: bytes, name: str, max_megabytes: float, max_triangles: int) -> list[Finding]:
+    """Check the bytes of a GLB; `name` is for messages. A file that cannot be read at all gives one failed finding."""
+    try:
+        asset = parse_glb(data, name)
+    except BadInputError as error:
+        return [Finding("readable GLB", False, str(error), "error")]
+    found: list[Finding] = []
+
+    def check(rule: str, passed: bool, detail: str, severity: Severity = "error") -> None:
+        found.append(Finding(rule, bool(passed), detail, severity))
+
+    check("readable GLB", True, f"glTF {asset.document['asset'].get('version')}, {len(data)} bytes")
+    _structure(asset, check)
+    _geometry(asset, check, max_triangles)
+    _layout(asset, check)
+    _images(asset, check)
+    megabytes = len(data) / 1e6
+    check("file size", megabytes <= max_megabytes, f"{megabytes:.2f} MB of {max_megabytes:g} MB", "warning")
+    return found
+
+
+def failed(findings: list[Finding]) -> list[Finding]:
+    """The findings of severity "error" that do not hold."""
+    return [f for f in findings if not f.passed and f.severity == "error"]
+
+
+def as_json(findings: list[Finding]) -> list[dict[str, Any]]:
+    """Findings as JSON-able records."""
+    return [asdict(f) for f in findings]
+
+
+def _structure(asset: GltfAsset, check: Any) -> None:
+    """Document: version, one mesh and material, self-contained, buffer views in order."""
+    document = asset.document
+    head = document["asset"]
+    check("glTF version", head.get("version") == "2.0", f"version {head.get('version')}")
+    check("generator", bool(head.get("generator")), str(head.get("generator", "none")), "warning")
+    scale = head.get("extras", {}).get("scale")
+    check("scale is stated", scale in ("metres", "unknown"), f"asset.extras.scale = {scale}", "warning")
+    counts = {key: len(document.get(key, [])) for key in ("meshes", "materials", "scenes", "buffers")}
+    primitives = sum(len(m["primitives"]) for m in document["meshes"])
+    check("one mesh, one material", counts["meshes"] == counts["materials"] == primitives == 1, f"{counts}, {primitives} primitives")
+    outside = [x for key in ("buffers", "images") for x in document.get(key, []) if "uri" in x]
+    check("self-contained", not outside, f"{len(outside)} outside references")
+    extensions = document.get("extensionsRequired", [])
+    check("no required extensions", not extensions, ", ".join(extensions) or "none")
+    material = document["materials"][0] if document.get("materials") else {}
+    check("opaque", material.get("alphaMode", "OPAQUE") == "OPAQUE", f"alphaMode {material.get('alphaMode', 'OPAQUE')}")
+    end, aligned, total = 0, True, document["buffers"][0]["byteLength"]
+    for view in document["bufferViews"]:
+        start = view.get("byteOffset", 0)
+        aligned = aligned and start % 4 == 0 and start >= end
+        end = start + view["byteLength"]
+    check("buffer views aligned", aligned and end <= total, f"{len(document['bufferViews'])} views, {end} of {total} bytes")
+
+
+def _geometry(asset: GltfAsset, check: Any, max_triangles: int) -> None:
+    """Attributes: finite, unit length, in range, bounds as stated."""
+    attributes, faces = asset.attributes, asset.faces
+    missing = [k for k in ("POSITION", "NORMAL", "TEXCOORD_0") if k not in attributes]
+    if "normal" in asset.roles and "TANGENT" not in attributes:
+        missing.append("TANGENT")
+    check("attributes present", not missing, "missing: " + ", ".join(missing) if missing else ", ".join(attributes))
+    check("triangle count", 0 < len(faces) <= max_triangles, f"{len(faces)} of at most {max_triangles}")
+    position = attributes["POSITION"]
+    check("finite values", all(np.isfinite(a).all() for a in attributes.values()), f"{len(position)} vertices")
+    in_range = len(faces) > 0 and faces.min() >= 0 and faces.max() < len(position)
+    check("indices in range", in_range, f"{len(faces)} triangles, {len(position)} vertices")
+    accessor = asset.document["accessors"][asset.document["meshes"][0]["primitives"][0]["attributes"]["POSITION"]]
+    bounds = np.array([accessor.get("min", [np.nan] * 3), accessor.get("max", [np.nan] * 3)], np.float32)
+    check("POSITION bounds", np.array_equal(bounds, np.stack([position.min(0), position.max(0)])), f"{bounds.tolist()}")
+    if in_range:
+        corner = position[faces].astype(np.float64)
+        area = np.linalg.norm(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=1)
+        check("no degenerate triangles", (area > 0).all(), f"{int((area <= 0).sum())} without area", "warning")
+    if "NORMAL" in attributes:
+        off = float(np.abs(np.linalg.norm(attributes["NORMAL"], axis=1) - 1).max())
+        check("unit normals", off < 5e-4, f"off by at most {off:.1e}")
+    if "TANGENT" in attributes and "NORMAL" in attributes:
+        tangent = attributes["TANGENT"].astype(np.float64)
+        off = float(np.abs(np.linalg.norm(tangent[:, :3], axis=1) - 1).max())
+        check("unit tangents", off < 5e-4 and bool((np.abs(tangent[:, 3]) == 1).all()), f"off by at most {off:.1e}; w is ±1")
+        lean = float(np.abs(np.einsum("nd,nd->n", tangent[:, :3], attributes["NORMAL"].astype(np.float64))).max())
+        check("tangents in the surface", lean < 1e-2, f"cosine to the normal at most {lean:.1e}")
+
+
+def _layout(asset: GltfAsset, check: Any) -> None:
+    """UVs: in the unit square, no mirrored and no overlapping triangles."""
+    if "TEXCOORD_0" not in asset.attributes or asset.faces.max(initial=-1) >= len(asset.attributes["TEXCOORD_0"]):
+        return
+    uv, faces = asset.attributes["TEXCOORD_0"].astype(np.float64), asset.faces
+    check("UVs in 0..1", uv.min() >= 0 and uv.max() <= 1, f"{uv.min():.4f}..{uv.max():.4f}")
+    a, b, c = (uv[faces[:, k]] for k in range(3))
+    # v points downwards, so triangles that turn left on the surface have negative area here.
+    area = 0.5 * ((b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (c[:, 0] - a[:, 0]) * (b[:, 1] - a[:, 1]))
+    flipped = int((area > 1e-12).sum())
+    check("no mirrored UVs", flipped == 0, f"{flipped} of {len(faces)} triangles")
+    shared = overlapping(uv, faces, OVERLAP_SIZE)
+    check("no overlapping UVs", shared <= OVERLAP_SHARE * OVERLAP_SIZE**2, f"{shared} of {OVERLAP_SIZE}² texels")
+    check("UV space used", True, f"{np.abs(area).sum():.0%} of the square", "info")
+
+
+def _images(asset: GltfAsset, check: Any) -> None:
+    """Textures: PNG of a power of two without colour chunks; packing; plausible values."""
+    check("textures present", {"base_color", "orm"} <= set(asset.roles), ", ".join(asset.roles))
+    check("occlusion packed with roughness", asset.roles.get("occlusion") in (None, asset.roles.get("orm")), "one image")
+    for role in ("base_color", "orm", "normal"):
+        if role not in asset.roles:
+            continue
+        content = asset.images[asset.roles[role]]
+        chunks = png_chunks(content)
+        if not chunks:
+            check(f"{role}: PNG", False, "not a PNG file")
+            continue
+        width, height, depth, kind = struct.unpack_from(">IIBB", content, 16)
+        check(f"{role}: 8-bit RGB PNG", depth == 8 and kind == 2, f"{width}x{height}, {depth} bits, colour type {kind}")
+        power = width == height and width & (width - 1) == 0
+        check(f"{role}: square power of two", power, f"{width}x{height}")
+        check(f"{role}: usual size", USUAL_SIZES[0] <= width <= USUAL_SIZES[1], f"{width} texels", "info")
+        colour = [c for c in chunks if c in COLOUR_CHUNKS]
+        check(f"{role}: no colour chunks", not colour, ", ".join(colour) or "none")
+        pixels = asset.image(role)
+        if pixels is None:
+            continue
+        if role == "base_color":
+            outside = float(((pixels < PLAUSIBLE_COLOUR[0]) | (pixels > PLAUSIBLE_COLOUR[1])).mean())
+            check("base colour within 30..243", outside < 0.05, f"{outside:.1%} of the values outside", "info")
+        if role == "normal":
+            length = np.linalg.norm(pixels / 127.5 - 1, axis=2)
+            off = float((np.abs(length - 1) > 0.1).mean())
+            check("normal map of unit vectors", off < 0.02, f"{off:.2%} of the texels off by more than 0.1")
+            inward = float((pixels[..., 2] < 128).mean())
+            check("normal map points outwards", inward < 0.001, f"{inward:.2%} of the texels")
+
+
+def png_chunks(content: bytes) -> list[str]:
+    """Names of a PNG's chunks in order; empty when it is no whole PNG."""
+    if content[:8] != b"\x89PNG\r\n\x1a\n":
+        return []
+    names, at = [], 8
+    while at + 8 <= len(content):
+        size = struct.unpack_from(">I", content, at)[0]
+        names.append(content[at + 4 : at + 8].decode("latin-1"))
+        at += 12 + size
+    return names if names and names[-1] == "IEND" and at == len(content) else []

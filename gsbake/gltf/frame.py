@@ -1,0 +1,58 @@
+"""The asset's own frame: glTF's right-handed +Y up, and where the origin lies.
+
+World is Z-up; (x, y, z) becomes (x, z, −y), so Blender's front (−Y) becomes glTF's (+Z). Poses that came with the photos keep their origin;
+solved ones have none worth keeping, so the origin moves to the bottom centre of the object.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gsbake.capture.cameras import CameraSet, Similarity
+
+#: World (Z-up) to glTF (Y-up).
+Y_UP = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
+
+
+def asset_frame(cameras: CameraSet, position: NDArray[Any]) -> Similarity:
+    """The map from the unit frame of `cameras` to the asset's frame; `position` (v, 3) is the mesh in the unit frame."""
+    to_gltf = cameras.to_world.then(Similarity(1.0, Y_UP, np.zeros(3)))
+    if cameras.poses == "given":
+        return to_gltf
+    placed = to_gltf.apply(np.asarray(position, np.float64))
+    low, high = placed.min(0), placed.max(0)
+    origin = np.array([(low[0] + high[0]) / 2, low[1], (low[2] + high[2]) / 2])
+    return to_gltf.then(Similarity(1.0, np.eye(3), -origin))
+
+
+def transforms_json(cameras: CameraSet, frame: Similarity, sources: dict[str, str]) -> dict[str, Any]:
+    """nerfstudio's `transforms.json` with the cameras in the asset's frame.
+
+    `frame` maps the cameras' frame to the asset's; `sources` gives the file name of each photo by its name in the set. Matrices are
+    camera to asset with OpenGL axes; intrinsics stand in every frame.
+    """
+    frames = []
+    for camera in cameras.cameras:
+        moved = camera.moved(frame)
+        frames.append(
+            {
+                "file_path": sources.get(camera.name, camera.name),
+                "w": camera.width,
+                "h": camera.height,
+                "fl_x": camera.fx,
+                "fl_y": camera.fy,
+                "cx": camera.cx,
+                "cy": camera.cy,
+                "transform_matrix": moved.camera_to_world_opengl().tolist(),
+            }
+        )
+    return {
+        "camera_model": "PINHOLE",
+        "frame": "glTF: right-handed, +Y up; OpenGL camera axes; intrinsics of the undistorted photos",
+        "scale": "metres" if cameras.metric else "unknown",
+        "poses": cameras.poses,
+        "frames": frames,
+    }

@@ -1,0 +1,102 @@
+"""A small reader of GLB files, for the report and the audit: the first mesh primitive, its material and its images.
+
+Reads any GLB with float attributes and embedded images; it is no general glTF library.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from gsbake.gltf.container import unpack_glb
+from gsbake.pipeline.errors import BadInputError
+
+COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
+
+
+@dataclass(frozen=True)
+class GltfAsset:
+    """A GLB taken apart.
+
+    `attributes` maps names ("POSITION", …) to arrays (v, k); `faces` (f, 3) int64; `images` holds the encoded bytes of each image and
+    `roles` the image index of each texture role of the material ("base_color", "orm", "occlusion", "normal"; absent roles are left out).
+    """
+
+    document: dict[str, Any]
+    attributes: dict[str, NDArray[Any]]
+    faces: NDArray[np.int64]
+    images: tuple[bytes, ...]
+    roles: dict[str, int]
+    size: int
+
+    def image(self, role: str) -> NDArray[np.uint8] | None:
+        """Pixels (h, w, 3) RGB of a role's image as stored, or None when the material has none."""
+        if role not in self.roles:
+            return None
+        pixels = cv2.imdecode(np.frombuffer(self.images[self.roles[role]], np.uint8), cv2.IMREAD_COLOR)
+        if pixels is None:
+            raise BadInputError(f"The {role} image of the asset cannot be decoded; export it again.")
+        return np.ascontiguousarray(pixels[..., ::-1], np.uint8)
+
+
+def read_glb(path: Path) -> GltfAsset:
+    """Read a GLB. Raises BadInputError when it is damaged or holds no triangle mesh."""
+    return parse_glb(path.read_bytes(), str(path))
+
+
+def parse_glb(data: bytes, name: str) -> GltfAsset:
+    """Read the bytes of a GLB; `name` is for messages."""
+    document, binary = unpack_glb(data, name)
+    try:
+        primitive = document["meshes"][0]["primitives"][0]
+        attributes = {key: _accessor(document, binary, index) for key, index in primitive["attributes"].items()}
+        if "indices" in primitive:
+            faces = _accessor(document, binary, primitive["indices"]).astype(np.int64).reshape(-1, 3)
+        else:
+            faces = np.arange(len(attributes["POSITION"])).reshape(-1, 3)
+        images = tuple(_view(document, binary, image["bufferView"]) for image in document.get("images", []))
+        material = document.get("materials", [{}])[primitive.get("material", 0)]
+        roles = _roles(document, material)
+    except (KeyError, IndexError, ValueError, TypeError) as error:
+        raise BadInputError(f"{name} holds no readable triangle mesh ({error!r}); export it again.") from error
+    return GltfAsset(document, attributes, faces, images, roles, len(data))
+
+
+def _view(document: dict[str, Any], binary: bytes, index: int) -> bytes:
+    view = document["bufferViews"][index]
+    start = view.get("byteOffset", 0)
+    content = binary[start : start + view["byteLength"]]
+    if len(content) != view["byteLength"]:
+        raise ValueError(f"buffer view {index} ends after the binary chunk")
+    return content
+
+
+def _accessor(document: dict[str, Any], binary: bytes, index: int) -> NDArray[Any]:
+    """An accessor's values (count, width), or (count,) for scalars; interleaved views are resolved."""
+    accessor = document["accessors"][index]
+    kind, width, count = np.dtype(COMPONENTS[accessor["componentType"]]), WIDTHS[accessor["type"]], accessor["count"]
+    content = _view(document, binary, accessor["bufferView"])
+    stride = document["bufferViews"][accessor["bufferView"]].get("byteStride", kind.itemsize * width)
+    start = accessor.get("byteOffset", 0)
+    if start + stride * (count - 1) + kind.itemsize * width > len(content):
+        raise ValueError(f"accessor {index} ends after its buffer view")
+    values = np.ndarray((count, width), kind, content, start, (stride, kind.itemsize)).copy()
+    return values[:, 0] if width == 1 else values
+
+
+def _roles(document: dict[str, Any], material: dict[str, Any]) -> dict[str, int]:
+    """Image index of each texture role."""
+    surface = material.get("pbrMetallicRoughness", {})
+    found = {
+        "base_color": surface.get("baseColorTexture"),
+        "orm": surface.get("metallicRoughnessTexture"),
+        "occlusion": material.get("occlusionTexture"),
+        "normal": material.get("normalTexture"),
+    }
+    return {role: document["textures"][texture["index"]]["source"] for role, texture in found.items() if texture is not None}

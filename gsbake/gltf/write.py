@@ -1,0 +1,127 @@
+"""A small writer of the one kind of glTF file gsbake makes: one mesh, one material, three textures, one GLB.
+
+trimesh and others cannot write TANGENT, and bytes that depend only on the input make assets comparable by digest.
+
+glTF 2.0 specification, sections 3.6 (buffers, accessors), 3.7 (meshes), 3.9 (materials).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gsbake.gltf.container import pack_glb
+
+FLOAT, UNSIGNED_SHORT, UNSIGNED_INT = 5126, 5123, 5125
+ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER = 34962, 34963
+LINEAR, LINEAR_MIPMAP_LINEAR, CLAMP = 9729, 9987, 33071
+
+
+@dataclass(frozen=True)
+class GltfMesh:
+    """Triangles in the glTF frame (+Y up).
+
+    `position` (v, 3), unit `normal` (v, 3), `tangent` (v, 4), `uv` (v, 2) with the origin at the top left, `faces` (f, 3).
+    """
+
+    position: NDArray[np.float32]
+    normal: NDArray[np.float32]
+    tangent: NDArray[np.float32]
+    uv: NDArray[np.float32]
+    faces: NDArray[np.int32]
+
+
+@dataclass(frozen=True)
+class GltfImages:
+    """Encoded PNG files: base colour (sRGB), occlusion-roughness-metallic and normal map (both linear; the normal map may be absent)."""
+
+    base_color: bytes
+    orm: bytes
+    normal: bytes | None
+
+
+@dataclass
+class _Buffer:
+    """The growing binary chunk with its views and accessors."""
+
+    data: bytearray = field(default_factory=bytearray)
+    views: list[dict[str, Any]] = field(default_factory=list)
+    accessors: list[dict[str, Any]] = field(default_factory=list)
+
+    def view(self, content: bytes, target: int | None = None) -> int:
+        """Append bytes at a multiple of four; returns the index of their buffer view."""
+        self.data += b"\0" * (-len(self.data) % 4)
+        entry: dict[str, Any] = {"buffer": 0, "byteOffset": len(self.data), "byteLength": len(content)}
+        if target is not None:
+            entry["target"] = target
+        self.data += content
+        self.views.append(entry)
+        return len(self.views) - 1
+
+    def accessor(self, values: NDArray[Any], kind: str, component: int, target: int, bounds: bool = False) -> int:
+        """Append an array as an accessor of its own view; returns its index."""
+        entry: dict[str, Any] = {
+            "bufferView": self.view(values.tobytes(), target),
+            "componentType": component,
+            "count": int(values.size if kind == "SCALAR" else len(values)),
+            "type": kind,
+        }
+        if bounds:
+            columns = values.reshape(len(values), -1)
+            entry |= {"min": [x.item() for x in columns.min(0)], "max": [x.item() for x in columns.max(0)]}
+        self.accessors.append(entry)
+        return len(self.accessors) - 1
+
+
+def build_glb(
+    mesh: GltfMesh, images: GltfImages, name: str, generator: str, copyright_line: str = "", extras: dict[str, Any] | None = None
+) -> bytes:
+    """The bytes of the asset. Raises ValueError when the mesh is empty or its arrays do not fit together."""
+    count = len(mesh.position)
+    if len(mesh.faces) == 0 or not (len(mesh.normal) == len(mesh.tangent) == len(mesh.uv) == count):
+        raise ValueError("the mesh is empty or its attributes differ in length")
+    buffer = _Buffer()
+    attributes = {
+        "POSITION": buffer.accessor(np.ascontiguousarray(mesh.position, "<f4"), "VEC3", FLOAT, ARRAY_BUFFER, bounds=True),
+        "NORMAL": buffer.accessor(np.ascontiguousarray(mesh.normal, "<f4"), "VEC3", FLOAT, ARRAY_BUFFER),
+        "TANGENT": buffer.accessor(np.ascontiguousarray(mesh.tangent, "<f4"), "VEC4", FLOAT, ARRAY_BUFFER),
+        "TEXCOORD_0": buffer.accessor(np.ascontiguousarray(mesh.uv, "<f4"), "VEC2", FLOAT, ARRAY_BUFFER),
+    }
+    # 65535 is the primitive-restart value of 16-bit indices and may not be used.
+    component, width = (UNSIGNED_SHORT, "<u2") if count < 65535 else (UNSIGNED_INT, "<u4")
+    indices = buffer.accessor(np.ascontiguousarray(mesh.faces, width).ravel(), "SCALAR", component, ELEMENT_ARRAY_BUFFER)
+    pictures: list[dict[str, Any]] = []
+    material: dict[str, Any] = {
+        "name": name,
+        "pbrMetallicRoughness": {"baseColorTexture": {"index": 0}, "metallicRoughnessTexture": {"index": 1}},
+        "occlusionTexture": {"index": 1},
+        "alphaMode": "OPAQUE",
+    }
+    for label, content in (("base_color", images.base_color), ("orm", images.orm), ("normal", images.normal)):
+        if content is not None:
+            pictures.append({"name": label, "mimeType": "image/png", "bufferView": buffer.view(content)})
+    if images.normal is not None:
+        material["normalTexture"] = {"index": 2}
+    asset: dict[str, Any] = {"version": "2.0", "generator": generator}
+    if copyright_line:
+        asset["copyright"] = copyright_line
+    if extras:
+        asset["extras"] = extras
+    document = {
+        "asset": asset,
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"name": name, "mesh": 0}],
+        "meshes": [{"name": name, "primitives": [{"attributes": attributes, "indices": indices, "material": 0, "mode": 4}]}],
+        "materials": [material],
+        "textures": [{"sampler": 0, "source": k} for k in range(len(pictures))],
+        "samplers": [{"magFilter": LINEAR, "minFilter": LINEAR_MIPMAP_LINEAR, "wrapS": CLAMP, "wrapT": CLAMP}],
+        "images": pictures,
+        "accessors": buffer.accessors,
+        "bufferViews": buffer.views,
+        "buffers": [{"byteLength": len(buffer.data) + -len(buffer.data) % 4}],
+    }
+    return pack_glb(document, bytes(buffer.data))

@@ -1,0 +1,1 @@
+"""Environment light and split-sum shading."""

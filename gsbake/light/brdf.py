@@ -1,0 +1,78 @@
+"""The split-sum table: directional albedo of GGX as scale and bias of F0.
+
+Karis, *Real Shading in Unreal Engine 4*, 2013: with Schlick's Fresnel term, ∫ f (n·l) dl = F0·A(n·v, roughness) + B(n·v, roughness). Here
+the microfacet model is the one of the glTF specification and of Cycles: GGX with α = roughness² and the height-correlated Smith term
+
+    G2/G1(v) = n·l (n·v + Λ_v) / (n·l Λ_v + n·v Λ_l),   Λ_x = √(α² + (1 − α²)(n·x)²)      (Heitz, JCGT 2014)
+
+Half-vectors are drawn from the visible normals (Dupuy & Benyoub, *Sampling Visible GGX Normals with Spherical Caps*, HPG 2023) on a
+stratified grid, so that each sample weighs G2/G1 ≤ 1 and a small grid is exact enough down to grazing angles.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+#: Nodes along √(n·v) and along roughness, both from 0 to 1 inclusive. The square root spends nodes on grazing angles, where A and B bend.
+COSINES = 48
+ROUGHNESSES = 32
+
+
+def integrate(cosine: NDArray[np.float64], alpha: NDArray[np.float64], strata: int = 32) -> NDArray[np.float64]:
+    """A and B (n, 2) at n·v (n,) and α (n,) by strata² samples each; `cosine` may be 0."""
+    k = (np.arange(strata) + 0.5) / strata
+    phi, cap = (g.ravel()[None] for g in np.meshgrid(np.pi * k, k))  # the lobe is symmetric: half the azimuths
+    nv, a = cosine[:, None], alpha[:, None]
+    sin_v = np.sqrt(np.clip(1.0 - nv * nv, 0.0, None))
+    stretch = 1.0 / np.sqrt((a * sin_v) ** 2 + nv**2 + 1e-30)
+    vx, vz = a * sin_v * stretch, nv * stretch
+    z = (1.0 - cap) * (1.0 + vz) - vz
+    ring = np.sqrt(np.clip(1.0 - z * z, 0.0, None))
+    hx, hy, hz = a * (ring * np.cos(phi) + vx), a * ring * np.sin(phi), np.clip(z + vz, 0.0, None) + 1e-12
+    length = 1.0 / np.sqrt(hx * hx + hy * hy + hz * hz)
+    hx, hz = hx * length, hz * length
+    vh = np.clip(hx * sin_v + hz * nv, 0.0, 1.0)
+    nl = 2.0 * vh * hz - nv
+    lit = nl > 0
+    nl = np.where(lit, nl, 1.0)
+    smith_v = np.sqrt(a * a + (1.0 - a * a) * nv * nv)
+    smith_l = np.sqrt(a * a + (1.0 - a * a) * nl * nl)
+    weight = np.where(lit, nl * (nv + smith_v) / (nl * smith_v + nv * smith_l + 1e-30), 0.0)
+    fresnel = (1.0 - vh) ** 5
+    return np.stack([((1.0 - fresnel) * weight).mean(axis=1), (fresnel * weight).mean(axis=1)], axis=1)
+
+
+@lru_cache(maxsize=1)
+def table() -> NDArray[np.float32]:
+    """The table (ROUGHNESSES, COSINES, 2), read-only, computed once per process."""
+    rough, root = np.meshgrid(np.linspace(0.0, 1.0, ROUGHNESSES), np.linspace(0.0, 1.0, COSINES), indexing="ij")
+    # A perfect mirror seen edge-on is 0/0; 1e-4 is its limit to five digits.
+    cosine, alpha = np.maximum(root.ravel() ** 2, 1e-4), np.maximum(rough.ravel() ** 2, 1e-4)
+    rows = [integrate(cosine[i : i + COSINES], alpha[i : i + COSINES]) for i in range(0, len(alpha), COSINES)]
+    out = np.concatenate(rows).reshape(ROUGHNESSES, COSINES, 2).astype(np.float32)
+    out.flags.writeable = False
+    return out
+
+
+@lru_cache(maxsize=8)
+def _tensor(dtype: torch.dtype, device: torch.device) -> torch.Tensor:
+    return torch.tensor(table().reshape(-1, 2), dtype=dtype, device=device)
+
+
+def scale_and_bias(cosine: torch.Tensor, roughness: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """A and B, (n,) each, at n·v (n,) > 0 and roughness (n,); bilinear in √(n·v) and roughness, differentiable in both."""
+    lut = _tensor(cosine.dtype, cosine.device)
+    x = cosine.sqrt() * (COSINES - 1)
+    y = roughness.clamp(0.0, 1.0) * (ROUGHNESSES - 1)
+    col = x.detach().floor().long().clamp(0, COSINES - 2)
+    row = y.detach().floor().long().clamp(0, ROUGHNESSES - 2)
+    fx, fy = (x - col).unsqueeze(1), (y - row).unsqueeze(1)
+    base = row * COSINES + col
+    top = lut[base] * (1.0 - fx) + lut[base + 1] * fx
+    bottom = lut[base + COSINES] * (1.0 - fx) + lut[base + COSINES + 1] * fx
+    both = top * (1.0 - fy) + bottom * fy
+    return both[:, 0], both[:, 1]

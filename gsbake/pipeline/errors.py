@@ -1,0 +1,27 @@
+"""The errors a person sees, each with its documented exit code (0 done, 2 usage, 42 bad input, 75 interrupted)."""
+
+from __future__ import annotations
+
+
+class GsbakeError(Exception):
+    """Base: the message is one sentence that says what is wrong, where, and what to do."""
+
+    exit_code = 1
+
+
+class UsageError(GsbakeError):
+    """The command or profile was used wrongly (exit code 2)."""
+
+    exit_code = 2
+
+
+class BadInputError(GsbakeError):
+    """The data cannot be used; retrying will not help (exit code 42)."""
+
+    exit_code = 42
+
+
+class InterruptedRun(GsbakeError):
+    """Stopped on request or by a passing fault; the same command goes on from here (exit code 75)."""
+
+    exit_code = 75

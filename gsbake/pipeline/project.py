@@ -1,0 +1,49 @@
+"""What an output folder remembers of its run, so that later commands need only `--out`: OUT/project.json."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+
+from gsbake.pipeline.errors import BadInputError
+from gsbake.pipeline.files import write_atomic
+
+PROJECT = "project.json"
+
+
+@dataclass(frozen=True)
+class Project:
+    """The person's paths and choices; paths are absolute. `published` holds {file in OUT: digest} of the results put there."""
+
+    photos: str | None = None
+    masks: str | None = None
+    poses: str | None = None
+    profile: str | None = None
+    overrides: tuple[str, ...] = ()
+    seed: int = 0
+    published: dict[str, str] = field(default_factory=dict)
+
+    @staticmethod
+    def load(out: Path) -> Project | None:
+        """The project of an output folder; None when there is none yet, BadInputError when it cannot be read."""
+        path = out / PROJECT
+        try:
+            body = json.loads(path.read_text(encoding="utf-8"))
+            return Project(**{**body, "overrides": tuple(body.get("overrides", ()))})
+        except (FileNotFoundError, NotADirectoryError):
+            return None
+        except (OSError, ValueError, TypeError, AttributeError) as error:
+            raise BadInputError(f"'{path}' cannot be read ({error}); delete it and give the photos again.") from error
+
+    def save(self, out: Path) -> None:
+        """Write it, unless the file already says the same."""
+        text = json.dumps(asdict(self), indent=1, ensure_ascii=False)
+        path = out / PROJECT
+        if not path.exists() or path.read_text(encoding="utf-8") != text:
+            write_atomic(path, text)
+
+    def sources(self) -> dict[str, Path]:
+        """{"photos" | "masks" | "poses": path} of those given."""
+        given = {"photos": self.photos, "masks": self.masks, "poses": self.poses}
+        return {name: Path(path) for name, path in given.items() if path is not None}

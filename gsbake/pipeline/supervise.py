@@ -1,0 +1,238 @@
+"""Running one stage in its worker process: messages, memory, signals, and what its end means."""
+
+from __future__ import annotations
+
+import json
+import os
+import selectors
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import FrameType, TracebackType
+from typing import Any
+
+import psutil
+
+from gsbake.pipeline import errors
+from gsbake.pipeline.errors import BadInputError, GsbakeError, InterruptedRun
+from gsbake.pipeline.machine import thread_environment
+from gsbake.pipeline.worker import Job
+
+#: Seconds a stage has to react to a stop, and to write its checkpoint once it has.
+GRACE = 5.0
+GRACE_CHECKPOINT = 30.0
+
+_SAMPLE = 0.5  # seconds between looks at the memory of the worker and its children
+_COMMAND = "from gsbake.pipeline.worker import main; main()"
+
+
+class StageFailed(GsbakeError):
+    """A stage ended in a way nobody foresaw; `details` holds the traceback."""
+
+    def __init__(self, message: str, details: str = "") -> None:
+        super().__init__(message)
+        self.details = details
+
+
+class StopSignals:
+    """Counts SIGINT, SIGTERM and SIGHUP while it is entered, in place of their usual effect; inert outside the main thread."""
+
+    def __init__(self) -> None:
+        self.count = 0
+        self._old: dict[int, Any] = {}
+
+    def __enter__(self) -> StopSignals:
+        if threading.current_thread() is threading.main_thread():
+            for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+                self._old[number] = signal.signal(number, self._on_signal)
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        for number, handler in self._old.items():
+            signal.signal(number, handler)
+
+    def _on_signal(self, number: int, frame: FrameType | None) -> None:
+        self.count += 1
+
+    def check(self) -> None:
+        """Raise InterruptedRun if a stop was requested."""
+        if self.count:
+            raise InterruptedRun("Stopped on request; the same command goes on from here.")
+
+
+@dataclass
+class Outcome:
+    """What a finished stage reported."""
+
+    results: dict[str, Any] = field(default_factory=dict)
+    parts: dict[str, float] = field(default_factory=dict)
+    decisions: list[dict[str, str]] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
+    seconds: float = 0.0
+    peak_bytes: int = 0
+
+
+class Worker:
+    """One worker process and the reading end of its pipe."""
+
+    def __init__(self, job: Job, log: Path) -> None:
+        read, write = os.pipe()
+        paths = [os.path.abspath(p) if p in ("", ".") else p for p in sys.path]
+        environment = {**os.environ, **thread_environment(job.threads), "PYTHONPATH": os.pathsep.join(paths), "PYTHONUNBUFFERED": "1"}
+        with log.open("wb") as sink:
+            self.process = subprocess.Popen(
+                [sys.executable, "-P", "-c", _COMMAND, str(write)],
+                stdin=subprocess.PIPE, stdout=sink, stderr=sink, env=environment,
+                pass_fds=(write,), start_new_session=True,  # Ctrl-C reaches only the supervisor, which passes it on
+            )  # fmt: skip
+        os.close(write)
+        assert self.process.stdin is not None
+        with suppress(BrokenPipeError):
+            self.process.stdin.write(job.dumps().encode())
+            self.process.stdin.close()
+        self._read = read
+        os.set_blocking(read, False)
+        self._selector = selectors.DefaultSelector()
+        self._selector.register(read, selectors.EVENT_READ)
+        self._rest = b""
+        self.peak = 0
+        self._sampled = -_SAMPLE
+
+    def messages(self, timeout: float) -> tuple[list[dict[str, Any]], bool]:
+        """Messages that came within `timeout` seconds, and whether the worker has ended."""
+        ended = self.process.poll() is not None
+        self._selector.select(0 if ended else timeout)
+        chunks = [self._rest]
+        while True:
+            try:
+                chunk = os.read(self._read, 1 << 16)
+            except BlockingIOError:
+                break
+            if not chunk:
+                ended = True
+                self.process.wait()
+                break
+            chunks.append(chunk)
+        *lines, self._rest = b"".join(chunks).split(b"\n")
+        return [json.loads(line) for line in lines], ended
+
+    def sample(self) -> None:
+        """Look at the memory of the worker and all its children."""
+        now = time.monotonic()
+        if now - self._sampled < _SAMPLE:
+            return
+        self._sampled = now
+        with suppress(psutil.Error):
+            root = psutil.Process(self.process.pid)
+            total = 0
+            for process in (root, *root.children(recursive=True)):
+                with suppress(psutil.Error):
+                    total += process.memory_info().rss
+            self.peak = max(self.peak, total)
+
+    def terminate(self) -> None:
+        """Ask the stage to stop."""
+        with suppress(ProcessLookupError):
+            self.process.send_signal(signal.SIGTERM)
+
+    def kill(self) -> None:
+        """End the worker and its children at once."""
+        with suppress(psutil.Error):
+            for child in psutil.Process(self.process.pid).children(recursive=True):
+                with suppress(psutil.Error):
+                    child.kill()
+        with suppress(ProcessLookupError, PermissionError):
+            os.killpg(self.process.pid, signal.SIGKILL)
+        self.process.wait()
+
+    def close(self) -> None:
+        """Leave no process and no handle behind."""
+        if self.process.poll() is None:
+            self.kill()
+        self._selector.close()
+        os.close(self._read)
+
+
+def supervise(job: Job, log: Path, stop: StopSignals, on_message: Callable[[dict[str, Any]], None], *, grace: float = GRACE) -> Outcome:
+    """Run the job to its end and return what it reported; raises what it raised.
+
+    A stop is passed on to the stage; one that has not reacted after `grace` seconds, or a second signal, ends it by force.
+    """
+    outcome = Outcome()
+    start = time.perf_counter()
+    last: dict[str, Any] = {}
+    worker = Worker(job, log)
+    deadline = None
+    try:
+        ended = False
+        while not ended:
+            messages, ended = worker.messages(0.1)
+            for message in messages:
+                match message["kind"]:
+                    case "done" | "failed":
+                        last = message
+                    case "decision":
+                        outcome.decisions.append({k: message[k] for k in ("what", "choice", "evidence")})
+                    case "warning":
+                        outcome.warnings.append(message["text"])
+                    case "stopping":
+                        deadline = time.monotonic() + max(grace, GRACE_CHECKPOINT)
+                on_message(message)
+            worker.sample()
+            if stop.count and deadline is None:
+                deadline = time.monotonic() + grace
+                worker.terminate()
+                on_message({"kind": "stop sent"})
+            if not last and (stop.count > 1 or (deadline is not None and time.monotonic() > deadline)):
+                worker.kill()
+                raise InterruptedRun("Stopped by force; the same command goes on from the last checkpoint.")
+        if not last:
+            raise _ended(worker, log, stop)
+    finally:
+        worker.close()
+    outcome.seconds = time.perf_counter() - start
+    if last["kind"] == "failed":
+        raise _error(last, worker.peak)
+    outcome.results, outcome.parts = last["results"], last["parts"]
+    outcome.peak_bytes = max(worker.peak, last["peak"])
+    return outcome
+
+
+def _error(message: dict[str, Any], peak: int) -> GsbakeError:
+    """The exception that a failed worker reported."""
+    kind = message["error"]
+    if kind == "MemoryError":
+        return BadInputError(
+            f"Memory ran out ({message['message']}; {peak / 1e9:.1f} GB in use): choose a smaller profile, or lower ingest.max_size, "
+            "train.max_size or bake.size."
+        )
+    if kind == "InterruptedRun":
+        return InterruptedRun("Stopped on request; the same command goes on from here.")
+    if kind == "unexpected":
+        return StageFailed(message["message"], message["traceback"])
+    error: GsbakeError = getattr(errors, kind)(message["message"])
+    return error
+
+
+def _ended(worker: Worker, log: Path, stop: StopSignals) -> GsbakeError:
+    """What it means that a worker ended without a word."""
+    code = worker.process.returncode
+    if stop.count:
+        return InterruptedRun("Stopped on request; the same command goes on from here.")
+    with suppress(OSError):
+        tail = log.read_text(errors="replace")[-4000:]
+        if code == -signal.SIGKILL:
+            total = psutil.virtual_memory().total
+            return InterruptedRun(
+                f"The stage was killed by the system, most likely for lack of memory (it used {worker.peak / 1e9:.1f} GB of "
+                f"{total / 1e9:.1f} GB): the same command goes on from the last checkpoint, a smaller profile needs less."
+            )
+        name = signal.Signals(-code).name if code < 0 else f"exit code {code}"
+        return StageFailed(f"the stage's process ended with {name}", tail)
+    return StageFailed(f"the stage's process ended with code {code}")

@@ -1,0 +1,1 @@
+"""Settings: the pydantic schema, TOML profiles and overrides."""

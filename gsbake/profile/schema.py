@@ -1,0 +1,144 @@
+"""Every setting gsbake has, by section; each field's description is its help text.
+
+A profile (TOML) fills these sections; an unknown key or a value outside its range is an error that names the nearest valid key.
+A stage declares the fields it reads (`"train.iterations"` or `"train.*"`): only those enter its cache key.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+Fraction = Annotated[float, Field(ge=0, le=1)]
+
+
+class Section(BaseModel):
+    """Base of all sections: unknown keys are errors, docs come from the field descriptions."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class Ingest(Section):
+    """Reading photos, masks and known poses."""
+
+    max_size: int = Field(1600, ge=16, le=16384, description="Longer side of the working photos in pixels; larger photos are reduced with an area filter.")
+    invert_masks: bool = Field(False, description="Masks are white where the background is.")
+    min_photos: int = Field(3, ge=2, description="Fewer usable photos than this is an error.")
+
+
+class Poses(Section):
+    """Structure from motion and the normalisation to the unit object."""
+
+    max_features: int = Field(8192, ge=256, description="SIFT features per photo.")
+    peak_threshold: float = Field(0.0033, gt=0, description="SIFT peak threshold; lower finds more features on smooth objects.")
+    matching: Literal["auto", "exhaustive", "ranked", "sequential", "vocabulary"] = Field("auto", description="Which pairs are matched; auto chooses by photo count and names.")
+    mapper: Literal["incremental", "global"] = Field("incremental", description="COLMAP mapper.")
+    min_registered: Fraction = Field(0.5, description="Fewer registered photos than this share is an error.")
+    masked_features: bool | Literal["auto"] = Field(
+        "auto", description="Find features only inside the masks; auto does so where the background stands still (turntables)."
+    )
+    max_size: int = Field(1600, ge=64, le=16384, description="Longer side in pixels at which features are found.")
+
+
+class Splat(Section):
+    """The surfel model and its rasteriser."""
+
+    shading: Literal["colour", "pbr"] = Field("colour", description="colour: plain colour with view dependence; pbr: deferred split-sum shading with a learnt environment light.")
+    sh_degree: int = Field(1, ge=0, le=2, description="Degree of the view dependence (spherical harmonics) in colour shading.")
+    max_surfels: int = Field(60_000, ge=100, description="Upper bound on the number of surfels.")
+    env_size: int = Field(32, ge=4, le=256, description="Edge of the environment cube map in texels.")
+
+
+class Train(Section):
+    """Training of the surfels."""
+
+    iterations: int = Field(3000, ge=0, description="Training steps; the schedule scales with it.")
+    max_size: int = Field(512, ge=16, description="Longer side of the training photos in pixels.")
+    coarse_share: Fraction = Field(0.5, description="Share of the run at half resolution.")
+    init_surfels: int = Field(20_000, ge=10, description="Surfels to start with.")
+    init: Literal["auto", "points", "hull", "sphere"] = Field("auto", description="Where surfels start: SfM points, visual hull, a sphere, or the best available.")
+    holdout: int = Field(8, ge=0, description="Every n-th photo is held out of training for the quality figure; 0 holds none out.")
+    early_stop: bool = Field(True, description="Stop when held-out PSNR and the SDF median stand still.")
+    lr_position: float = Field(8e-4, gt=0, description="Adam rate of positions at the start; decays to 1/100.")
+    lr_scale: float = Field(0.02, gt=0, description="Adam rate of log-scales.")
+    lr_rotation: float = Field(2e-3, gt=0, description="Adam rate of quaternions.")
+    lr_sdf: float = Field(0.005, gt=0, description="Adam rate of SDF samples.")
+    lr_gamma: float = Field(0.03, gt=0, description="Adam rate of the sharpness.")
+    lr_material: float = Field(1.6e-2, gt=0, description="Adam rate of colours and materials; decays to 1/10.")
+    lr_light: float = Field(1.6e-2, gt=0, description="Adam rate of the environment light; decays to 1/10.")
+
+
+class Loss(Section):
+    """Loss weights (METHOD: reflective / diffuse objects)."""
+
+    ssim: Fraction = Field(0.2, description="Share of 1-SSIM in the colour loss.")
+    median: float = Field(1.0, ge=0, description="Sharpness: pulls gamma up as the SDF median shrinks.")
+    projection: float = Field(10.0, ge=0, description="Surfels moved by their SDF sample must lie on the rendered depth.")
+    normal: float = Field(0.2, ge=0, description="Surfel normals against normals of the depth map.")
+    distortion: float = Field(100.0, ge=0, description="Concentration of weights along the ray (2DGS).")
+    mask: float = Field(0.3, ge=0, description="Alpha against the mask.")
+    smoothness: float = Field(0.02, ge=0, description="Edge-aware smoothness of the materials.")
+    white_light: float = Field(0.005, ge=0, description="Neutral environment light.")
+
+
+class Refine(Section):
+    """SDF-guided pruning, densification and the short fine-tune after training."""
+
+    iterations: int = Field(600, ge=0, description="Fine-tuning steps after pruning and densifying.")
+    prune_distance: float = Field(3.0, gt=0, description="Drop surfels farther from the zero set than this many surfel spacings.")
+    densify_share: Fraction = Field(0.3, description="At most this share of surfels is added where the surface is under-sampled.")
+
+
+class Mesh(Section):
+    """Field, marching cubes and clean-up."""
+
+    resolution: int = Field(0, ge=0, le=2048, description="Grid cells along the longest side; 0 derives it from surfel spacing and pixel footprint.")
+    max_resolution: int = Field(384, ge=16, le=2048, description="Upper bound of the derived resolution.")
+    field: Literal["tsdf", "imls"] = Field("tsdf", description="Field that is meshed: fused depth maps or the surfels' own SDF samples.")
+    holes: Literal["close", "leave"] = Field("close", description="Close what no photo saw, or leave it open.")
+    faces: int = Field(30_000, ge=100, description="Target triangle count of the asset.")
+    smooth: int = Field(2, ge=0, description="Taubin smoothing steps on the dense mesh.")
+    normal_reach: float = Field(8.0, ge=0, description="Waves shorter than this many cells follow the rendered normals instead of the depth; 0 leaves them.")
+    min_component: Fraction = Field(0.02, description="Drop loose pieces with less than this share of the largest piece's area.")
+
+
+class Bake(Section):
+    """UV atlas and textures."""
+
+    size: Literal[128, 256, 512, 1024, 2048, 4096] = Field(1024, description="Edge of the square textures in texels.")
+    normal_map: bool = Field(True, description="Bake a tangent-space normal map from the undecimated surface.")
+    occlusion_rays: int = Field(64, ge=0, description="Rays per texel for ambient occlusion; 0 leaves it out.")
+    equalise: bool = Field(True, description="Solve for one exposure gain per photo and channel before photos are fused into the base colour.")
+    roughness: Fraction = Field(0.8, description="Roughness of the whole asset when only colours were trained (splat.shading = colour).")
+
+
+class Export(Section):
+    """The GLB and what lies beside it."""
+
+    max_megabytes: float = Field(5.0, gt=0, description="Size the audit warns above.")
+    max_triangles: int = Field(100_000, ge=100, description="Triangle count the audit fails above.")
+    copyright: str = Field("", description="Copyright line written into the asset.")
+
+
+class Report(Section):
+    """The HTML report."""
+
+    views: int = Field(4, ge=1, description="Held-out photos shown beside the render of the final asset.")
+    view_size: int = Field(512, ge=32, description="Longer side of the renders in pixels.")
+
+
+class Profile(Section):
+    """All settings of a run."""
+
+    description: str = Field("", description="What the profile is for.")
+    ingest: Ingest = Ingest()
+    poses: Poses = Poses()
+    splat: Splat = Splat()
+    train: Train = Train()
+    loss: Loss = Loss()
+    refine: Refine = Refine()
+    mesh: Mesh = Mesh()
+    bake: Bake = Bake()
+    export: Export = Export()
+    report: Report = Report()

@@ -1,0 +1,1 @@
+"""The report and the renderer behind its figures."""

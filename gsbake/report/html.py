@@ -1,0 +1,166 @@
+"""The report as one HTML file that opens offline: page contents as plain data, images and model inlined, filled into a Jinja template.
+
+Style, script and the 3D viewer (vendored, see `vendor/`) are inlined too; nothing is fetched. Text is escaped by the template engine.
+"""
+
+from __future__ import annotations
+
+import base64
+from dataclasses import dataclass
+from importlib import resources
+
+import cv2
+import jinja2
+import numpy as np
+from markupsafe import Markup
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A headline figure."""
+
+    label: str
+    value: str
+    note: str = ""
+
+
+@dataclass(frozen=True)
+class Warned:
+    """A warning of a stage."""
+
+    stage: str
+    text: str
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Photo and render of one view as data addresses, with their likeness."""
+
+    name: str
+    photo: str
+    render: str
+    psnr: float
+    ssim: float
+    held_out: bool
+
+
+@dataclass(frozen=True)
+class Panel:
+    """An image (data address) with title and caption."""
+
+    title: str
+    caption: str
+    image: str
+
+
+@dataclass(frozen=True)
+class Light:
+    """A light for the 3D view: its name and a base64 Radiance HDR picture."""
+
+    name: str
+    hdr: str
+
+
+@dataclass(frozen=True)
+class Check:
+    """A line of the audit; `state` is pass, warn, fail or info."""
+
+    rule: str
+    state: str
+    detail: str
+
+
+@dataclass(frozen=True)
+class Decision:
+    """A choice that a stage took from evidence."""
+
+    stage: str
+    what: str
+    choice: str
+    evidence: str
+
+
+@dataclass(frozen=True)
+class StageRow:
+    """What the manifest of a stage says, as (heading, rows of key and value)."""
+
+    title: str
+    summary: str
+    tables: tuple[tuple[str, tuple[tuple[str, str], ...]], ...]
+
+
+@dataclass(frozen=True)
+class Page:
+    """Everything on the page. Charts are SVG from `gsbake.report.charts`; `model` is the GLB in base64, or empty for no 3D view."""
+
+    title: str
+    lead: str
+    figures: tuple[Figure, ...]
+    warnings: tuple[Warned, ...]
+    model: str
+    lights: tuple[Light, ...]
+    comparisons: tuple[Comparison, ...]
+    comparison_note: str
+    relit_title: str
+    relit: tuple[Panel, ...]
+    relit_note: str
+    maps: tuple[Panel, ...]
+    maps_note: str
+    audit: tuple[Check, ...]
+    curves: tuple[str, ...]
+    curves_note: str
+    decisions: tuple[Decision, ...]
+    stages: tuple[StageRow, ...]
+    time_chart: str
+    memory_chart: str
+    run_note: str
+    footer: str
+
+
+def picture_uri(rgb: NDArray[np.floating], alpha: NDArray[np.floating] | None = None, quality: int = 88) -> str:
+    """Data address of an sRGB picture (h, w, 3) in 0..1 as JPEG, or as WebP with `alpha` (h, w)."""
+    bgr = np.round(255 * np.clip(rgb[..., ::-1], 0, 1)).astype(np.uint8)
+    if alpha is None:
+        return _uri(bgr, ".jpg", "image/jpeg", [cv2.IMWRITE_JPEG_QUALITY, quality, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, 0x111111])
+    cover = np.round(255 * np.clip(alpha, 0, 1)).astype(np.uint8)
+    return _uri(np.dstack([bgr, cover]), ".webp", "image/webp", [cv2.IMWRITE_WEBP_QUALITY, quality])
+
+
+def _uri(image: NDArray[np.uint8], ending: str, kind: str, options: list[int]) -> str:
+    done, data = cv2.imencode(ending, image, options)
+    if not done:
+        raise RuntimeError(f"could not encode a picture of shape {image.shape} as {kind}")
+    return f"data:{kind};base64," + base64.b64encode(data.tobytes()).decode()
+
+
+def hdr_base64(radiance: NDArray[np.floating]) -> str:
+    """An equirectangular map (h, w, 3) as a Radiance HDR file in base64."""
+    done, data = cv2.imencode(".hdr", np.ascontiguousarray(radiance[..., ::-1], np.float32))
+    if not done:
+        raise RuntimeError(f"could not encode a light of shape {radiance.shape} as HDR")
+    return base64.b64encode(data.tobytes()).decode()
+
+
+def inline_script(text: str) -> Markup:
+    """Script text that can stand inside a script element: what would end or nest the element is written with an escape."""
+    return Markup(text.replace("<!--", "<\\!--").replace("</script", "<\\/script"))
+
+
+def render_page(page: Page) -> str:
+    """The HTML text of the page."""
+    here = resources.files("gsbake.report")
+
+    def text(name: str) -> str:
+        return here.joinpath(name).read_text(encoding="utf-8")
+
+    environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    template = environment.from_string(text("page.html.j2"))
+    charts = {name: Markup(getattr(page, name)) for name in ("time_chart", "memory_chart")}
+    filled = {**vars(page), **charts, "curves": tuple(Markup(curve) for curve in page.curves)}
+    return template.render(
+        page=filled,
+        css=Markup(text("page.css")),
+        page_js=inline_script(text("page.js")),
+        viewer_js=inline_script(text("vendor/model-viewer.min.js")) if page.model else "",
+    )

@@ -1,0 +1,223 @@
+"""A small ray-traced renderer of the finished asset: what a glTF viewer shows, from any camera, with an alpha channel.
+
+Primary rays hit the triangles (Embree); at each hit the textures are read bilinearly as glTF 2.0 says: base colour as sRGB, decoded before
+filtering; occlusion, roughness and metallic from R, G, B of one linear image; the normal map in the frame (tangent, w · n × t, normal) of
+the interpolated vertex vectors. Samples are shaded one by one, then averaged in linear light over each pixel, so edges are smooth.
+A texture that is finer than the picture's samples is halved (area filter) until it is not, which stands in for mip maps.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Protocol
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from gsbake.capture.cameras import Camera
+from gsbake.surface.raycast import RayCaster
+
+Floats = NDArray[np.float32]
+
+
+def decode_srgb(coded: NDArray[np.floating]) -> Floats:
+    """sRGB values in 0..1 to linear ones (IEC 61966-2-1)."""
+    value = np.asarray(coded, np.float32)
+    return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4).astype(np.float32)
+
+
+def encode_srgb(linear: NDArray[np.floating]) -> Floats:
+    """Linear values to sRGB values in 0..1, clipped."""
+    value = np.clip(np.asarray(linear, np.float32), 0, 1)
+    return np.where(value <= 0.0031308, 12.92 * value, 1.055 * value ** (1 / 2.4) - 0.055).astype(np.float32)
+
+
+@dataclass(frozen=True, eq=False)
+class Asset:
+    """A textured mesh ready to be drawn, in one frame (the glTF asset's own when it was read from a GLB).
+
+    `position`, `normal` (v, 3); `tangent` (v, 4) or None; `uv` (v, 2) with the origin top left; `faces` (f, 3). `base_color` (h, w, 3)
+    linear, `orm` (h, w, 3) linear occlusion, roughness, metallic, `normal_map` (h, w, 3) vectors in -1..1; the last two may be None.
+    `unlit`: the base colour is the picture, no light falls on it. `wrap`: textures repeat beyond 0..1, else their edge goes on.
+    """
+
+    position: NDArray[np.float64]
+    normal: Floats
+    tangent: Floats | None
+    uv: Floats
+    faces: NDArray[np.int32]
+    base_color: Floats
+    orm: Floats | None = None
+    normal_map: Floats | None = None
+    unlit: bool = False
+    wrap: bool = True
+
+    @property
+    def centre(self) -> NDArray[np.float64]:
+        """Middle (3,) of the bounding box."""
+        return np.asarray((self.position.min(0) + self.position.max(0)) / 2)
+
+    @property
+    def radius(self) -> float:
+        """Distance of the farthest vertex from the centre."""
+        return float(np.linalg.norm(self.position - self.centre, axis=1).max())
+
+
+@dataclass(frozen=True, eq=False)
+class Samples:
+    """What n camera samples on the asset see, in the asset's frame: unit `normal` and `view` (towards the eye) (n, 3), linear
+    `base_color` (n, 3), `occlusion`, `roughness`, `metallic` (n,)."""
+
+    normal: Floats
+    view: Floats
+    base_color: Floats
+    occlusion: Floats
+    roughness: Floats
+    metallic: Floats
+
+
+class Shader(Protocol):
+    """Turns samples into linear radiance (n, 3)."""
+
+    def __call__(self, samples: Samples) -> Floats:
+        """Radiance towards the eye (n, 3), linear."""
+
+
+@dataclass(frozen=True, eq=False)
+class Picture:
+    """A render: straight sRGB `rgb` (h, w, 3) in 0..1 and `alpha` (h, w), and the buffers behind it, averaged over the covered samples:
+    `base_color` (h, w, 3) linear, unit `normal` (h, w, 3), `orm` (h, w, 3)."""
+
+    rgb: Floats
+    alpha: Floats
+    base_color: Floats
+    normal: Floats
+    orm: Floats
+
+    def over(self, grey: float) -> Floats:
+        """The picture (h, w, 3) over a plain background, mixed in sRGB values as photos with masks are."""
+        return self.rgb * self.alpha[..., None] + np.float32(grey) * (1 - self.alpha[..., None])
+
+
+def unlit(samples: Samples) -> Floats:
+    """The shader of assets whose base colour already is the picture."""
+    return samples.base_color
+
+
+class Renderer:
+    """Draws one asset from many cameras; the ray tree and the halved textures are kept."""
+
+    def __init__(self, asset: Asset, threads: int | None = None) -> None:
+        self.asset = asset
+        self._caster = RayCaster(asset.position, asset.faces, threads)
+        corner, uv = asset.position[asset.faces], asset.uv[asset.faces].astype(np.float64)
+        area = np.linalg.norm(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=1)
+        e1, e2 = uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]
+        # Texture area per unit of surface area, for the choice of the halving.
+        self._density = float(np.abs(e1[:, 0] * e2[:, 1] - e1[:, 1] * e2[:, 0]).sum() / max(area.sum(), 1e-30))
+        self._level = lru_cache(maxsize=16)(self._halved)
+
+    def _halved(self, name: str, level: int) -> Floats | None:
+        image: Floats | None = getattr(self.asset, name)
+        if image is None or level == 0:
+            return image
+        size = (max(1, image.shape[1] >> level), max(1, image.shape[0] >> level))
+        return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.float32)
+
+    def _read(self, name: str, level: int, uv: Floats) -> Floats | None:
+        """Texture values (n, 3) at uv (n, 2), or None when the asset has no such texture."""
+        image = self._level(name, level)
+        if image is None:
+            return None
+        return bilinear(image, uv, self.asset.wrap)
+
+    def draw(self, camera: Camera, shader: Shader, samples: int = 2) -> Picture:
+        """Render from `camera` (same frame as the asset) with samples² rays a pixel."""
+        height, width = camera.height, camera.width
+        fine = camera.scaled(width * samples, height * samples)
+        inside = self._window(fine)
+        rays = fine.rays()[inside]
+        shape = rays.shape[:2]
+        hits = self._caster.first_hit(fine.centre[None], rays.reshape(-1, 3))
+        index = np.flatnonzero(hits.hit)
+        surface = self._samples(fine, rays.reshape(-1, 3)[index], hits.face[index], hits.bary[index], hits.distance[index])
+        radiance = shader(surface)
+        columns = (
+            radiance, np.ones((len(index), 1)), surface.base_color, surface.normal,
+            np.stack([surface.occlusion, surface.roughness, surface.metallic], 1),
+        )  # fmt: skip
+        part = np.zeros((shape[0] * shape[1], 13), np.float32)
+        part[index] = np.concatenate(columns, 1)
+        full = np.zeros((fine.height, fine.width, 13), np.float32)
+        full[inside] = part.reshape(*shape, 13)
+        mean = full.reshape(height, samples, width, samples, 13).mean((1, 3), dtype=np.float32)
+        alpha = mean[..., 3]
+        straight = mean / np.maximum(alpha, 1e-6)[..., None]
+        normal = straight[..., 7:10]
+        length = np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-6)
+        return Picture(encode_srgb(straight[..., :3]), alpha, straight[..., 4:7], normal / length, straight[..., 10:13])
+
+    def _window(self, camera: Camera) -> tuple[slice, slice]:
+        """Rows and columns that hold the asset's projection; the whole picture when the camera stands within its bounds."""
+        pixels, depth = camera.project(self.asset.position)
+        if depth.min() <= 0:
+            return slice(0, camera.height), slice(0, camera.width)
+        low = np.clip(np.floor(pixels.min(0)).astype(int) - 1, 0, [camera.width, camera.height])
+        high = np.clip(np.ceil(pixels.max(0)).astype(int) + 1, low, [camera.width, camera.height])
+        return slice(low[1], high[1]), slice(low[0], high[0])
+
+    def _samples(self, camera: Camera, rays: NDArray[np.float64], face: NDArray[np.int32], bary: Floats, distance: Floats) -> Samples:
+        asset = self.asset
+        corners = asset.faces[face]
+
+        def mix(values: Floats) -> Floats:
+            return np.einsum("nk,nkc->nc", bary, values[corners]).astype(np.float32)
+
+        uv, normal = mix(asset.uv), unit(mix(asset.normal))
+        view = unit(-rays.astype(np.float32))
+        level = self._choose_level(camera, distance)
+        base = self._read("base_color", level, uv)
+        orm = self._read("orm", level, uv)
+        bent = self._read("normal_map", level, uv)
+        if bent is not None and asset.tangent is not None:
+            tangent = mix(asset.tangent)
+            sign = np.where(tangent[:, 3:] < 0, np.float32(-1), np.float32(1))
+            across = sign * np.cross(normal, tangent[:, :3])
+            normal = unit(bent[:, :1] * tangent[:, :3] + bent[:, 1:2] * across + bent[:, 2:] * normal)
+        if orm is None:
+            orm = np.broadcast_to(np.array([1, 1, 0], np.float32), (len(face), 3))
+        assert base is not None
+        return Samples(normal, view, base, orm[:, 0], orm[:, 1], orm[:, 2])
+
+    def _choose_level(self, camera: Camera, distance: Floats) -> int:
+        """Halvings after which a texel is about as large as a sample's footprint on the surface."""
+        if len(distance) == 0:
+            return 0
+        height, width = self.asset.base_color.shape[:2]
+        footprint = float(np.median(distance)) ** 2 / (camera.fx * camera.fy)
+        texels = self._density * height * width * footprint
+        return max(0, min(round(0.5 * math.log2(max(texels, 1e-12))), int(math.log2(min(height, width)))))
+
+
+def unit(vectors: Floats) -> Floats:
+    """Vectors (n, 3) at unit length; a zero vector stays zero."""
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), np.float32(1e-12))
+
+
+def bilinear(image: Floats, uv: Floats, wrap: bool = True) -> Floats:
+    """Values (n, c) of an image (h, w, c) at uv (n, 2), texel centres at (i + .5) / size; beyond 0..1 repeated or clamped."""
+    height, width = image.shape[:2]
+    x, y = uv[:, 0] * width - np.float32(0.5), uv[:, 1] * height - np.float32(0.5)
+    col, row = np.floor(x).astype(np.int64), np.floor(y).astype(np.int64)
+    fx, fy = (x - col)[:, None].astype(np.float32), (y - row)[:, None].astype(np.float32)
+    if wrap:
+        left, right, top, bottom = col % width, (col + 1) % width, row % height, (row + 1) % height
+    else:
+        left, right = np.clip(col, 0, width - 1), np.clip(col + 1, 0, width - 1)
+        top, bottom = np.clip(row, 0, height - 1), np.clip(row + 1, 0, height - 1)
+    above = image[top, left] * (1 - fx) + image[top, right] * fx
+    below = image[bottom, left] * (1 - fx) + image[bottom, right] * fx
+    return np.asarray(above * (1 - fy) + below * fy, np.float32)

@@ -1,0 +1,78 @@
+"""The asset's maps as pictures: textures, their channels, and the UV sheet with its charts."""
+
+from __future__ import annotations
+
+import colorsys
+
+import cv2
+import numpy as np
+import scipy.sparse
+from numpy.typing import NDArray
+
+from gsbake.report.html import Panel, picture_uri
+from gsbake.report.render import Asset, Floats, encode_srgb
+
+#: Longer side of a map in the page.
+SHOWN = 768
+
+
+def shrink(image: Floats, longest: int = SHOWN) -> Floats:
+    """The picture at most `longest` wide and high (area filter)."""
+    height, width = image.shape[:2]
+    if max(height, width) <= longest:
+        return image
+    scale = longest / max(height, width)
+    small = cv2.resize(image, (round(width * scale), round(height * scale)), interpolation=cv2.INTER_AREA)
+    return np.asarray(small, np.float32)
+
+
+def chart_of_faces(faces: NDArray[np.int32], vertices: int) -> NDArray[np.int32]:
+    """Chart number (f,) of each face: faces that share vertices of the atlas are one chart."""
+    a, b = faces[:, [0, 1]].ravel(), faces[:, [1, 2]].ravel()
+    graph = scipy.sparse.coo_matrix((np.ones(len(a), np.int8), (a, b)), shape=(vertices, vertices))
+    _, label = scipy.sparse.csgraph.connected_components(graph, directed=False)
+    _, chart = np.unique(label[faces[:, 0]], return_inverse=True)
+    return chart.astype(np.int32)
+
+
+def uv_sheet(asset: Asset, edge: int = 1024) -> Floats:
+    """The atlas (edge, edge, 3) in 0..1: every chart in a colour of its own, triangle edges fine, empty space dark."""
+    chart = chart_of_faces(asset.faces, len(asset.uv))
+    sheet = np.full((edge, edge, 3), 34, np.uint8)
+    # Fixed point with 4 fractional bits; OpenCV puts pixel centres at whole numbers.
+    corners = np.round((asset.uv[asset.faces] * edge - 0.5) * 16).astype(np.int32)
+    order = np.argsort(chart, kind="stable")
+    for part in np.split(order, np.flatnonzero(np.diff(chart[order])) + 1):
+        hue = (int(chart[part[0]]) * 0.61803398875) % 1.0
+        r, g, b = colorsys.hls_to_rgb(hue, 0.62, 0.45)
+        for triangle in corners[part]:
+            cv2.fillConvexPoly(sheet, triangle, (r * 255, g * 255, b * 255), lineType=cv2.LINE_8, shift=4)
+    lines = np.zeros((edge, edge), np.uint8)
+    cv2.polylines(lines, list(corners), True, 255, 1, cv2.LINE_AA, shift=4)
+    share = np.float32(0.45 / 255) * lines.astype(np.float32)[..., None]
+    return np.asarray(sheet / np.float32(255) * (1 - share) + share * np.float32(0.08), np.float32)
+
+
+def map_panels(asset: Asset) -> tuple[Panel, ...]:
+    """Panels of the asset's maps; channels that the asset lacks are left out."""
+
+    def panel(title: str, caption: str, image: Floats) -> Panel:
+        return Panel(title, caption, picture_uri(shrink(image)))
+
+    def grey(channel: Floats) -> Floats:
+        return np.repeat(channel[..., None], 3, axis=2)
+
+    height, width = asset.base_color.shape[:2]
+    kind = "as photographed" if asset.unlit else "no light in it"
+    out = [panel("Base colour", f"{width} × {height}, {kind}", encode_srgb(asset.base_color))]
+    if asset.normal_map is not None:
+        out.append(panel("Normal", "tangent space, +Y up", 0.5 + 0.5 * asset.normal_map))
+    if asset.orm is not None:
+        names = (("Occlusion", "white = open"), ("Roughness", "white = rough"), ("Metallic", "white = metal"))
+        for k, (title, caption) in enumerate(names):
+            low, high = float(asset.orm[..., k].min()), float(asset.orm[..., k].max())
+            span = f"{low:.2f} everywhere" if high - low < 0.004 else f"{caption}, {low:.2f}–{high:.2f}"
+            out.append(panel(title, span, grey(asset.orm[..., k])))
+    charts = int(chart_of_faces(asset.faces, len(asset.uv)).max()) + 1 if len(asset.faces) else 0
+    out.append(panel("UV sheet", f"{charts} charts, {len(asset.faces):,} triangles".replace(",", " "), uv_sheet(asset)))
+    return tuple(out)

@@ -1,0 +1,104 @@
+"""Adding and dropping surfels: gradient-driven clone and split under a budget, and pruning by opacity, size, visibility and SDF.
+
+Clone/split after 3DGS (Kerbl et al. 2023); children inherit s (Zhu et al. 2025). Instead of a fixed gradient threshold the surfels with the
+largest mean screen gradient are taken, as many as a budget that grows to `max_surfels` allows: no scene-dependent constant to guess.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from gsbake.splat.adam import Adam
+from gsbake.splat.reference import rotation_matrix
+from gsbake.splat.surfels import Surfels
+
+#: Opacity below which a surfel is dropped (DSDF).
+OPACITY_FLOOR = 0.005
+
+
+@dataclass
+class Statistics:
+    """Per surfel since the last change: summed screen gradient (pixels at unit resolution), views that touched it, summed weight."""
+
+    gradient: Tensor
+    views: Tensor
+    weight: Tensor
+
+    @staticmethod
+    def zeros(n: int) -> Statistics:
+        """Fresh statistics for n surfels."""
+        return Statistics(torch.zeros(n), torch.zeros(n), torch.zeros(n))
+
+    def add(self, screen_grad: Tensor, touched: Tensor, size: int) -> None:
+        """Collect one backward pass: gradients (n, ≥2) w.r.t. the screen centre in pixels, weights (n,); `size` makes them resolution-free."""
+        seen = touched > 0
+        self.gradient += torch.where(seen, screen_grad[:, :2].norm(dim=1) * (size / 2), 0.0)
+        self.views += seen
+        self.weight += touched
+
+    def mean_gradient(self) -> Tensor:
+        """Mean screen gradient (n,) over the views that touched each surfel."""
+        return self.gradient / self.views.clamp_min(1)
+
+
+def replace_rows(surfels: Surfels, adam: Adam, keep: Tensor, children: Surfels | None) -> Surfels:
+    """Keep the rows at index `keep`, append `children`; Adam's moments follow."""
+    names = [k for k in surfels.tensors() if k != "gamma"]
+    kept = surfels.select(keep)
+    adam.select(names, keep, 0 if children is None else len(children))
+    if children is None:
+        return kept
+    join = {k: torch.cat([v, children.tensors()[k]]) for k, v in kept.tensors().items() if k != "gamma"}
+    attributes = {k.split(".", 1)[1]: v for k, v in join.items() if "." in k}
+    return Surfels(gamma=surfels.gamma, attributes=attributes, **{k: v for k, v in join.items() if "." not in k})
+
+
+@torch.no_grad()
+def densify(surfels: Surfels, adam: Adam, stats: Statistics, budget: int, large: float, generator: torch.Generator, floor: float = 0.0) -> Surfels:
+    """Split (scale above `large`) or clone the surfels with the largest mean gradient until `budget` surfels exist.
+
+    A split surfel becomes two of 1/1.6 its size at random places of its disc; a clone is a copy. Only gradients above `floor` count.
+    """
+    room = budget - len(surfels)
+    score = stats.mean_gradient()
+    chosen = torch.argsort(score, descending=True, stable=True)[: max(0, room)]
+    chosen = chosen[score[chosen] > floor]
+    if not len(chosen):
+        return surfels
+    parents = surfels.select(chosen)
+    split = parents.scale.max(1).values > large
+    axes = rotation_matrix(parents.quaternion)[:, :, :2]
+    children = []
+    for _ in range(2):
+        offset = torch.randn(len(chosen), 2, generator=generator).clamp(-2, 2) * parents.scale
+        place = parents.position + torch.einsum("nij,nj->ni", axes, offset)
+        child = parents.select(torch.arange(len(chosen)))
+        child.position = torch.where(split[:, None], place, parents.position)
+        child.log_scale = torch.where(split[:, None], parents.log_scale - math.log(1.6), parents.log_scale)
+        children.append(child)
+    # the first child takes its parent's row, moments and all
+    surfels.position[chosen] = children[0].position
+    surfels.log_scale[chosen] = children[0].log_scale
+    return replace_rows(surfels, adam, torch.arange(len(surfels)), children[1])
+
+
+@torch.no_grad()
+def prune(surfels: Surfels, adam: Adam, stats: Statistics | None, largest: float) -> tuple[Surfels, Tensor, dict[str, int]]:
+    """Drop surfels that are transparent, larger than `largest`, not finite, or (given statistics) touched by no view; returns also the kept index."""
+    dropped = {
+        "transparent": surfels.opacity() < OPACITY_FLOOR,
+        "too large": surfels.scale.max(1).values > largest,
+        "not finite": ~torch.isfinite(surfels.position).all(1),
+    }
+    if stats is not None:
+        dropped["unseen"] = (stats.views == 0) & ~dropped["transparent"]
+    bad = torch.stack(list(dropped.values())).any(0)
+    keep = (~bad).nonzero()[:, 0]
+    counts = {k: int(v.sum()) for k, v in dropped.items()}
+    if len(keep) == len(surfels):
+        return surfels, keep, counts
+    return replace_rows(surfels, adam, keep, None), keep, counts

@@ -1,0 +1,160 @@
+"""Differentiable rasterisation of surfels: sort, bin and blend around the Numba kernel, as one autograd function.
+
+`render` is the one entry the rest of gsbake uses; `gsbake.splat.reference` is its readable twin.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gsbake.splat.kernel import (
+    EXTRA,
+    SLOT,
+    TILE,
+    backward_kernel,
+    count_tiles,
+    fill_tiles,
+    forward_kernel,
+    sum_slots,
+)
+from gsbake.splat.projection import Pinhole, Project
+from gsbake.splat.threads import run_chunks, thread_count
+
+
+@dataclass
+class Rendered:
+    """One rendered view. Planes are (h, w) or (c, h, w) float32; sums over surfels are weighted by w = α T, not divided by alpha.
+
+    `features` (c, h, w); `depth` Σ w z; `distortion` Σ_{i<j} w_i w_j (m_i − m_j)² on NDC depth; `alpha` Σ w; `median` depth where T
+    crosses ½ (0 if it never does; no gradient); `normal` (n, 3) world normals of the surfels; `visible` (n,) bool;
+    `screen` (n, 9), whose `.grad` after backward holds the screen-space gradients (columns 0, 1: the centre, in pixels);
+    `touched` holds Σ w per surfel after backward.
+    """
+
+    features: Tensor
+    depth: Tensor
+    distortion: Tensor
+    alpha: Tensor
+    median: Tensor
+    normal: Tensor
+    visible: Tensor
+    screen: Tensor
+    stats: dict[str, Tensor]
+
+    def expected_depth(self) -> Tensor:
+        """Alpha-normalised expected z-depth (h, w); 0 where nothing is."""
+        return torch.where(self.alpha > 1e-3, self.depth / self.alpha.clamp_min(1e-3), torch.zeros_like(self.depth))
+
+
+@dataclass(frozen=True)
+class Bins:
+    """Tile lists: pairs of tile t are `ids[starts[t]:starts[t + 1]]`, front to back; `slots` their gradient slots."""
+
+    starts: Any
+    ids: Any
+    slots: Any
+    offsets: Any
+    order: Any
+    tiles_x: int
+
+
+def bin_surfels(depth: Any, box: Any, visible: Any, width: int, height: int) -> Bins:
+    """Depth-sort the visible surfels once and deal them to 16x16 tiles (numpy arrays in and out)."""
+    n = len(depth)
+    tiles_x, tiles_y = -(-width // TILE), -(-height // TILE)
+    tiles = tiles_x * tiles_y
+    idx = np.flatnonzero(visible).astype(np.uint64)
+    # positive float32 sort as their bits; the index below keeps ties stable
+    keys = (depth[idx.astype(np.int64)].view(np.uint32).astype(np.uint64) << np.uint64(32)) | idx
+    keys.sort()
+    front = (keys & np.uint64(0xFFFFFFFF)).astype(np.int64)
+    per_tile, per_surfel = np.zeros(tiles, np.int64), np.zeros(n, np.int64)
+    count_tiles(box, visible, tiles_x, per_tile, per_surfel)
+    starts, offsets = np.zeros(tiles + 1, np.int64), np.zeros(n + 1, np.int64)
+    np.cumsum(per_tile, out=starts[1:])
+    np.cumsum(per_surfel, out=offsets[1:])
+    pairs = int(starts[-1])
+    ids, slots = np.empty(pairs, np.int32), np.empty(pairs, np.int64)
+    fill_tiles(front, box, tiles_x, offsets, starts[:-1].copy(), ids, slots)
+    # heavy tiles first, dealt in turn to the chunks, so that both threads end together
+    order = np.argsort(-per_tile, kind="stable")
+    chunks = max(1, thread_count() * 6)
+    order = np.concatenate([order[i::chunks] for i in range(chunks)])
+    return Bins(starts, ids, slots, offsets, order, tiles_x)
+
+
+class _Blend(torch.autograd.Function):
+    @staticmethod
+    def forward(  # type: ignore[override]
+        ctx: Any, geo: Tensor, opacity: Tensor, features: Tensor, box: Tensor, visible: Tensor, width: int, height: int, stats: dict[str, Tensor]
+    ) -> Tensor:
+        channels = features.shape[1]
+        g, o, f = (x.detach().contiguous().numpy() for x in (geo, opacity, features))
+        b = box.numpy()
+        bins = bin_surfels(np.ascontiguousarray(g[:, 8]), b, visible.numpy(), width, height)
+        out = torch.empty(channels + EXTRA, height, width)
+        used = np.empty(len(bins.order), np.int64)
+        kernel, image = forward_kernel(channels), out.numpy()
+        run_chunks(
+            lambda lo, hi: kernel(bins.order, lo, hi, bins.starts, bins.ids, g, b, o, f, width, height, bins.tiles_x, image, used),
+            len(bins.order),
+        )
+        ctx.save_for_backward(geo, opacity, features, box, out)
+        ctx.bins, ctx.used, ctx.size, ctx.stats = bins, used, (width, height), stats
+        return out
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> Any:  # type: ignore[override]
+        geo, opacity, features, box, out = ctx.saved_tensors
+        bins, used, (width, height) = ctx.bins, ctx.used, ctx.size
+        channels, n = features.shape[1], features.shape[0]
+        g, o, f = (x.detach().contiguous().numpy() for x in (geo, opacity, features))
+        planes = torch.cat([grad[: channels + 2], grad[channels + 4 : channels + 5]]).contiguous().numpy()
+        result = np.empty((len(bins.ids), SLOT + channels), np.float32)
+        kernel, image, b = backward_kernel(channels), out.numpy(), box.numpy()
+        run_chunks(
+            lambda lo, hi: kernel(
+                bins.order, lo, hi, bins.starts, bins.ids, bins.slots, g, b, o, f, width, height, bins.tiles_x, image, used, planes, result
+            ),
+            len(bins.order),
+        )
+        sums = torch.empty(n, SLOT + channels)
+        total = sums.numpy()
+        run_chunks(lambda lo, hi: sum_slots(lo, hi, bins.offsets, result, total), n, 2, 4096)
+        ctx.stats["touched"] = sums[:, 10]
+        return sums[:, :9].contiguous(), sums[:, 9].contiguous(), sums[:, SLOT:].contiguous(), None, None, None, None, None
+
+
+def render(
+    position: Tensor,
+    quaternion: Tensor,
+    log_scale: Tensor,
+    opacity: Tensor,
+    features: Tensor,
+    rotation: Tensor,
+    translation: Tensor,
+    pinhole: Pinhole,
+    normals_as_features: bool = True,
+    cull_backfaces: bool = False,
+) -> Rendered:
+    """Render surfels (float32, CPU): position (n, 3), quaternion (n, 4) as (w, x, y, z), log_scale (n, 2), opacity (n,), features (n, c).
+
+    `rotation` (3, 3) and `translation` (3,) are world→camera (OpenCV axes); gradients flow to them too. With `normals_as_features`
+    the world normals are blended as three more channels behind the given ones.
+    """
+    geo, normal, box, visible = Project.apply(
+        position, quaternion, log_scale, opacity, rotation, translation, pinhole, cull_backfaces
+    )
+    if geo.requires_grad:
+        geo.retain_grad()
+    if normals_as_features:
+        features = torch.cat([features, normal], 1)
+    stats: dict[str, Tensor] = {}
+    out = _Blend.apply(geo, opacity, features, box, visible, pinhole.width, pinhole.height, stats)
+    c = features.shape[1]
+    return Rendered(out[:c], out[c], out[c + 1], out[c + 4], out[c + 5].detach(), normal, visible, geo, stats)

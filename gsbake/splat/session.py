@@ -1,0 +1,94 @@
+"""A training run as a stage sees it: photos loaded, checkpoints kept, progress told, an interruption survived, results written."""
+
+from __future__ import annotations
+
+import csv
+import os
+import time
+from typing import Any
+
+import torch
+
+from gsbake.capture.posed import PosedPhotos
+from gsbake.pipeline.stage import Context
+from gsbake.splat.surfels import Surfels
+from gsbake.splat.trainer import EVALUATE_EVERY, Plan, Trainer
+from gsbake.splat.views import held_out, load_views
+
+CHECKPOINT_VERSION = 1
+CHECKPOINT_SECONDS = 30.0
+
+
+class Session:
+    """Runs a `Trainer` to its end inside a stage's context."""
+
+    def __init__(self, ctx: Context, posed: PosedPhotos, surfels: Surfels, light: Any, iterations: int, coarse_share: float, densify: bool) -> None:
+        """Load the photos at `train.max_size`; go on from the newest checkpoint if this stage was interrupted."""
+        self.ctx = ctx
+        settings = ctx.settings
+        with ctx.part("load photos"):
+            full, half = load_views(posed, settings.train.max_size)
+        held = held_out(len(full), settings.train.holdout)
+        plan = Plan(settings.train, settings.splat, settings.loss, iterations, coarse_share, densify, ctx.seed)
+        self.trainer = Trainer(plan, surfels, light, full, half, held)
+        self.before = len(surfels)
+        self._resume()
+
+    def _resume(self) -> None:
+        path = self.ctx.checkpoint / "checkpoint.pt"
+        if not path.exists():
+            return
+        body = torch.load(path, weights_only=True)
+        if body["version"] == CHECKPOINT_VERSION:
+            self.trainer.restore(body["trainer"])
+            self.ctx.decide("training", f"resumed at step {self.trainer.done}", "a checkpoint of an interrupted run")
+
+    def _save_checkpoint(self) -> None:
+        path = self.ctx.checkpoint / "checkpoint.pt"
+        part = path.with_suffix(".part")
+        with part.open("wb") as file:
+            torch.save({"version": CHECKPOINT_VERSION, "trainer": self.trainer.state()}, file)
+            file.flush()
+            os.fsync(file.fileno())
+        part.replace(path)
+
+    def run(self) -> dict[str, Any]:
+        """Train to the end (or to a requested stop, which leaves a checkpoint) and write the results."""
+        trainer, ctx = self.trainer, self.ctx
+        saved = time.monotonic()
+        live: dict[str, float] = {}
+        with ctx.part("train"):
+            while trainer.done < trainer.end:
+                figures = trainer.step()
+                if trainer.done % EVALUATE_EVERY == 0 or trainer.done >= trainer.end:
+                    live["psnr"] = trainer.record()["psnr"]
+                ctx.progress(trainer.done, trainer.end, "", surfels=figures["surfels"], **live)
+                if ctx.stop_requested():
+                    self._save_checkpoint()
+                    ctx.check_stop()
+                if time.monotonic() - saved > CHECKPOINT_SECONDS:
+                    self._save_checkpoint()
+                    saved = time.monotonic()
+        if trainer.cooling_from is not None:
+            ctx.decide("early stop", f"step {trainer.end} of {trainer.plan.iterations}", "held-out PSNR and SDF median stood still")
+        return self._write()
+
+    def _write(self) -> dict[str, Any]:
+        trainer, out = self.trainer, self.ctx.out
+        trainer.surfels.save(out / "surfels.safetensors")
+        if trainer.light is not None:
+            trainer.light.save(out / "light.safetensors")
+        with (out / "log.csv").open("w", newline="") as file:
+            writer = csv.DictWriter(file, ["step", "psnr", "surfels", "sdf_median", "gamma"])
+            writer.writeheader()
+            writer.writerows(trainer.log)
+        psnr = trainer.log[-1]["psnr"] if trainer.log else trainer.evaluate()
+        return {
+            "steps": trainer.done,
+            "surfels_before": self.before,
+            "surfels": len(trainer.surfels),
+            "psnr": round(psnr, 3),
+            "held_out": [trainer.views[i].name for i in trainer.held],
+            "gamma": round(float(trainer.surfels.gamma), 4),
+            "sdf_median": round(float(trainer.surfels.sdf.abs().median()), 6) if len(trainer.surfels) else None,
+        }

@@ -1,0 +1,139 @@
+"""The state that training optimises: 2D Gaussian surfels, each with one sample of the signed distance field.
+
+Per surfel: centre μ, quaternion (third axis = oriented normal, never flipped to a camera), two log-scales, SDF sample s, and either
+spherical-harmonic colours (shading "colour") or base colour, roughness and metallic (shading "pbr"). One global sharpness γ.
+(Zhu et al., Gaussian Splatting with Discretized SDF, ICCV 2025; Huang et al., 2D Gaussian Splatting, SIGGRAPH 2024.)
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from safetensors import safe_open
+from safetensors.torch import save_file
+from torch import Tensor
+
+from gsbake.splat.reference import rotation_matrix
+from gsbake.splat.transfer import opacity
+
+#: Start values of the materials before the sigmoid: base colour .5, roughness .646, metallic .12 (dielectrics are the common case).
+ROUGHNESS_START, METALLIC_START = 0.6, -2.0
+SH0 = 0.28209479177387814  # Y_00
+SH1 = 0.4886025119029199  # Y_1m
+
+
+@dataclass
+class Surfels:
+    """All surfels of a scene; tensors have the surfel count n as first dimension, in the unit frame.
+
+    `position` (n, 3), `quaternion` (n, 4) as (w, x, y, z), `log_scale` (n, 2), `sdf` (n,), `attributes`: "sh" (n, (degree+1)², 3) or
+    "albedo" (n, 3), "roughness" (n,), "metallic" (n,) before the sigmoid; `gamma` (1,).
+    """
+
+    position: Tensor
+    quaternion: Tensor
+    log_scale: Tensor
+    sdf: Tensor
+    gamma: Tensor
+    attributes: dict[str, Tensor]
+
+    def __len__(self) -> int:
+        return self.position.shape[0]
+
+    @property
+    def pbr(self) -> bool:
+        """Whether materials (rather than plain colours) are carried."""
+        return "albedo" in self.attributes
+
+    def opacity(self) -> Tensor:
+        """Opacity (n,) from the SDF samples."""
+        return opacity(self.sdf, self.gamma)
+
+    def normal(self) -> Tensor:
+        """Oriented unit normals (n, 3)."""
+        return rotation_matrix(self.quaternion)[:, :, 2]
+
+    @property
+    def scale(self) -> Tensor:
+        """Standard deviations (n, 2) along the two tangents."""
+        return self.log_scale.exp()
+
+    def tensors(self) -> dict[str, Tensor]:
+        """All tensors by name."""
+        own = {k: getattr(self, k) for k in ("position", "quaternion", "log_scale", "sdf", "gamma")}
+        return own | {f"attributes.{k}": v for k, v in self.attributes.items()}
+
+    def features(self, camera_centre: Tensor) -> Tensor:
+        """What is blended per surfel: rgb (n, 3) seen from `camera_centre` (3,), or base colour, roughness, metallic (n, 5)."""
+        a = self.attributes
+        if self.pbr:
+            return torch.sigmoid(torch.cat([a["albedo"], a["roughness"][:, None], a["metallic"][:, None]], 1))
+        sh = a["sh"]
+        colour = 0.5 + SH0 * sh[:, 0]
+        if sh.shape[1] > 1:
+            d = torch.nn.functional.normalize(self.position.detach() - camera_centre, dim=1)
+            x, y, z = d[:, :1], d[:, 1:2], d[:, 2:]
+            colour = colour + SH1 * (z * sh[:, 2] - y * sh[:, 1] - x * sh[:, 3])
+            if sh.shape[1] > 4:
+                colour = colour + (
+                    1.0925484305920792 * (x * y * sh[:, 4] - y * z * sh[:, 5] - x * z * sh[:, 7])
+                    + 0.31539156525252005 * (2 * z * z - x * x - y * y) * sh[:, 6]
+                    + 0.5462742152960396 * (x * x - y * y) * sh[:, 8]
+                )
+        return colour
+
+    def select(self, index: Tensor) -> Surfels:
+        """The surfels at `index` (indices or a mask)."""
+        return Surfels(
+            self.position[index], self.quaternion[index], self.log_scale[index], self.sdf[index], self.gamma,
+            {k: v[index] for k, v in self.attributes.items()},
+        )  # fmt: skip
+
+    def save(self, path: Path) -> None:
+        """Write as safetensors."""
+        save_file({k: v.detach().contiguous().cpu() for k, v in self.tensors().items()}, str(path), {"format": "gsbake surfels 1"})
+
+    @staticmethod
+    def load(path: Path) -> Surfels:
+        """Read what `save` wrote."""
+        with safe_open(str(path), "pt") as file:
+            all_ = {k: file.get_tensor(k) for k in file.keys()}  # noqa: SIM118 (safetensors has no iterator)
+        attributes = {k.split(".", 1)[1]: v for k, v in all_.items() if k.startswith("attributes.")}
+        return Surfels(attributes=attributes, **{k: v for k, v in all_.items() if "." not in k})
+
+
+def quaternion_to(normals: Tensor) -> Tensor:
+    """Shortest rotations (n, 4) that turn +z to the unit normals (n, 3)."""
+    w = 1 + normals[:, 2]
+    q = torch.stack([w, -normals[:, 1], normals[:, 0], torch.zeros_like(w)], 1)
+    flipped = w < 1e-6  # −z: half a turn about x
+    q[flipped] = torch.tensor([0.0, 1.0, 0.0, 0.0], dtype=normals.dtype)
+    return torch.nn.functional.normalize(q, dim=1)
+
+
+def create(
+    points: np.ndarray, normals: np.ndarray, spacing: np.ndarray, colours: np.ndarray | None, shading: str, sh_degree: int, sdf: float, gamma: float
+) -> Surfels:
+    """New surfels at points (n, 3) with unit normals (n, 3), neighbour distance `spacing` (n,) and sRGB colours (n, 3) in 0..1 or None (grey)."""
+    n = len(points)
+    position = torch.from_numpy(np.ascontiguousarray(points, np.float32))
+    normal = torch.from_numpy(np.ascontiguousarray(normals, np.float32))
+    rgb = torch.full((n, 3), 0.5) if colours is None else torch.from_numpy(np.ascontiguousarray(colours, np.float32))
+    attributes: dict[str, Tensor]
+    if shading == "pbr":
+        linear = ((rgb + 0.055) / 1.055).clamp_min(0.04) ** 2.4
+        attributes = {
+            "albedo": torch.logit(linear.clamp(0.02, 0.98)),
+            "roughness": torch.full((n,), ROUGHNESS_START),
+            "metallic": torch.full((n,), METALLIC_START),
+        }
+    else:
+        sh = torch.zeros(n, (sh_degree + 1) ** 2, 3)
+        sh[:, 0] = (rgb - 0.5) / SH0
+        attributes = {"sh": sh}
+    # σ of .6 neighbour distances: discs overlap without smearing
+    log_scale = torch.from_numpy(np.log(0.6 * np.maximum(spacing, 1e-5)).astype(np.float32))[:, None].repeat(1, 2)
+    return Surfels(position, quaternion_to(normal), log_scale, torch.full((n,), sdf), torch.tensor([gamma]), attributes)

@@ -1,0 +1,1 @@
+"""The built-in analytic capture with known truth."""

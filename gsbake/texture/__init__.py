@@ -1,0 +1,1 @@
+"""UV atlas and baked textures."""

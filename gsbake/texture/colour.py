@@ -1,0 +1,27 @@
+"""sRGB and linear light, on 8-bit images.
+
+IEC 61966-2-1.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+_CODED = np.arange(256) / 255
+#: Linear value of each 8-bit sRGB code.
+LINEAR = np.where(_CODED <= 0.04045, _CODED / 12.92, ((_CODED + 0.055) / 1.055) ** 2.4).astype(np.float32)
+
+
+def decode_bytes(coded: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """Linear float32 values of 8-bit sRGB `coded`, of the same shape."""
+    return np.asarray(LINEAR[coded], np.float32)
+
+
+def encode_bytes(linear: NDArray[Any]) -> NDArray[np.uint8]:
+    """8-bit sRGB codes of linear values (clipped to 0..1), rounded to nearest."""
+    value = np.clip(np.asarray(linear, np.float64), 0, 1)
+    coded = np.where(value <= 0.0031308, 12.92 * value, 1.055 * value ** (1 / 2.4) - 0.055)
+    return np.asarray(np.rint(255 * coded), np.uint8)

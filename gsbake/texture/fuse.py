@@ -1,0 +1,123 @@
+"""Fusing the best views of each texel: exposure gains, weighted median, reweighted mean.
+
+Deviations are measured on square roots of linear values, which are about even in perception and in camera noise.
+"""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float32]
+Codes = NDArray[np.uint16]
+
+#: Deviations (of square roots) below this are noise, whatever the spread of a texel's views.
+NOISE = 0.02
+#: Power of a view's weight in the final mean: higher leans on the best view alone (sharper, more seams).
+SHARPNESS = 2.0
+#: Texels looked at for the gains.
+GAIN_TEXELS = 30_000
+#: Rounds of the gain solve.
+GAIN_ROUNDS = 12
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _median(value: NDArray[np.float64], weight: NDArray[np.float64], count: int, order: NDArray[np.int64]) -> float:
+    """Weighted median of the first `count` values; halfway between two when the weight splits evenly."""
+    total = 0.0
+    for k in range(count):
+        order[k] = k
+        total += weight[k]
+        m = k
+        while m > 0 and value[order[m - 1]] > value[order[m]]:
+            order[m - 1], order[m] = order[m], order[m - 1]
+            m -= 1
+    run = 0.0
+    for k in range(count):
+        run += weight[order[k]]
+        if run > 0.5 * total * (1 + 1e-9):
+            return value[order[k]]
+        if run > 0.5 * total * (1 - 1e-9) and k + 1 < count:
+            return 0.5 * (value[order[k]] + value[order[k + 1]])
+    return value[order[count - 1]]
+
+
+@numba.njit(cache=True, parallel=True, error_model="numpy")
+def fuse(values: Codes, weights: Floats, views: NDArray[np.int16], gains: Floats) -> tuple[Floats, NDArray[np.int32], Floats]:
+    """Fused values (n, c), number of views (n,) and confidence (n,) 0..1.
+
+    `values` (n, keep, c) are coded as `gather` does; `weights` (n, keep); `views` (n, keep); `gains` (views, c).
+    """
+    count, keep, channels = values.shape
+    out = np.zeros((count, channels), np.float32)
+    seen = np.zeros(count, np.int32)
+    confidence = np.zeros(count, np.float32)
+    for n in numba.prange(count):
+        root = np.zeros((channels, keep))
+        weight = np.zeros(keep)
+        order = np.zeros(keep, np.int64)
+        m = 0
+        for k in range(keep):
+            if weights[n, k] > 0:
+                weight[m] = weights[n, k]
+                for c in range(channels):
+                    root[c, m] = values[n, k, c] / 65535.0 / np.sqrt(gains[views[n, k], c])
+                m += 1
+        seen[n] = m
+        if m == 0:
+            continue
+        deviation = np.zeros(keep)
+        for c in range(channels):
+            centre = _median(root[c], weight, m, order)
+            for k in range(m):
+                deviation[k] += (root[c, k] - centre) ** 2 / channels
+        for k in range(m):
+            deviation[k] = np.sqrt(deviation[k])
+        spread = NOISE + _median(deviation, weight, m, order)
+        best = 0.0
+        for k in range(m):
+            best = max(best, weight[k])
+        total, plain = 0.0, 0.0
+        for k in range(m):
+            trust = np.exp(-0.5 * (deviation[k] / spread) ** 2)
+            w = (weight[k] / best) ** SHARPNESS * trust
+            plain += weight[k] / best * trust
+            total += w
+            for c in range(channels):
+                out[n, c] += w * root[c, k] ** 2
+        for c in range(channels):
+            out[n, c] /= max(total, 1e-12)
+        confidence[n] = 1 - np.exp(-plain)
+    return out, seen, confidence
+
+
+def solve_gains(values: Codes, weights: Floats, views: NDArray[np.int16], count: int) -> Floats:
+    """Gain (count, c) of each view against the others, its geometric mean 1, from texels that several views share.
+
+    Alternates between each texel's weighted median and each view's median ratio to it, in logarithms.
+    """
+    channels = values.shape[2]
+    several = np.flatnonzero((weights > 0).sum(1) >= 3)
+    chosen = several[:: max(1, len(several) // GAIN_TEXELS)]
+    gains = np.zeros((count, channels))
+    if len(chosen) < 100:
+        return np.ones((count, channels), np.float32)
+    linear = (values[chosen] / 65535.0) ** 2
+    usable = (weights[chosen] > 0) & (linear > 0.004).all(2) & (linear < 0.96).all(2)
+    logs = np.where(usable[..., None], np.log(np.maximum(linear, 1e-4)), np.nan)
+    view = np.maximum(views[chosen], 0)
+    enough = usable.sum(1) >= 3
+    logs, usable, view = logs[enough], usable[enough], view[enough]
+    if len(logs) < 100:
+        return np.ones((count, channels), np.float32)
+    for _ in range(GAIN_ROUNDS):
+        centre = np.nanmedian(logs - gains[view], axis=1, keepdims=True)
+        ratio = logs - centre
+        for v in range(count):
+            mine = ratio[(view == v) & usable]
+            # Few shared texels say little: shrink towards no gain.
+            if len(mine):
+                gains[v] = np.median(mine, axis=0) * len(mine) / (len(mine) + 50)
+        gains -= gains.mean(0)
+    return np.exp(np.clip(gains, -1.5, 1.5)).astype(np.float32)

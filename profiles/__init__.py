@@ -1,0 +1,1 @@
+"""The TOML profiles that ship with gsbake."""

@@ -1,0 +1,8 @@
+"""The stages of a bake, in order; each module defines `STAGE` and is imported only when it is asked for."""
+
+from __future__ import annotations
+
+from gsbake.pipeline.registry import Registry
+
+#: Stage names in the order they run, and where each is declared.
+REGISTRY = Registry({name: f"stages.{name}:STAGE" for name in ("ingest", "poses", "train", "refine", "mesh", "bake", "export", "report")})

@@ -1,0 +1,281 @@
+"""Meshes and views to textures: UV atlas, normal map, occlusion, and what the views show, as linear half-float masters."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+from gsbake.pipeline.errors import BadInputError
+from gsbake.pipeline.stage import Context, Stage
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from gsbake.surface.raycast import RayCaster
+    from gsbake.texture.atlas import Atlas
+    from gsbake.texture.normals import Detail
+    from gsbake.texture.project import Blended
+    from gsbake.texture.texels import Texels
+
+#: Occlusion is smooth: it is traced on at most this many texels along the edge and enlarged.
+OCCLUSION_SIZE = 1024
+#: Held-out photos count this much: they fill only what no other photo saw, so that figures taken on them stay honest.
+HELD_OUT_WEIGHT = 1e-4
+#: Within this share of a photo's longer side from the mask's border, pixels count less.
+MASK_MARGIN = 0.008
+#: Rendered materials count where the surfels are at least this opaque.
+SOLID = 0.8
+
+
+@dataclass(frozen=True)
+class Surface:
+    """The light mesh cut into charts.
+
+    Per atlas vertex `position` (v, 3), `normal` (v, 3), `tangent` (v, 4); its texels, their points `at` (n, 3) and unit normals `facing`
+    (n, 3); `diagonal` of the bounding box and `texel` edge in the unit frame.
+    """
+
+    atlas: Atlas
+    position: NDArray[np.float64]
+    normal: NDArray[np.float64]
+    tangent: NDArray[np.float32]
+    texels: Texels
+    at: NDArray[np.float32]
+    facing: NDArray[np.float32]
+    caster: RayCaster
+    diagonal: float
+    texel: float
+
+
+def run(ctx: Context) -> dict[str, Any]:
+    """Write `mesh.safetensors` and the EXR masters; return the figures of the atlas and the coverage."""
+    import numpy as np
+
+    from gsbake.texture.flood import continue_over_surface, flood
+    from gsbake.texture.masters import write_exr
+    from gsbake.texture.normals import normal_map
+
+    settings = ctx.settings.bake
+    vertices, faces = _mesh(ctx, "mesh.ply")
+    surface = _unwrap(ctx, vertices, faces)
+    texels = surface.texels
+    ctx.check_stop()
+    with ctx.part("normals"):
+        dense, detail = _detail(ctx, surface)
+        tangent = texels.interpolate(surface.tangent, surface.atlas.faces)
+        coded = normal_map(detail, texels.interpolate(surface.normal, surface.atlas.faces), tangent)
+        if not settings.normal_map:
+            coded[:] = (0.5, 0.5, 1.0)
+    ctx.check_stop()
+    with ctx.part("occlusion"):
+        open_share = _occlusion(ctx, surface, dense, detail)
+    with ctx.part("projection"):
+        blended = _project_materials(ctx, surface) if ctx.settings.splat.shading == "pbr" else _project_photos(ctx, surface)
+    with ctx.part("flood"):
+        if not blended.seen.any():
+            raise BadInputError("bake: no photo sees the mesh; poses and mesh do not belong together, run from the poses stage again.")
+        values = continue_over_surface(blended.values, blended.seen, texels, faces, len(vertices))
+        if values.shape[1] == 3:
+            constant = np.tile(np.array([settings.roughness, 0.0], np.float32), (len(texels), 1))
+            values = np.concatenate([values, constant], 1)
+        values = np.clip(values, 0, 1)
+        coverage = np.stack([np.ones(len(texels), np.float32), blended.seen.astype(np.float32), blended.confidence], 1)
+        packed = np.concatenate([values[:, :3], open_share[:, None], values[:, 3:5], coded], 1)
+        image = flood(texels.image(packed), texels.covered(), rim=max(2, settings.size // 256))
+    with ctx.part("write"):
+        write_exr(ctx.out / "base_color.exr", image[..., 0:3])
+        write_exr(ctx.out / "orm.exr", image[..., 3:6])
+        write_exr(ctx.out / "normal.exr", image[..., 6:9])
+        write_exr(ctx.out / "coverage.exr", texels.image(coverage))
+        _save_mesh(ctx, surface)
+    unseen = float(1 - blended.seen.mean())
+    if unseen > 0.25:
+        ctx.warn(f"bake: {unseen:.0%} of the surface was seen by no photo; its colours are continued from what was seen.")
+    return {
+        "charts": surface.atlas.charts,
+        "fill": surface.atlas.fill,
+        "texels": len(texels),
+        "vertices": len(surface.position),
+        "faces": len(surface.atlas.faces),
+        "texel_edge": surface.texel,
+        "unseen_share": unseen,
+        "median_views": float(np.median(blended.views)),
+        "detail_share": float(detail.found.mean()),
+        "detail_bound": detail.bound,
+        "largest_gain": float(np.exp(np.abs(np.log(blended.gains)).max())),
+    }
+
+
+def _mesh(ctx: Context, name: str) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Vertices and faces of a PLY of the mesh stage."""
+    import numpy as np
+    import trimesh
+
+    path = ctx.inputs["mesh"] / name
+    try:
+        mesh: Any = trimesh.load(path, process=False)
+        vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
+    except (OSError, ValueError, AttributeError, IndexError, KeyError) as error:
+        raise BadInputError(f"{path} is not a readable triangle mesh ({error}); run the mesh stage again.") from error
+    if len(faces) == 0 or not np.isfinite(vertices).all():
+        raise BadInputError(f"{path} has no triangles or positions that are not numbers; run the mesh stage again or replace the file.")
+    return vertices, faces
+
+
+def _unwrap(ctx: Context, vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> Surface:
+    """Atlas, vertex frames and texels of the light mesh."""
+    import numpy as np
+
+    from gsbake.gltf.tangents import tangents
+    from gsbake.surface.raycast import RayCaster
+    from gsbake.texture.atlas import make_atlas
+    from gsbake.texture.normals import vertex_normals
+    from gsbake.texture.texels import rasterise
+
+    size = ctx.settings.bake.size
+    with ctx.part("atlas"):
+        try:
+            atlas = make_atlas(vertices, faces, size)
+        except ValueError as error:
+            raise BadInputError(f"bake: {error}; raise bake.size or lower mesh.faces.") from error
+    with ctx.part("texels"):
+        position, normal = vertices[atlas.source], vertex_normals(vertices, faces)[atlas.source]
+        frames = tangents(position, normal, atlas.uv, atlas.faces)
+        atlas = replace(atlas, source=atlas.source[frames.source], uv=atlas.uv[frames.source], faces=frames.faces)
+        position, normal = position[frames.source], normal[frames.source]
+        texels = rasterise(atlas.uv, atlas.faces, size)
+        facing = texels.interpolate(normal, atlas.faces)
+        facing /= np.maximum(np.linalg.norm(facing, axis=1, keepdims=True), 1e-12)
+        corner = vertices[faces]
+        area = 0.5 * np.linalg.norm(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=1).sum()
+    ctx.progress(1, 4, "atlas", charts=atlas.charts, fill=atlas.fill)
+    return Surface(
+        atlas, position, normal, frames.tangent, texels, texels.interpolate(position, atlas.faces), facing,
+        RayCaster(vertices, faces, ctx.threads), float(np.linalg.norm(np.ptp(vertices, axis=0))),
+        float(np.sqrt(area / (atlas.fill * size * size))),
+    )  # fmt: skip
+
+
+def _detail(ctx: Context, surface: Surface) -> tuple[tuple[RayCaster, NDArray[np.float64]], Detail]:
+    """The dense surface with its vertex normals, and what of it each texel shows."""
+    from gsbake.surface.raycast import RayCaster
+    from gsbake.texture.normals import find_detail, vertex_normals
+
+    vertices, faces = _mesh(ctx, "dense.ply")
+    caster, normals = RayCaster(vertices, faces, ctx.threads), vertex_normals(vertices, faces)
+    return (caster, normals), find_detail(surface.at, surface.facing, caster, normals, surface.diagonal)
+
+
+def _occlusion(ctx: Context, surface: Surface, dense: tuple[RayCaster, NDArray[np.float64]], detail: Detail) -> NDArray[np.float32]:
+    """Open share of the hemisphere per texel (n,), traced on the dense surface where there is one."""
+    import cv2
+    import numpy as np
+
+    from gsbake.texture.flood import flood
+    from gsbake.texture.normals import find_detail
+    from gsbake.texture.occlusion import occlusion, smoothed
+    from gsbake.texture.texels import rasterise
+
+    rays, size = ctx.settings.bake.occlusion_rays, surface.texels.size
+    if rays == 0:
+        return np.ones(len(surface.texels), np.float32)
+    texels = surface.texels
+    if size > OCCLUSION_SIZE:
+        texels = rasterise(surface.atlas.uv, surface.atlas.faces, OCCLUSION_SIZE)
+        facing = texels.interpolate(surface.normal, surface.atlas.faces)
+        detail = find_detail(texels.interpolate(surface.position, surface.atlas.faces), facing, *dense, surface.diagonal)
+    offset = 0.002 * surface.diagonal
+
+    def each(done: int, total: int) -> None:
+        ctx.check_stop()
+        ctx.progress(done, total, "occlusion")
+
+    value = np.ones(len(texels), np.float32)
+    for mine, caster in ((detail.found, dense[0]), (~detail.found, surface.caster)):
+        if mine.any():
+            value[mine] = occlusion(detail.position[mine], detail.normal[mine], caster, rays, offset, each)
+    value = smoothed(texels, value, detail.position, detail.normal, reach=3 * surface.texel * size / texels.size)
+    if texels is surface.texels:
+        return value
+    image = flood(texels.image(value), texels.covered(), rim=2)[..., 0]
+    large = cv2.resize(image, (size, size), interpolation=cv2.INTER_LINEAR)
+    return np.asarray(large.ravel()[surface.texels.index], np.float32)
+
+
+def _project_photos(ctx: Context, surface: Surface) -> Blended:
+    """Base colour (n, 3) from the photos at their stored size."""
+    import numpy as np
+
+    from gsbake.capture.posed import PosedPhotos
+    from gsbake.splat.views import held_out
+    from gsbake.texture.colour import decode_bytes
+    from gsbake.texture.project import ProjectionBlender, mask_weights
+
+    posed = PosedPhotos.open(ctx.inputs["poses"])
+    aside = set(held_out(len(posed), ctx.settings.train.holdout))
+    blender = ProjectionBlender(surface.at, surface.facing, surface.caster, 3, surface.texel)
+    for index in range(len(posed)):
+        ctx.check_stop()
+        view = posed.view(index)
+        margin = MASK_MARGIN * max(view.camera.width, view.camera.height)
+        weights = None if view.mask is None else mask_weights(view.mask, margin)
+        blender.add(view.camera, decode_bytes(view.rgb), weights, HELD_OUT_WEIGHT if index in aside else 1.0)
+        ctx.progress(index + 1, len(posed), "photos onto the texture")
+    blended = blender.result(solve_exposure=ctx.settings.bake.equalise)
+    if ctx.settings.bake.equalise:
+        spread = float(np.exp(np.abs(np.log(blended.gains)).max()))
+        ctx.decide("exposure", f"equalised by up to {spread:.2f}x", f"{len(posed)} photos compared on the surface")
+    return blended
+
+
+def _project_materials(ctx: Context, surface: Surface) -> Blended:
+    """Base colour, roughness, metallic (n, 5) from the trained surfels, rendered at the photos' poses."""
+    import numpy as np
+
+    from gsbake.capture.posed import PosedPhotos
+    from gsbake.splat.render import SurfelRenderer
+    from gsbake.texture.project import ProjectionBlender, mask_weights
+
+    posed = PosedPhotos.open(ctx.inputs["poses"])
+    renderer = SurfelRenderer.load(ctx.inputs["refine"])
+    blender = ProjectionBlender(surface.at, surface.facing, surface.caster, 5, surface.texel)
+    size = ctx.settings.train.max_size
+    for index, full in enumerate(posed.cameras.cameras):
+        ctx.check_stop()
+        shrink = min(1.0, size / max(full.width, full.height))
+        camera = full.scaled(max(1, round(full.width * shrink)), max(1, round(full.height * shrink)))
+        buffers = renderer.gbuffer(camera)
+        image = np.dstack([buffers["albedo"], buffers["roughness"], buffers["metallic"]])
+        solid = (buffers["alpha"] > SOLID).astype(np.uint8) * 255
+        blender.add(camera, image, mask_weights(solid, MASK_MARGIN * size))
+        ctx.progress(index + 1, len(posed), "materials onto the texture")
+    return blender.result()
+
+
+def _save_mesh(ctx: Context, surface: Surface) -> None:
+    """Write the cut mesh with its frames."""
+    import numpy as np
+    from safetensors.numpy import save_file
+
+    save_file(
+        {
+            "position": np.ascontiguousarray(surface.position, np.float32),
+            "normal": np.ascontiguousarray(surface.normal, np.float32),
+            "tangent": np.ascontiguousarray(surface.tangent, np.float32),
+            "uv": np.ascontiguousarray(surface.atlas.uv, np.float32),
+            "faces": np.ascontiguousarray(surface.atlas.faces, np.int32),
+        },
+        ctx.out / "mesh.safetensors",
+    )
+
+
+STAGE = Stage(
+    name="bake",
+    version=1,
+    title="Textures",
+    run=run,
+    needs=("poses", "refine", "mesh"),
+    settings=("bake.*", "splat.shading", "train.max_size", "train.holdout"),
+    uses_device=True,
+)

@@ -1,0 +1,234 @@
+"""Surfels to a mesh: depth maps rendered at the photos' poses, one distance field, marching cubes, clean-up, decimation."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from gsbake.pipeline.errors import BadInputError
+from gsbake.pipeline.stage import Context, Stage
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from gsbake.capture.posed import PosedPhotos
+    from gsbake.surface.resolution import Resolution
+    from gsbake.surface.spool import ViewSpool
+    from gsbake.surface.tsdf import SparseTsdf
+
+#: The object lives in the unit sphere; a little more, so that its outermost point is not cut.
+BALL = 1.05
+#: Truncation in cells, at least and at most; between them three times the depth noise.
+TRUNCATION_CELLS = (4.0, 10.0)
+#: Holes with more border edges than this are openings, not holes, when nothing tells inside from outside.
+MAX_HOLE_EDGES = 400
+
+
+def run(ctx: Context) -> dict[str, Any]:
+    """Write `dense.ply` and `mesh.ply`; return counts, the cell and the errors."""
+    import tempfile
+
+    from gsbake.capture.posed import PosedPhotos
+    from gsbake.surface.spool import ViewSpool
+
+    posed = PosedPhotos.open(ctx.inputs["poses"])
+    points, normals, weights = _samples(ctx.inputs["refine"])
+    lower, upper, resolution = _choose(ctx, posed, points)
+    with tempfile.TemporaryDirectory(dir=ctx.checkpoint, prefix="depth-") as folder:
+        spool = ViewSpool(Path(folder))
+        with ctx.part("depth"):
+            _render(ctx, posed, spool, resolution)
+        noise = _noise(spool)
+        cells = min(max(3 * noise / resolution.cell, TRUNCATION_CELLS[0]), TRUNCATION_CELLS[1])
+        ctx.decide("truncation", f"{cells:.1f} cells", f"median depth difference between neighbouring views {noise / resolution.cell:.2f} cells")
+        field = _field(ctx, spool, lower, upper, resolution, cells * resolution.cell, posed.has_masks, (points, normals, weights))
+        with ctx.part("marching"):
+            dense = field.mesh(close=ctx.settings.mesh.holes == "close")
+        del field
+        if len(dense[1]) == 0:
+            raise BadInputError(
+                "mesh: the trained surfels show no surface inside the object's sphere; look at the training figures in the report, "
+                "give masks, or train longer (train.iterations)."
+            )
+        return _finish(ctx, dense, spool, resolution, noise)
+
+
+def _samples(folder: Path) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """The surfels on their zero set: points (n, 3), outward normals (n, 3), weights (n,) by area; those in the ball."""
+    import numpy as np
+
+    from gsbake.splat.surfels import Surfels
+
+    surfels = Surfels.load(folder / "surfels.safetensors")
+    normal = surfels.normal().detach().cpu().numpy().astype(np.float64)
+    sdf = surfels.sdf.detach().cpu().numpy().astype(np.float64).reshape(-1, 1)
+    points = surfels.position.detach().cpu().numpy().astype(np.float64) - sdf * normal
+    weights = surfels.scale.detach().cpu().numpy().astype(np.float64).prod(1)
+    keep = np.isfinite(points).all(1) & (np.linalg.norm(points, axis=1) <= BALL)
+    if keep.sum() < 10:
+        raise BadInputError("mesh: fewer than ten surfels lie in the object's sphere; the training failed, see its figures in the report.")
+    weights = weights[keep]
+    return points[keep], normal[keep], weights / max(float(np.median(weights)), 1e-12)
+
+
+def _choose(ctx: Context, posed: PosedPhotos, points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64], Resolution]:
+    """The object's box, padded, and the cell, with its reason logged."""
+    import numpy as np
+
+    from gsbake.surface.resolution import choose, pixel_footprint, surfel_spacing
+
+    lower, upper = points.min(0), points.max(0)
+    size = ctx.settings.train.max_size
+    cameras = []
+    for camera in posed.cameras.cameras:
+        shrink = min(1.0, size / max(camera.width, camera.height))
+        cameras.append(camera.scaled(max(1, round(camera.width * shrink)), max(1, round(camera.height * shrink))))
+    settings = ctx.settings.mesh
+    resolution = choose(
+        float((upper - lower).max()),
+        surfel_spacing(points),
+        pixel_footprint(cameras, (lower + upper) / 2),
+        settings.resolution,
+        settings.max_resolution,
+    )
+    ctx.decide("field resolution", f"{resolution.cells} cells of {resolution.cell:.4g}", resolution.reason)
+    pad = 16 * resolution.cell  # room for the truncation and for the survey's border layers
+    return np.maximum(lower - pad, -BALL - pad), np.minimum(upper + pad, BALL + pad), resolution
+
+
+def _render(ctx: Context, posed: PosedPhotos, spool: ViewSpool, resolution: Resolution) -> None:
+    """Depth and normals at every photo's pose into the spool."""
+    from gsbake.splat.render import SurfelRenderer
+    from gsbake.surface.views import DepthView
+
+    renderer = SurfelRenderer.load(ctx.inputs["refine"], ctx.device)
+    for index in range(len(posed)):
+        ctx.check_stop()
+        photo = posed.view(index, ctx.settings.train.max_size)
+        buffers = renderer.gbuffer(photo.camera)
+        spool.append(DepthView.from_gbuffer(photo.camera, buffers, photo.mask, TRUNCATION_CELLS[0] * resolution.cell), buffers["normal"])
+        ctx.progress(index + 1, len(posed), "depth maps")
+
+
+def _noise(spool: ViewSpool) -> float:
+    """Median disagreement (unit frame) of neighbouring views' depths; 0 when no two views overlap."""
+    import numpy as np
+
+    from gsbake.surface.views import depth_noise
+
+    views = range(0, len(spool), max(1, len(spool) // 12))
+    directions = np.stack([spool.view(index).camera.view_direction for index in range(len(spool))])
+    gaps = []
+    for index in views:
+        closeness = directions @ directions[index]
+        closeness[index] = -2
+        gap = depth_noise(spool.view(index), spool.view(int(closeness.argmax())))
+        if gap is not None:
+            gaps.append(gap)
+    return float(np.median(gaps)) if gaps else 0.0
+
+
+def _field(
+    ctx: Context,
+    spool: ViewSpool,
+    lower: NDArray[np.float64],
+    upper: NDArray[np.float64],
+    resolution: Resolution,
+    truncation: float,
+    masks: bool,
+    samples: tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]],
+) -> SparseTsdf:
+    """The distance field, from depth maps or from the surfels' own samples."""
+    from gsbake.surface.imls import imls_field
+    from gsbake.surface.tsdf import SparseTsdf
+
+    field = SparseTsdf(lower, upper, resolution.cell, truncation, ball=BALL, solid=masks)
+    with ctx.part("survey"):
+        for done, view in enumerate(spool):
+            ctx.check_stop()
+            field.survey(view)
+            ctx.progress(done + 1, 2 * len(spool), "fusing")
+    with ctx.part("filling"):
+        field.allocate()
+    with ctx.part("fusion"):
+        if ctx.settings.mesh.field == "imls":
+            points, normals, weights = samples
+            field.set_field(imls_field(field.lattice, points, normals, truncation, weights))
+        else:
+            for done, view in enumerate(spool):
+                ctx.check_stop()
+                field.integrate(view)
+                ctx.progress(len(spool) + done + 1, 2 * len(spool), "fusing")
+    return field
+
+
+def _finish(
+    ctx: Context, dense: tuple[NDArray[np.float64], NDArray[np.int32]], spool: ViewSpool, resolution: Resolution, noise: float
+) -> dict[str, Any]:
+    """Clean, refine along the normals, decimate, write."""
+    from gsbake.surface import clean
+    from gsbake.surface.ply import write_ply
+
+    settings = ctx.settings.mesh
+    vertices, faces = dense
+    with ctx.part("clean"):
+        vertices, faces, dropped = clean.drop_small(vertices, faces, settings.min_component)
+        if settings.normal_reach > 0:
+            vertices = _follow(spool, vertices, faces, settings.normal_reach, resolution.cell)
+        vertices = clean.smooth(vertices, faces, settings.smooth)
+        shape = clean.topology(vertices, faces)
+        if not shape.watertight:
+            vertices, faces = clean.repair(vertices, faces)
+            if settings.holes == "close":
+                vertices, faces = clean.close_holes(vertices, faces, MAX_HOLE_EDGES)
+            shape = clean.topology(vertices, faces)
+        write_ply(ctx.out / "dense.ply", vertices, faces)
+    ctx.check_stop()
+    with ctx.part("decimate"):
+        low_vertices, low_faces, error = clean.decimate(vertices, faces, settings.faces)
+        low = clean.topology(low_vertices, low_faces)
+        if low.non_manifold_edges:
+            low_vertices, low_faces = clean.repair(low_vertices, low_faces)
+            low = clean.topology(low_vertices, low_faces)
+        write_ply(ctx.out / "mesh.ply", low_vertices, low_faces)
+    if error > 2 * resolution.cell:
+        ctx.warn(f"mesh: decimation to {len(low_faces)} faces moves the surface by up to {error / resolution.cell:.1f} cells; raise mesh.faces to keep it.")
+    return {
+        "vertices": len(low_vertices),
+        "faces": len(low_faces),
+        "dense_vertices": len(vertices),
+        "dense_faces": len(faces),
+        "cell": resolution.cell,
+        "cells": resolution.cells,
+        "depth_noise_cells": noise / resolution.cell,
+        "components": low.components,
+        "dropped_components": dropped,
+        "watertight": low.watertight,
+        "border_edges": low.border_edges,
+        "decimation_error_cells": error / resolution.cell,
+    }
+
+
+def _follow(
+    spool: ViewSpool, vertices: NDArray[np.float64], faces: NDArray[np.int32], reach: float, cell: float
+) -> NDArray[np.float64]:
+    """Move the dense vertices so that they agree with the normals that the views show."""
+    from gsbake.surface.normals import NormalGather, follow_normals
+
+    gather = NormalGather(vertices, tolerance=3 * cell)
+    for index, view in enumerate(spool):
+        gather.add(view, spool.normal(index))
+    target, trust = gather.normals()
+    return follow_normals(vertices, faces, target, trust, reach, limit=1.5 * cell)
+
+
+STAGE = Stage(
+    name="mesh",
+    version=1,
+    title="Mesh",
+    run=run,
+    needs=("poses", "refine"),
+    settings=("mesh.*", "train.max_size"),
+    uses_device=True,
+)

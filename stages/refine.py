@@ -1,0 +1,42 @@
+"""Stage refine: SDF-guided pruning and densifying of the trained surfels, then a short fine-tune."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from gsbake.pipeline.stage import Context, Stage
+
+
+def run(ctx: Context) -> dict[str, Any]:
+    """Prune, densify and fine-tune; writes the same files as train and reports the counts before and after."""
+    from gsbake.capture.posed import PosedPhotos
+    from gsbake.splat.refine import prune_and_densify
+    from gsbake.splat.session import Session
+    from gsbake.splat.surfels import Surfels
+
+    settings = ctx.settings
+    posed = PosedPhotos.open(ctx.inputs["poses"])
+    surfels = Surfels.load(ctx.inputs["train"] / "surfels.safetensors")
+    light = None
+    if (ctx.inputs["train"] / "light.safetensors").exists():
+        from gsbake.light.environment import EnvironmentLight
+
+        light = EnvironmentLight.load(ctx.inputs["train"] / "light.safetensors")
+    with ctx.part("prune and densify"):
+        surfels, counts = prune_and_densify(surfels, posed, settings.refine, settings.train.max_size, ctx.seed)
+    for reason, number in counts.items():
+        ctx.decide(f"refine: {reason}", str(number), "SDF samples, silhouettes and visibility of the trained surfels")
+    session = Session(ctx, posed, surfels, light, settings.refine.iterations, 0.0, densify=False)
+    return session.run() | {"counts": counts}
+
+
+STAGE = Stage(
+    name="refine",
+    version=1,
+    title="refine surfels",
+    run=run,
+    needs=("poses", "train"),
+    settings=("refine.*", "train.max_size", "train.holdout", "train.early_stop", "train.lr_*", "splat.*", "loss.*"),
+    uses_device=True,
+    seeded=True,
+)

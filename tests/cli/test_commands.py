@@ -1,0 +1,228 @@
+"""The command line on a toy pipeline: what it prints, writes and remembers, and how it exits."""
+
+from __future__ import annotations
+
+import json
+import signal
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from gsbake.cli import main
+from tests.cli import toy_bake
+
+
+@dataclass(frozen=True)
+class End:
+    """How a command ended."""
+
+    code: int
+    out: str
+    err: str
+
+    @property
+    def json(self) -> Any:
+        return json.loads(self.out)
+
+
+Run = Callable[..., End]
+
+
+@pytest.fixture
+def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> Iterator[Run]:
+    """Run a command in this process, in an empty current folder, over the toy stages."""
+    import gsbake.cli.session
+
+    monkeypatch.setattr(gsbake.cli.session, "REGISTRY", toy_bake.REGISTRY)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "200")
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+
+    def command(*arguments: object) -> End:
+        monkeypatch.setattr(sys, "argv", ["gsbake", *map(str, arguments)])
+        code: Any = 0
+        try:
+            main()
+        except SystemExit as error:
+            code = error.code
+        captured = capsys.readouterr()
+        return End(int(code or 0), captured.out, captured.err)
+
+    yield command
+    for number, handler in handlers.items():
+        signal.signal(number, handler)
+
+
+@pytest.fixture
+def capture(tmp_path: Path) -> Path:
+    folder = tmp_path / "tankard"
+    for name in ("images/a.jpg", "images/b.jpg", "images/c.jpg", "masks/a.png", "gt/secret.jpg"):
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text(name)
+    return folder
+
+
+def test_run_puts_the_results_and_then_serves_them(run: Run, capture: Path, tmp_path: Path) -> None:
+    end = run("run", capture)
+    out = tmp_path / "out" / "tankard"
+    assert end.code == 0, end.err
+    assert {p.name for p in out.iterdir()} >= {"asset.glb", "cameras.json", "light.hdr", "report.html", "events.jsonl"}
+    assert (out / "asset.glb").read_text() == "glb ply 30000"
+    assert "gsbake: warning (ingest): photo 3 is blurred" in end.err
+    assert "mesh: Meshing (it has not run yet)" in end.out and "asset.glb" in end.out.splitlines()[-1]
+    again = run("run", capture)
+    assert again.out.count("cached") == 4 and again.err == ""
+    manifest = json.loads(next(out.glob("stages/ingest/*/manifest.json")).read_text())
+    assert set(manifest["inputs"]["photos"]["files"]) == {"a.jpg", "b.jpg", "c.jpg"}
+    assert set(manifest["inputs"]["masks"]["files"]) == {"a.png"} and "gt" not in json.dumps(manifest["inputs"])
+
+
+def test_memory_of_the_output_folder(run: Run, capture: Path, tmp_path: Path) -> None:
+    assert run("mesh", capture, "--out", "o", "--profile", "preview", "--set", "mesh.faces=500", "--seed", 3).code == 0
+    project = json.loads((tmp_path / "o" / "project.json").read_text())
+    assert project["photos"] == str(capture / "images") and project["masks"] == str(capture / "masks")
+    assert project["profile"] == "preview" and project["overrides"] == ["mesh.faces=500"] and project["seed"] == 3
+    end = run("export", "--out", "o", "--json")
+    assert [(s["name"], s["status"]) for s in end.json["stages"]] == [("ingest", "cached"), ("mesh", "cached"), ("export", "ran")]
+    assert (tmp_path / "o" / "asset.glb").read_text() == "glb ply 500" and end.json["files"]["asset.glb"] == "o/asset.glb"
+    assert run("run", "--out", "o", "--set", "mesh.faces=600", "-q").out == ""
+    assert (tmp_path / "o" / "asset.glb").read_text() == "glb ply 600"
+    fresh = run("run", capture, "--out", "o", "--json")  # PHOTOS starts anew, with the default profile
+    assert fresh.json["stages"][1]["results"] == {"faces": 30000}
+
+
+def test_result_that_is_no_more_is_deleted_unless_edited(run: Run, capture: Path, tmp_path: Path) -> None:
+    run("run", capture, "--out", "o")
+    assert (tmp_path / "o" / "light.hdr").exists()
+    run("run", "--out", "o", "--profile", "preview")
+    assert not (tmp_path / "o" / "light.hdr").exists()
+    run("run", "--out", "o", "--profile", "relight")
+    (tmp_path / "o" / "light.hdr").write_text("mine")
+    run("run", "--out", "o", "--profile", "preview")
+    assert (tmp_path / "o" / "light.hdr").read_text() == "mine"
+
+
+def test_status_explain_and_dry_run(run: Run, capture: Path, tmp_path: Path) -> None:
+    dry = run("run", capture, "--out", "o", "--dry-run")
+    assert dry.code == 0 and "will run" in dry.out and not (tmp_path / "o").exists()
+    run("run", capture, "--out", "o")
+    states = run("status", "--out", "o", "--set", "mesh.faces=700", "--json").json["stages"]
+    assert [s["will_run"] for s in states] == [False, True, True, True]
+    assert states[1]["reasons"] == ["mesh.faces: 30000 → 700"]
+    text = run("status", "--out", "o", "--set", "mesh.faces=700").out
+    assert "mesh.faces: 30000 → 700" in text and "mesh will run first" in text
+    (capture / "images" / "b.jpg").write_text("other")
+    explained = run("explain", "ingest", "--out", "o").out
+    assert "because photos: b.jpg changed" in explained and "ingest.min_photos = 3  (default)" in explained
+    assert run("explain", "bakery", "--out", "o").err.startswith("gsbake: There is no stage 'bakery'")
+
+
+def test_replace_and_undo(run: Run, capture: Path, tmp_path: Path) -> None:
+    run("run", capture, "--out", "o")
+    mine = tmp_path / "edited.ply"
+    mine.write_text("ply mine")
+    assert run("replace", "mesh", mine, "--out", "o", "--dry-run", "--json").json == {
+        "stage": "mesh",
+        "would_replace": ["dense.ply", "mesh.ply"],
+    }
+    end = run("replace", "mesh", mine, "--out", "o")
+    assert end.code == 0 and "dense.ply, mesh.ply put in place by hand" in end.out
+    end = run("run", "--out", "o")
+    assert "mesh: replaced by hand" in end.out and (tmp_path / "o" / "asset.glb").read_text() == "glb ply mine"
+    run("replace", "mesh", "--undo", "--out", "o")
+    run("run", "--out", "o")
+    assert (tmp_path / "o" / "asset.glb").read_text() == "glb ply 30000"
+    mine.write_text("obj")
+    assert run("replace", "mesh", mine, "--out", "o").code == 42
+    assert run("replace", "mesh", tmp_path / "none.ply", "--out", "o").code == 42
+    assert run("replace", "mesh", "--out", "o").code == 2
+    wrong = run("replace", "export", mine, "--out", "o")
+    assert wrong.code == 2 and "it has asset.glb, cameras.json, light.hdr" in wrong.err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "says"),
+    [
+        (["run", "nowhere"], 42, "nowhere does not exist"),
+        (["run", "empty"], 42, "holds no photos"),
+        (["run", "two"], 42, "There are 2 photos"),
+        (["run", "tankard", "--set", "train.iteration=3"], 42, "the nearest is 'train.iterations'"),
+        (["run", "tankard", "--profile", "relihgt"], 2, "did you mean 'relight'?"),
+        (["run", "tankard", "--set", "nonsense"], 2, "--set takes section.key=value"),
+        (["run", "tankard", "--masks", "nomasks"], 42, "nomasks does not exist"),
+        (["run"], 2, "give the folder of photos"),
+        (["mesh", "--out", "new"], 2, "holds no run yet"),
+        (["run", "tankard", "--out", "tankard/images/a.jpg"], 2, "a file of that name is in the way"),
+        (["run", "tankard", "--out", "/proc/nowhere"], 42, "choose another with --out"),
+        (["run", "tankard", "--device", "cuda"], 2, "--device cuda cannot be had"),
+    ],
+)
+def test_each_mistake_has_its_sentence_and_code(
+    run: Run, capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arguments: list[str], code: int, says: str
+) -> None:
+    import gsbake.pipeline.machine
+
+    monkeypatch.setattr(gsbake.pipeline.machine, "torch_cuda_build", lambda: None)
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "two").mkdir()
+    for name in ("a.png", "b.png"):
+        (tmp_path / "two" / name).write_text(name)
+    end = run(*arguments)
+    assert end.code == code
+    errors = [line for line in end.err.splitlines() if "warning" not in line]
+    assert len(errors) == 1 and errors[0].startswith("gsbake: ") and says in errors[0]
+    machine = run(*arguments, "--json")
+    assert machine.code == code and says in machine.json["error"] and machine.json["exit_code"] == code
+
+
+def test_wrong_option_is_usage(run: Run, capture: Path) -> None:
+    assert run("run", capture, "--fast").code == 2
+    assert run("bakery").code == 2
+    assert run("run", capture, "--device", "gpu").code == 2
+
+
+def test_unforeseen_failure_is_one_sentence_with_a_traceback_saved(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    import gsbake.cli.inspect
+
+    monkeypatch.setattr(gsbake.cli.inspect, "shipped", lambda: 1 / 0)
+    end = run("profiles")
+    assert end.code == 1 and end.err.count("\n") == 1 and "ZeroDivisionError" in end.err
+    saved = Path(end.err.split("'")[-2])
+    assert "Traceback" in saved.read_text()
+    saved.unlink()
+
+
+def test_invert_masks_is_a_setting(run: Run, capture: Path, tmp_path: Path) -> None:
+    run("ingest", capture, "--out", "o", "--invert-masks")
+    assert json.loads((tmp_path / "o" / "project.json").read_text())["overrides"] == ["ingest.invert_masks=true"]
+    assert next((tmp_path / "o").glob("stages/ingest/*/photos.json")).read_text().endswith("TrueTrue")
+
+
+def test_profiles_lists_and_shows(run: Run) -> None:
+    assert set(run("profiles", "--json").json) == {"smoke", "preview", "relight", "quality", "scan"}
+    shown = run("profiles", "smoke", "--set", "mesh.faces=123", "--json").json
+    assert shown["mesh.faces"]["value"] == 123 and shown["mesh.faces"]["origin"] == "--set"
+    assert shown["train.iterations"]["origin"] == "smoke" and shown["ingest.min_photos"]["origin"] == "default"
+    assert "Training steps" in run("profiles", "smoke").out
+
+
+def test_help_imports_nothing_heavy() -> None:
+    import subprocess
+
+    start = "import sys; sys.argv = ['gsbake', '--help']; from gsbake.cli import main"
+    code = f"{start}\ntry: main()\nexcept SystemExit: pass\nprint('LOADED', *sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert "report" in done.stdout
+    loaded = set(done.stdout.split("LOADED")[1].split())
+    assert loaded.isdisjoint({"torch", "numba", "cv2", "numpy", "scipy", "trimesh", "pydantic", "rich.progress", "stages.train"})
+
+
+def test_completion_knows_stages_profiles_and_settings(monkeypatch: pytest.MonkeyPatch) -> None:
+    from gsbake.cli.options import complete_profile, complete_setting, complete_stage
+
+    assert complete_profile("pr") == ["preview"] and complete_stage("re") == ["refine", "report"]
+    assert complete_setting("mesh.fa") == ["mesh.faces="]

@@ -1,0 +1,52 @@
+"""A toy pipeline with gsbake's own stage names and results, for tests of the command line."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+from gsbake.pipeline.errors import BadInputError
+from gsbake.pipeline.registry import Registry
+from gsbake.pipeline.stage import Context, Stage
+
+
+def _ingest(ctx: Context) -> dict[str, Any]:
+    names = sorted(p.name for p in ctx.inputs["photos"].iterdir())
+    if len(names) < ctx.settings.ingest.min_photos:
+        raise BadInputError(f"There are {len(names)} photos; give more.")
+    (ctx.out / "photos.json").write_text("\n".join(names) + str("masks" in ctx.inputs) + str(ctx.settings.ingest.invert_masks))
+    ctx.warn("photo 3 is blurred")
+    return {"photos": len(names)}
+
+
+def _mesh(ctx: Context) -> dict[str, Any]:
+    for step in range(3):
+        ctx.progress(step + 1, 3, psnr=20.0 + step)
+        time.sleep(0.01)
+    for name in ("mesh.ply", "dense.ply"):
+        (ctx.out / name).write_text(f"ply {ctx.settings.mesh.faces}")
+    return {"faces": ctx.settings.mesh.faces}
+
+
+def _export(ctx: Context) -> dict[str, Any]:
+    mesh = (ctx.inputs["mesh"] / "mesh.ply").read_text()
+    (ctx.out / "asset.glb").write_text("glb " + mesh)
+    (ctx.out / "cameras.json").write_text("{}")
+    if ctx.settings.splat.shading == "pbr":
+        (ctx.out / "light.hdr").write_text("light")
+    return {"megabytes": 1.5}
+
+
+def _report(ctx: Context) -> dict[str, Any]:
+    (ctx.out / "report.html").write_text("<html>")
+    return {}
+
+
+INGEST = Stage(
+    "ingest", 1, "Reading photos", _ingest, sources=("photos", "masks", "poses"), settings=("ingest.min_photos", "ingest.invert_masks")
+)
+MESH = Stage("mesh", 1, "Meshing", _mesh, needs=("ingest",), settings=("mesh.faces",))
+EXPORT = Stage("export", 1, "Exporting", _export, needs=("mesh",), settings=("splat.shading",))
+REPORT = Stage("report", 1, "Reporting", _report, needs=("export",))
+
+REGISTRY = Registry({name: f"tests.cli.toy_bake:{name.upper()}" for name in ("ingest", "mesh", "export", "report")})

@@ -1,0 +1,9 @@
+"""What all tests share: few threads, whatever the machine has, and no writing into the checkout."""
+
+from __future__ import annotations
+
+import os
+
+# Before any library with a thread pool is imported: the tests' own pools stay small, so that runs side by side do not fight.
+for _pool in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OPENCV_FOR_THREADS_NUM"):
+    os.environ.setdefault(_pool, "2")

@@ -1,0 +1,47 @@
+"""8-bit maps: colour spaces, exact flat normals, and the size ladder."""
+
+from __future__ import annotations
+
+import io
+
+import numpy as np
+from PIL import Image
+
+from gsbake.gltf.encode import LADDER, encode_within, quantise
+
+
+def pixels(content: bytes) -> np.ndarray:
+    with Image.open(io.BytesIO(content)) as image:
+        return np.asarray(image)
+
+
+def test_colour_is_coded_in_srgb_and_the_rest_is_linear() -> None:
+    grey = np.full((4, 4, 3), 0.2140411)  # linear value of sRGB one half
+    sheets = quantise(grey, grey, np.tile([0.5, 0.5, 1.0], (4, 4, 1)))
+    assert (sheets.base_color == 128).all() and (sheets.orm == 55).all()
+    assert sheets.normal is not None and (sheets.normal == [128, 128, 255]).all()
+
+
+def test_budget_lowers_the_linear_maps_only() -> None:
+    rng = np.random.default_rng(0)
+    normal = rng.normal(size=(64, 64, 3)) * [0.2, 0.2, 0] + [0, 0, 1]
+    normal /= np.linalg.norm(normal, axis=2, keepdims=True)
+    sheets = quantise(rng.random((64, 64, 3)), rng.random((64, 64, 3)), 0.5 * normal + 0.5)
+    full, saving = encode_within(sheets, 10**9)
+    assert saving is LADDER[0] and np.array_equal(pixels(full.orm), sheets.orm)
+    size = len(full.base_color) + len(full.orm) + len(full.normal or b"")
+    less, saving = encode_within(sheets, size - 1)
+    assert saving is LADDER[1] and less.base_color == full.base_color
+    assert np.abs(pixels(less.orm).astype(int) - sheets.orm).max() <= 2
+    least, saving = encode_within(sheets, 0)
+    assert saving is LADDER[-1] and pixels(least.normal or b"").shape == (32, 32, 3)
+    vector = pixels(least.normal or b"") / 127.5 - 1
+    assert np.abs(np.linalg.norm(vector, axis=2) - 1).max() < 0.03
+
+
+def test_flat_normals_and_ends_survive_every_rung() -> None:
+    flat = np.tile([0.5, 0.5, 1.0], (8, 8, 1))
+    orm = np.tile([1.0, 0.6, 0.0], (8, 8, 1))
+    images, _ = encode_within(quantise(flat, orm, flat), 0)
+    assert (pixels(images.normal or b"") == [128, 128, 255]).all()
+    assert (pixels(images.orm)[..., [0, 2]] == [255, 0]).all()

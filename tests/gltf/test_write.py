@@ -1,0 +1,97 @@
+"""The GLB as others read it."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import shutil
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from PIL import Image
+
+from gsbake.gltf.container import pack_glb, unpack_glb
+from gsbake.gltf.png import encode_png
+from gsbake.gltf.read import parse_glb
+from gsbake.gltf.write import GltfImages, GltfMesh, build_glb
+from gsbake.pipeline.errors import BadInputError
+
+
+def test_trimesh_reads_the_same_mesh(glb: bytes, mesh: GltfMesh) -> None:
+    scene = trimesh.load(io.BytesIO(glb), file_type="glb", process=False)
+    (read,) = scene.geometry.values()
+    assert np.array_equal(read.faces, mesh.faces)
+    assert np.allclose(read.vertices, mesh.position) and np.allclose(read.vertex_normals, mesh.normal, atol=1e-6)
+    # trimesh flips v on load: its image origin is at the bottom.
+    assert np.allclose(read.visual.uv, np.column_stack([mesh.uv[:, 0], 1 - mesh.uv[:, 1]]), atol=1e-6)
+    assert read.visual.material.baseColorTexture.size == (128, 128)
+    assert read.visual.material.metallicRoughnessTexture.getpixel((0, 0)) == (250, 180, 0)
+    assert read.visual.material.normalTexture.getpixel((0, 0)) == (128, 128, 255)
+
+
+def test_own_reader_gives_back_what_was_written(glb: bytes, mesh: GltfMesh, images: GltfImages) -> None:
+    asset = parse_glb(glb, "ball")
+    assert set(asset.attributes) == {"POSITION", "NORMAL", "TANGENT", "TEXCOORD_0"}
+    assert np.array_equal(asset.attributes["TANGENT"], mesh.tangent) and np.array_equal(asset.faces, mesh.faces)
+    assert asset.images == (images.base_color, images.orm, images.normal)
+    assert asset.roles == {"base_color": 0, "orm": 1, "occlusion": 1, "normal": 2}
+    assert asset.document["asset"] == {"version": "2.0", "generator": "gsbake test", "copyright": "me", "extras": {"scale": "unknown"}}
+
+
+def test_small_meshes_use_short_indices_and_large_ones_do_not(images: GltfImages) -> None:
+    for count, kind in ((65534, 5123), (65535, 5125)):
+        column = np.zeros((count, 3), np.float32)
+        large = GltfMesh(column, column, np.zeros((count, 4), np.float32), column[:, :2], np.array([[0, 1, count - 1]], np.int32))
+        asset = parse_glb(build_glb(large, images, "n", "g"), "n")
+        assert asset.document["accessors"][4]["componentType"] == kind and asset.faces.tolist() == [[0, 1, count - 1]]
+
+
+@pytest.mark.parametrize("shape", [(1, 1, 3), (5, 7, 3), (64, 33, 3), (9, 16)])
+def test_png_is_read_back_by_pillow(shape: tuple[int, ...]) -> None:
+    rng = np.random.default_rng(1)
+    for pixels in (rng.integers(0, 256, shape, np.uint8), np.cumsum(np.ones(shape, np.uint8), 0, np.uint8), np.full(shape, 7, np.uint8)):
+        with Image.open(io.BytesIO(encode_png(pixels))) as image:
+            assert np.array_equal(np.asarray(image), pixels)
+            assert not image.info
+
+
+def test_smooth_png_is_no_larger_than_pillows() -> None:
+    x, y = np.meshgrid(np.arange(256), np.arange(256))
+    noise = np.random.default_rng(0).normal(0, 2, (256, 256))
+    pixels = np.clip(np.stack([x / 2 + noise, y / 2 + 40 + noise, (x + y) / 4 + noise], 2), 0, 255).astype(np.uint8)
+    other = io.BytesIO()
+    Image.fromarray(pixels).save(other, "PNG", optimize=True)
+    assert len(encode_png(pixels)) <= 1.03 * len(other.getvalue())
+
+
+def test_damaged_files_are_named() -> None:
+    good = pack_glb({"asset": {"version": "2.0"}}, b"abc")
+    assert unpack_glb(good, "x") == ({"asset": {"version": "2.0"}}, b"abc\0")
+    for bad in (b"", good[:-5], b"PK" + good[2:], good + b"\0\0\0\0"):
+        with pytest.raises(BadInputError, match=r"x\.glb"):
+            unpack_glb(bad, "x.glb")
+    with pytest.raises(BadInputError, match="no readable triangle mesh"):
+        parse_glb(good, "x.glb")
+
+
+def test_an_empty_mesh_is_refused(mesh: GltfMesh, images: GltfImages) -> None:
+    with pytest.raises(ValueError, match="empty"):
+        build_glb(GltfMesh(mesh.position, mesh.normal, mesh.tangent, mesh.uv, mesh.faces[:0]), images, "n", "g")
+
+
+def test_khronos_validator_finds_nothing(glb: bytes, tmp_path: Path) -> None:
+    """npm package `gltf-validator`, folder in GSBAKE_NODE_MODULES."""
+    modules = os.environ.get("GSBAKE_NODE_MODULES", "")
+    if not (shutil.which("node") and Path(modules, "gltf-validator").is_dir()):
+        pytest.skip("node or the gltf-validator package is not there")
+    (tmp_path / "a.glb").write_bytes(glb)
+    script = (
+        "const v=require(process.argv[1]+'/gltf-validator'),f=require('fs');"
+        "v.validateBytes(new Uint8Array(f.readFileSync(process.argv[2]))).then(r=>console.log(JSON.stringify(r.issues)))"
+    )
+    out = subprocess.run(["node", "-e", script, modules, str(tmp_path / "a.glb")], capture_output=True, text=True, check=True).stdout
+    assert json.loads(out)["messages"] == []

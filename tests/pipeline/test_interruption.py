@@ -1,0 +1,204 @@
+"""Kills, signals and two runs at once: whatever happens, the same command goes on and the result is whole."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import psutil
+import pytest
+
+from gsbake.pipeline.lease import Holder, Lease, boot_id
+from tests.pipeline.test_engine import total
+from tests.pipeline.toy import Sum, Toy, engine
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@pytest.fixture
+def photos(tmp_path: Path) -> Path:
+    folder = tmp_path / "photos"
+    folder.mkdir()
+    (folder / "a.txt").write_text("one two three")
+    return folder
+
+
+@pytest.fixture
+def started() -> Iterator[list[subprocess.Popen[str]]]:
+    """Processes a test started; none outlives it."""
+    processes: list[subprocess.Popen[str]] = []
+    yield processes
+    for process in processes:
+        process.kill()
+        process.communicate()
+
+
+def start(processes: list[subprocess.Popen[str]], *arguments: object) -> subprocess.Popen[str]:
+    process = subprocess.Popen(
+        [sys.executable, "-c", "from tests.pipeline.toy import main; main()", *map(str, arguments)],
+        cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    processes.append(process)
+    return process
+
+
+def wait_for(out: Path, pattern: str, seconds: float = 20.0) -> Path:
+    """The first file under `out` that matches, as soon as it is there."""
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        for path in out.glob(pattern):
+            return path
+        time.sleep(0.02)
+    raise AssertionError(f"{pattern} did not appear in {out}")
+
+
+def steps_done(out: Path) -> int:
+    return int(json.loads(wait_for(out, "stages/sum/*.checkpoint/state.json").read_text())["step"])
+
+
+def wait_until_step(out: Path, step: int) -> None:
+    end = time.monotonic() + 20
+    while steps_done(out) < step:
+        assert time.monotonic() < end
+        time.sleep(0.02)
+
+
+def test_kill_9_then_the_same_command(tmp_path: Path, photos: Path, started: list[subprocess.Popen[str]]) -> None:
+    out = tmp_path / "out"
+    process = start(started, out, photos, "chain", 60, 0.05)
+    wait_until_step(out, 5)
+    workers = psutil.Process(process.pid).children()
+    process.kill()
+    process.communicate()
+    gone, alive = psutil.wait_procs(workers, timeout=5)
+    assert gone and not alive  # the worker dies with its supervisor
+    assert list((out / "stages" / "sum").glob("*.tmp-*"))
+    assert not list((out / "stages" / "tell").glob("*")) if (out / "stages" / "tell").exists() else True
+    reached = steps_done(out)
+    again, seen = engine(out, photos, Toy(sum=Sum(steps=60, step_seconds=0.05)))
+    assert [s.status for s in again.plan()] == ["cached", "run", "waits"]
+    begin = time.monotonic()
+    states = again.run()
+    manifest = states[1].artifact.manifest  # type: ignore[union-attr]
+    assert seen.cached == ["read"] and seen.ran == ["sum", "tell"]
+    assert manifest["results"] == {"total": total(60, 3)} and manifest["resumed"]
+    assert seen.reports[0][0] == reached + 1 and time.monotonic() - begin < 30
+    left = [p.name for p in (out / "stages" / "sum").iterdir() if not p.name.startswith(".")]
+    assert left == [states[1].artifact.folder.name]  # type: ignore[union-attr]
+
+
+def test_killed_worker_is_an_interruption(tmp_path: Path, photos: Path, started: list[subprocess.Popen[str]]) -> None:
+    out = tmp_path / "out"
+    process = start(started, out, photos, "chain", 200, 0.05)
+    wait_until_step(out, 3)
+    psutil.Process(process.pid).children()[0].kill()
+    _, errors = process.communicate(timeout=20)
+    assert process.returncode == 75
+    assert "killed by the system" in errors and "Traceback" not in errors
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_signal_ends_with_75_in_seconds(tmp_path: Path, photos: Path, started: list[subprocess.Popen[str]], number: signal.Signals) -> None:
+    out = tmp_path / "out"
+    process = start(started, out, photos, "chain", 500, 0.05)
+    wait_until_step(out, 3)
+    begin = time.monotonic()
+    process.send_signal(number)
+    _, errors = process.communicate(timeout=20)
+    assert process.returncode == 75 and time.monotonic() - begin < 4
+    assert errors.startswith("Sum slowly: Stopped on request") and errors.count("\n") == 0
+    assert not list((out / "stages" / "sum").glob("*.tmp-*")) and not list((out / "stages" / "sum").glob("*.lease"))
+    assert steps_done(out) >= 3
+
+
+def test_deaf_stage_is_ended_by_force(tmp_path: Path, photos: Path, started: list[subprocess.Popen[str]]) -> None:
+    out = tmp_path / "out"
+    process = start(started, out, photos, "stubborn")
+    wait_for(out, "stages/stubborn/*.tmp-*/half.txt")
+    begin = time.monotonic()
+    process.send_signal(signal.SIGINT)
+    time.sleep(0.5)
+    process.send_signal(signal.SIGINT)  # the second one does not wait
+    _, errors = process.communicate(timeout=20)
+    assert process.returncode == 75 and time.monotonic() - begin < 4 and "by force" in errors
+    assert not [p for p in (out / "stages" / "stubborn").iterdir() if not p.name.startswith(".")]
+
+
+@pytest.mark.slow
+def test_deaf_stage_is_ended_after_the_grace(tmp_path: Path, photos: Path, started: list[subprocess.Popen[str]]) -> None:
+    process = start(started, tmp_path / "out", photos, "stubborn")
+    wait_for(tmp_path / "out", "stages/stubborn/*.tmp-*/half.txt")
+    begin = time.monotonic()
+    process.send_signal(signal.SIGINT)
+    process.communicate(timeout=20)
+    assert process.returncode == 75 and 4 < time.monotonic() - begin < 8
+
+
+def test_two_runs_at_once(tmp_path: Path, photos: Path, started: list[subprocess.Popen[str]]) -> None:
+    out = tmp_path / "out"
+    first = start(started, out, photos, "chain", 40, 0.05)
+    wait_until_step(out, 2)
+    second = start(started, out, photos, "chain", 40, 0.05)
+    ends = [json.loads(p.communicate(timeout=40)[0]) for p in (first, second)]
+    assert ends[0]["ran"] == ["read", "sum", "tell"]
+    assert "sum" not in ends[1]["ran"] and "sum" in ends[1]["cached"]
+    assert f"process {first.pid} on " in ends[1]["waited"][0]
+
+
+def dead_pid() -> int:
+    process = subprocess.Popen([sys.executable, "-c", ""])
+    process.wait()
+    return process.pid
+
+
+@pytest.mark.parametrize(
+    "holder",
+    [
+        Holder(os.uname().nodename, boot_id(), dead_pid(), time.time() - 100),
+        Holder(os.uname().nodename, "another boot", 1, 0.0),
+        Holder(os.uname().nodename, boot_id(), os.getpid(), 12345.0),  # same number, another process
+    ],
+    ids=["dead process", "other boot", "recycled pid"],
+)
+def test_lapsed_lease_is_taken_over(tmp_path: Path, holder: Holder) -> None:
+    lease = Lease(tmp_path / "x.lease")
+    lease.path.write_text(json.dumps(holder.__dict__))
+    waited: list[object] = []
+    assert lease.acquire(waited.append) == holder
+    assert waited == []
+    assert Holder.read(lease.path).pid == os.getpid()  # type: ignore[union-attr]
+    lease.release()
+    assert not lease.path.exists()
+
+
+def test_lease_of_another_host_lapses_when_its_heart_stands_still(tmp_path: Path) -> None:
+    lease = Lease(tmp_path / "x.lease", patience=0.6)
+    holder = Holder("another-host", "b", 1, 0.0, beat=3)
+    lease.path.write_text(json.dumps(holder.__dict__))
+    beats = iter(range(4, 7))
+
+    def beat(seen: Holder | None) -> None:
+        number = next(beats, None)
+        if number is not None:  # three more heartbeats, then silence
+            lease.path.write_text(json.dumps({**holder.__dict__, "beat": number}))
+
+    begin = time.monotonic()
+    taken = lease.acquire(beat)
+    lease.release()
+    assert taken is not None and taken.beat == 6
+    assert time.monotonic() - begin > 1.0  # 3 polls with news, then the patience
+
+
+def test_lease_heartbeat_moves_and_unreadable_lease_does_not_block(tmp_path: Path) -> None:
+    lease = Lease(tmp_path / "x.lease", beat=0.05)
+    lease.path.write_text("{half a")
+    assert lease.acquire() is None
+    time.sleep(0.4)
+    assert Holder.read(lease.path).beat >= 2  # type: ignore[union-attr]
+    lease.release()

@@ -1,0 +1,67 @@
+"""A person's file in place of a stage's output, and back."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from gsbake.pipeline.errors import BadInputError, UsageError
+from gsbake.pipeline.replace import folder_files, replace_output, undo_replacement
+from tests.pipeline.toy import engine
+
+
+@pytest.fixture
+def photos(tmp_path: Path) -> Path:
+    folder = tmp_path / "photos"
+    folder.mkdir()
+    (folder / "a.txt").write_text("one two three")
+    return folder
+
+
+def test_replaced_output_feeds_the_stages_after_it(tmp_path: Path, photos: Path) -> None:
+    out, mine = tmp_path / "out", tmp_path / "mine.txt"
+    mine.write_text("777")
+    first, _ = engine(out, photos)
+    own = first.run()[1].artifact
+    assert own is not None
+    artifact = replace_output(first.store, "sum", {"total.txt": mine}, own)
+    mine.unlink()  # it was copied
+    assert artifact.by_hand and artifact.manifest["replaced"] == {"total.txt": str(mine)}
+    second, seen = engine(out, photos)
+    assert [s.status for s in second.plan()] == ["cached", "replaced", "run"]
+    assert second.plan()[2].reasons == ("sum: total.txt changed",)
+    states = second.run()
+    assert seen.ran == ["tell"] and seen.cached == ["read", "sum"]
+    assert (states[2].artifact.folder / "tell.txt").read_text() == "total 777"  # type: ignore[union-attr]
+    undo_replacement(second.store, "sum")
+    third, seen = engine(out, photos)
+    third.run()
+    assert seen.ran == [] and not list((out / "stages" / "sum").glob("by-hand*"))
+    with pytest.raises(UsageError, match="was not replaced"):
+        undo_replacement(third.store, "sum")
+
+
+def test_replacing_again_drops_the_earlier_one_and_keeps_other_files(tmp_path: Path, photos: Path) -> None:
+    made, _ = engine(tmp_path / "out", photos)
+    made.run()
+    folder = tmp_path / "mine"
+    (folder / "deep").mkdir(parents=True)
+    (folder / "total.txt").write_text("1")
+    (folder / "deep" / "more.txt").write_text("more")
+    first = replace_output(made.store, "sum", folder_files(folder), None)
+    assert set(first.files) == {"total.txt", "deep/more.txt"}
+    (tmp_path / "total.txt").write_text("2")
+    second = replace_output(made.store, "sum", {"total.txt": tmp_path / "total.txt"}, first)
+    assert set(second.files) == {"total.txt", "deep/more.txt"} and (second.folder / "total.txt").read_text() == "2"
+    assert len([p for p in (tmp_path / "out" / "stages" / "sum").glob("by-hand-*")]) == 1
+
+
+def test_damaged_replacement_is_said(tmp_path: Path, photos: Path) -> None:
+    made, _ = engine(tmp_path / "out", photos)
+    made.run()
+    (tmp_path / "total.txt").write_text("2")
+    artifact = replace_output(made.store, "sum", {"total.txt": tmp_path / "total.txt"}, None)
+    (artifact.folder / "total.txt").write_text("3")
+    with pytest.raises(BadInputError, match="replace sum --undo"):
+        engine(tmp_path / "out", photos)[0].plan()

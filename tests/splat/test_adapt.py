@@ -1,0 +1,79 @@
+"""Adding and dropping surfels: budgets, inheritance, Adam's rows, files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from gsbake.splat.adam import Adam
+from gsbake.splat.adapt import Statistics, densify, prune
+from gsbake.splat.start import fibonacci_sphere, spacing
+from gsbake.splat.surfels import Surfels, create, quaternion_to
+
+
+def ball(n: int = 200, shading: str = "colour") -> Surfels:
+    points = fibonacci_sphere(n)
+    return create(points, points, spacing(points), np.full((n, 3), 0.25), shading, 1, 0.01, 1.0)
+
+
+def test_create_and_reload(tmp_path: Path) -> None:
+    for shading in ("colour", "pbr"):
+        s = ball(50, shading)
+        assert torch.allclose(s.normal(), s.position, atol=1e-5)
+        colour = s.features(torch.tensor([0.0, 0.0, 5.0]))[:, :3]
+        expected = 0.25 if shading == "colour" else ((0.25 + 0.055) / 1.055) ** 2.4  # sRGB .25 → linear
+        assert torch.allclose(colour, torch.full_like(colour, expected), atol=1e-4)
+        s.save(tmp_path / "s.safetensors")
+        again = Surfels.load(tmp_path / "s.safetensors")
+        assert all(torch.equal(v, again.tensors()[k]) for k, v in s.tensors().items())
+
+
+def test_quaternions_turn_z_to_the_normal() -> None:
+    n = torch.nn.functional.normalize(torch.randn(100, 3, generator=torch.Generator().manual_seed(0)), dim=1)
+    n[0], n[1] = torch.tensor([0.0, 0.0, -1.0]), torch.tensor([0.0, 0.0, 1.0])
+    s = ball(100)
+    s.quaternion = quaternion_to(n)
+    assert torch.allclose(s.normal(), n, atol=1e-5)
+
+
+def test_densify_keeps_the_budget_and_the_moments() -> None:
+    s, adam = ball(), Adam()
+    for name, x in s.tensors().items():
+        adam.step(name, x, torch.ones_like(x), 1e-3)
+    stats = Statistics.zeros(200)
+    stats.gradient[:30], stats.views[:] = 5.0, 1
+    s.sdf = torch.arange(200) / 1000.0
+    before = s.scale.clone()
+    big = densify(s, adam, stats, 220, large=0.0, generator=torch.Generator().manual_seed(0))
+    assert len(big) == 220
+    assert torch.all(big.sdf[200:] < 0.03)  # children inherit s, and only surfels with a gradient were chosen
+    assert adam.first["position"].shape == (220, 3) and torch.all(adam.first["position"][200:] == 0)
+    parents = torch.round(big.sdf[200:] * 1000).long()
+    assert torch.allclose(big.scale[200:], before[parents] / 1.6) and torch.allclose(big.scale[parents], before[parents] / 1.6)
+    assert densify(big, adam, Statistics.zeros(220), 300, 0.0, torch.Generator()) is big  # no gradient, no growth
+
+
+def test_prune_reasons() -> None:
+    s, adam = ball(), Adam()
+    s.sdf[3] = 50.0
+    s.log_scale[5] = 2.0
+    s.position[7] = float("nan")
+    stats = Statistics.zeros(200)
+    stats.views[:] = 1
+    stats.views[9] = 0
+    kept, index, counts = prune(s, adam, stats, 0.25)
+    assert len(kept) == 196 and set(range(200)) - set(index.tolist()) == {3, 5, 7, 9}
+    assert counts == {"transparent": 1, "too large": 1, "not finite": 1, "unseen": 1}
+
+
+def test_adam_follows_the_published_rule() -> None:
+    """Two steps by hand (Kingma and Ba 2015, algorithm 1)."""
+    adam, x = Adam(), torch.tensor([1.0])
+    adam.step("x", x, torch.tensor([2.0]), 0.1)
+    assert torch.allclose(x, torch.tensor([0.9]))
+    adam.step("x", x, torch.tensor([-1.0]), 0.1)
+    m, v = 0.9 * 0.1 * 2 + 0.1 * -1, 0.999 * 0.001 * 4 + 0.001 * 1
+    expected = 0.9 - 0.1 * (m / (1 - 0.81)) / (v / (1 - 0.999**2)) ** 0.5
+    assert torch.allclose(x, torch.tensor([expected], dtype=torch.float32))

@@ -1,0 +1,110 @@
+"""Training on a tiny scene of known surfels: it learns, it resumes to the same bits, it refines."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from gsbake.capture.cameras import Camera, CameraSet
+from gsbake.capture.posed import PosedPhotos
+from gsbake.profile.schema import Profile
+from gsbake.splat.refine import prune_and_densify
+from gsbake.splat.render import SurfelRenderer
+from gsbake.splat.start import begin, fibonacci_sphere, spacing
+from gsbake.splat.surfels import Surfels, create
+from gsbake.splat.trainer import Plan, Trainer
+from gsbake.splat.views import held_out, load_views
+
+SIZE = 48
+
+
+def look_at(eye: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    z = -eye / np.linalg.norm(eye)
+    x = np.cross(z, [0.0, 0.0, 1.0])
+    x /= np.linalg.norm(x)
+    rotation = np.stack([x, np.cross(z, x), z])
+    return rotation, -rotation @ eye
+
+
+def ball() -> Surfels:
+    """A ball of radius .8 with coloured stripes."""
+    p = fibonacci_sphere(1500)
+    stripes = 0.5 + 0.4 * np.stack([np.sin(6 * p[:, 0]), np.sin(5 * p[:, 1] + 1), np.cos(4 * p[:, 2])], 1)
+    return create(0.8 * p, p, 0.8 * spacing(p), stripes, "colour", 0, 0.001, 4.5)
+
+
+@pytest.fixture(scope="module")
+def posed(tmp_path_factory: pytest.TempPathFactory) -> PosedPhotos:
+    folder: Path = tmp_path_factory.mktemp("posed")
+    (folder / "photos").mkdir()
+    (folder / "masks").mkdir()
+    renderer = SurfelRenderer(ball(), None)
+    cameras = []
+    for i, eye in enumerate(3 * fibonacci_sphere(12) * 0.99 + 1e-3):
+        rotation, t = look_at(eye)
+        camera = Camera(f"{i:02d}", SIZE, SIZE, 60.0, 60.0, SIZE / 2, SIZE / 2, rotation, t)
+        rgb, alpha = renderer.photo(camera)
+        straight = np.where(alpha[..., None] > 0.1, rgb / np.maximum(alpha[..., None], 0.1), 0)
+        cv2.imwrite(str(folder / "photos" / f"{i:02d}.png"), np.round(255 * straight[..., ::-1].clip(0, 1)).astype(np.uint8))
+        cv2.imwrite(str(folder / "masks" / f"{i:02d}.png"), np.round(255 * alpha).astype(np.uint8))
+        cameras.append(camera)
+    CameraSet(tuple(cameras)).save(folder / "cameras.json")
+    return PosedPhotos.open(folder)
+
+
+def profile(**train: object) -> Profile:
+    base = {"iterations": 60, "max_size": SIZE, "init_surfels": 400, "holdout": 6, "early_stop": False, "lr_position": 3e-3} | train
+    return Profile.model_validate({"train": base, "splat": {"max_surfels": 600}})
+
+
+def trainer(posed: PosedPhotos, p: Profile) -> Trainer:
+    surfels, kind, _ = begin(posed, p.train, p.splat, 0)
+    assert kind == p.train.init or kind == "hull"
+    full, half = load_views(posed, p.train.max_size)
+    plan = Plan(p.train, p.splat, p.loss, p.train.iterations, 0.5, True, 0)
+    return Trainer(plan, surfels, None, full, half, held_out(len(full), p.train.holdout))
+
+
+def test_held_out() -> None:
+    assert held_out(12, 6) == [3, 9] and held_out(5, 8) == [] and held_out(10, 0) == []
+
+
+def test_learns(posed: PosedPhotos) -> None:
+    t = trainer(posed, profile(iterations=150, init_surfels=1000))
+    before = t.evaluate()
+    while t.done < t.end:
+        t.step()
+    assert t.evaluate() > max(before + 3, 19)
+    radius = t.surfels.position.norm(dim=1)
+    assert float((radius - 0.8).abs().median()) < 0.05
+
+
+def test_a_resumed_run_ends_with_the_same_bits(posed: PosedPhotos, tmp_path: Path) -> None:
+    p = profile(iterations=130)
+    whole = trainer(posed, p)
+    while whole.done < whole.end:
+        whole.step()
+    first = trainer(posed, p)
+    for _ in range(37):
+        first.step()
+    torch.save(first.state(), tmp_path / "c.pt")
+    second = trainer(posed, p)
+    second.restore(torch.load(tmp_path / "c.pt", weights_only=True))
+    while second.done < second.end:
+        second.step()
+    assert all(torch.equal(v, second.surfels.tensors()[k]) for k, v in whole.surfels.tensors().items())
+
+
+def test_refine_drops_floaters_and_fills_gaps(posed: PosedPhotos) -> None:
+    s = ball()
+    keep = s.position[:, 2] < 0.7  # a thin cap: neighbours at its rim have wide gaps
+    s = s.select(keep.nonzero()[:, 0])
+    s.position[0] = torch.tensor([0.0, 0.0, 1.5])  # a floater outside every silhouette
+    after, counts = prune_and_densify(s, posed, profile().model_copy().refine, SIZE, 0)
+    assert counts["dropped, outside the silhouettes"] >= 1
+    assert float(after.position.norm(dim=1).max()) < 1.0
+    assert counts["after"] == len(after) == counts["before"] - (len(s) - len(after)) if not counts["added"] else len(after) > 0
