@@ -46,7 +46,7 @@ def run(ctx: Context) -> dict[str, Any]:
     least = ctx.settings.ingest.min_photos
     if len(read) < least:
         lost = f" ({len(skipped)} of {len(names)} were skipped: {skipped[0]['source']}: {skipped[0]['why']})" if skipped else ""
-        raise BadInputError(f"The folder {folder} has {len(read)} usable photos{lost}, but at least {least} are needed; take more around the object.")
+        raise BadInputError(f"{folder} has {len(read)} usable photos{lost}, but at least {least} are needed; take more around the object.")
     _mark_alike(ctx, read)
     _report_masks(ctx, read, masks)
     results = _poses(ctx, list(names), read)

@@ -41,7 +41,8 @@ def run(ctx: Context) -> dict[str, Any]:
             _render(ctx, posed, spool, resolution)
         noise = _noise(spool)
         cells = min(max(3 * noise / resolution.cell, TRUNCATION_CELLS[0]), TRUNCATION_CELLS[1])
-        ctx.decide("truncation", f"{cells:.1f} cells", f"median depth difference between neighbouring views {noise / resolution.cell:.2f} cells")
+        evidence = f"median depth difference between neighbouring views {noise / resolution.cell:.2f} cells"
+        ctx.decide("truncation", f"{cells:.1f} cells", evidence)
         field = _field(ctx, spool, lower, upper, resolution, cells * resolution.cell, posed.has_masks, (points, normals, weights))
         with ctx.part("marching"):
             dense = field.mesh(close=ctx.settings.mesh.holes == "close")
@@ -193,7 +194,10 @@ def _finish(
             low = clean.topology(low_vertices, low_faces)
         write_ply(ctx.out / "mesh.ply", low_vertices, low_faces)
     if error > 2 * resolution.cell:
-        ctx.warn(f"mesh: decimation to {len(low_faces)} faces moves the surface by up to {error / resolution.cell:.1f} cells; raise mesh.faces to keep it.")
+        ctx.warn(
+            f"mesh: decimation to {len(low_faces)} faces moves the surface by up to {error / resolution.cell:.1f} cells; "
+            "raise mesh.faces to keep it."
+        )
     return {
         "vertices": len(low_vertices),
         "faces": len(low_faces),
@@ -220,7 +224,7 @@ def _follow(
     for index, view in enumerate(spool):
         gather.add(view, spool.normal(index))
     target, trust = gather.normals()
-    return follow_normals(vertices, faces, target, trust, reach, limit=1.5 * cell)
+    return follow_normals(vertices, faces, target, trust, reach * cell, limit=1.5 * cell)
 
 
 STAGE = Stage(

@@ -126,8 +126,8 @@ def _solve(ctx: Context, entries: Sequence[dict[str, Any]], ingest: Path, out: P
     count, lost = int(result["registered"]), list(result["missing"])
     if count < max(3, settings.min_registered * len(names)):
         raise BadInputError(
-            f"Structure from motion placed only {count} of {len(names)} photos (not, for example, {_some(lost)}); take more photos that overlap "
-            "by two thirds, with texture in view and sharp, or leave out those of other places, or set poses.matching=exhaustive."
+            f"Structure from motion placed only {count} of {len(names)} photos (not {_some(lost)}); take sharp photos that overlap by two "
+            "thirds, with texture in view, leave out those of other places, or try poses.matching=exhaustive and more poses.max_features."
         )
     if lost:
         ctx.warn(f"{len(lost)} of {len(names)} photos could not be placed and were dropped ({_some(lost)}).")
@@ -181,7 +181,7 @@ def _take_given(
     cameras = list(CameraSet.load(ingest / "poses" / "cameras.json").cameras)
     ctx.decide("structure from motion", "skipped", "poses given")
     if len(cameras) < 3:
-        raise BadInputError(f"Only {len(cameras)} photos have a pose in the file given, but at least 3 are needed; give poses for more photos.")
+        raise BadInputError(f"Only {len(cameras)} photos have a pose in the file given, but at least 3 are needed.")
     results: dict[str, Any] = {"registered": len(cameras), "registered_share": len(cameras) / len(entries), "points": 0}
     known_points = ingest / "poses" / "points.ply"
     if known_points.exists():
@@ -220,6 +220,7 @@ def _given_lenses(cameras: Sequence[Camera]) -> list[dict[str, Any]]:
 def _undistort(ctx: Context, ingest: Path, cameras: Sequence[Camera]) -> list[Camera]:
     """Write photos and masks as a pinhole camera sees them; photos without distortion are copied as they are."""
     import cv2
+    import numpy as np
 
     from gsbake.capture.undistort import lens_key, pinhole_of, remap_tables, resample
 
@@ -248,7 +249,8 @@ def _undistort(ctx: Context, ingest: Path, cameras: Sequence[Camera]) -> list[Ca
                     image = cv2.imread(str(source), cv2.IMREAD_GRAYSCALE if is_mask else cv2.IMREAD_COLOR)
                     if image is None:
                         raise FileNotFoundError(source)
-                    coded = cv2.imencode(".png", resample(image, tables, is_mask), [cv2.IMWRITE_PNG_COMPRESSION, _PNG_LEVEL])[1]
+                    flat_image = resample(np.asarray(image, np.uint8), tables, is_mask)
+                    coded = cv2.imencode(".png", flat_image, [cv2.IMWRITE_PNG_COMPRESSION, _PNG_LEVEL])[1]
                     goal.write_bytes(coded.tobytes())
                 return replace(target, name=camera.name, R=camera.R, t=camera.t)
 
@@ -276,7 +278,7 @@ def _extent(ctx: Context, cameras: Sequence[Camera], points: Any) -> Extent:
         extent = extent_from_masks([c for c, _ in masked], [m for _, m in masked])
         if extent is not None:
             return extent
-        ctx.warn("The masks of different photos do not agree on any common object; check that white is the object (see ingest.invert_masks).")
+        ctx.warn("The masks of the photos share no common object; check that white is the object (else set ingest.invert_masks).")
     return extent_from_view(cameras, points)
 
 

@@ -24,8 +24,6 @@ def run(ctx: Context) -> dict[str, Any]:
         light = EnvironmentLight.load(ctx.inputs["train"] / "light.safetensors")
     with ctx.part("prune and densify"):
         surfels, counts = prune_and_densify(surfels, posed, settings.refine, settings.train.max_size, ctx.seed)
-    for reason, number in counts.items():
-        ctx.decide(f"refine: {reason}", str(number), "SDF samples, silhouettes and visibility of the trained surfels")
     session = Session(ctx, posed, surfels, light, settings.refine.iterations, 0.0, densify=False)
     return session.run() | {"counts": counts}
 

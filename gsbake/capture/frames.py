@@ -32,8 +32,8 @@ class PhotoSize:
 class Given:
     """Poses that came with the photos, in the frame of their file.
 
-    `cameras` by the photo's path inside the photo folder, at the size of the upright source photo; `missing` frames whose photo is not there;
-    `points` (n, 3) and `colours` (n, 3) 8-bit when the file has them.
+    `cameras` by the photo's path inside the photo folder, at the size of the upright source photo; `missing` frames whose photo is not
+    there; `points` (n, 3) and `colours` (n, 3) 8-bit when the file has them.
     """
 
     cameras: dict[str, Camera]
@@ -48,7 +48,7 @@ def rigid(rotation: Array, translation: Array, frame: str, source: str) -> tuple
     Raises BadInputError naming the frame when a value is NaN or infinite, or the matrix is no rotation (scaled, sheared, mirrored).
     """
     if not (np.isfinite(rotation).all() and np.isfinite(translation).all()):
-        raise BadInputError(f"The pose of frame {frame} in {source} holds NaN or infinite values; remove the frame or solve the poses again.")
+        raise BadInputError(f"The pose of frame {frame} in {source} holds NaN or infinite values; remove the frame or solve it again.")
     if np.abs(rotation.T @ rotation - np.eye(3)).max() > RIGID_TOLERANCE or np.linalg.det(rotation) < 0:
         raise BadInputError(
             f"The pose of frame {frame} in {source} is no rigid motion (its matrix scales, shears or mirrors); export the poses again."
@@ -159,5 +159,5 @@ def collect(frames: Iterable[tuple[str, Camera]], sizes: Mapping[str, PhotoSize]
         else:
             cameras[photo] = checked_intrinsics(fit_to_photo(camera, sizes[photo], source), source)
     if not cameras:
-        raise BadInputError(f"None of the frames in {source} belongs to a photo by its file name; check that poses and photos are of one capture.")
+        raise BadInputError(f"No frame in {source} belongs to a photo by its file name; check that poses and photos are of one capture.")
     return cameras, tuple(missing)

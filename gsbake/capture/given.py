@@ -13,8 +13,8 @@ from gsbake.capture.transforms import read_transforms
 def read_poses(path: Path, listing: Sequence[str], sizes: Mapping[str, PhotoSize]) -> Given:
     """Cameras for the photos, in the frame of the file.
 
-    `path` is a transforms.json, a poses_bounds.npy or a COLMAP model folder; `listing` names all photo files in order (LLFF poses go by order),
-    `sizes` holds the readable ones. Raises BadInputError when the file is broken, a pose is unusable or no frame fits a photo.
+    `path` is a transforms.json, a poses_bounds.npy or a COLMAP model folder; `listing` names all photo files in order (LLFF poses go
+    by order), `sizes` holds the readable ones. Raises BadInputError when the file is broken, a pose is unusable or no frame fits a photo.
     """
     if path.is_dir():
         from gsbake.capture.model import read_model

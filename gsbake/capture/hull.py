@@ -1,9 +1,9 @@
 """The visual hull of a masked object, as a signed distance on a grid.
 
-Laurentini, *The visual hull concept* (PAMI 1994): what no silhouette excludes. Instead of a yes or no per voxel each view gives a signed distance
-(pixels from the silhouette's edge, times depth over focal length), and the hull's value is the largest of them: surfaces come out at a fraction
-of a cell with smooth normals. Two allowances for real captures: a point outside a photo's frame is *unknown* to that photo, not empty (an
-object cut off at the edge stays whole), and a few views may disagree, since masks have holes.
+Laurentini, *The visual hull concept* (PAMI 1994): what no silhouette excludes. Instead of a yes or no per voxel each view gives a
+signed distance (pixels from the silhouette's edge, times depth over focal length), and the hull's value is the largest of them:
+surfaces come out at a fraction of a cell with smooth normals. Two allowances for real captures: a point outside a photo's frame is
+*unknown* to that photo, not empty (an object cut off at the edge stays whole), and a few views may disagree, since masks have holes.
 """
 
 from __future__ import annotations
@@ -40,8 +40,8 @@ def _carve(
 ) -> Floats:  # fmt: skip
     """Signed distance (n, n, n) at cell centres; negative inside.
 
-    distance: concatenated signed pixel distances (positive outside) of all views; starts (v,), sizes (v, 2) as h, w; lens (v, 4) fx, fy, cx, cy;
-    poses (v, 3, 4) world→camera.
+    distance: concatenated signed pixel distances (positive outside) of all views; starts (v,), sizes (v, 2) as h, w;
+    lens (v, 4) fx, fy, cx, cy; poses (v, 3, 4) world→camera.
     """
     views = starts.shape[0]
     out = np.empty((n, n, n), np.float32)

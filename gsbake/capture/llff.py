@@ -28,7 +28,7 @@ def read_llff(path: Path, listing: Sequence[str], sizes: Mapping[str, PhotoSize]
     if rows.ndim != 2 or rows.shape[1] != 17:
         raise BadInputError(f"{path} holds an array of shape {rows.shape}; LLFF poses have 17 numbers a photo.")
     if len(rows) != len(listing):
-        raise BadInputError(f"{path} has poses for {len(rows)} photos but there are {len(listing)}; use the photos the poses were made with.")
+        raise BadInputError(f"{path} has {len(rows)} poses but there are {len(listing)} photos; use the photos the poses were made with.")
     cameras = {}
     for row, photo in zip(np.asarray(rows, float), listing, strict=True):
         matrix = row[:15].reshape(3, 5)

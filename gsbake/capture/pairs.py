@@ -1,9 +1,10 @@
 """Which photos to match with which, before the costly matching of all their features.
 
-Small captures are matched exhaustively. Larger ones first match only the largest-scale features of each photo ("preemptive matching": Wu, *Towards
-linear-time incremental structure from motion*, 3DV 2013), which costs a hundredth, and keep each photo's best partners. Very large
-ones rank partners by VLAD descriptors (Jégou et al., CVPR 2010) over a vocabulary learnt from the capture itself: no vocabulary file has to be
-downloaded, and none that was trained on other pictures can mislead. Photos that follow each other by name are always matched.
+Small captures are matched exhaustively. Larger ones first match only the largest-scale features of each photo ("preemptive matching":
+Wu, *Towards linear-time incremental structure from motion*, 3DV 2013), which costs a hundredth, and keep each photo's best partners.
+Very large ones rank partners by VLAD descriptors (Jégou et al., CVPR 2010) over a vocabulary learnt from the capture itself: no
+vocabulary file has to be downloaded, and none that was trained on other pictures can mislead. Photos that follow each other by name
+are always matched.
 """
 
 from __future__ import annotations
@@ -143,7 +144,7 @@ def near_views(centres: NDArray[np.float64], directions: NDArray[np.float64], pa
     cost = (1 - cosine) + gap / max(float(gap.max()), 1e-12)
     cost[cosine < np.cos(np.radians(widest))] = np.inf
     np.fill_diagonal(cost, np.inf)
-    pairs = set()
+    pairs: set[Pair] = set()
     for i, row in enumerate(cost):
         pairs.update((min(i, int(j)), max(i, int(j))) for j in np.argsort(row)[:partners] if np.isfinite(row[j]))
     return sorted(pairs)

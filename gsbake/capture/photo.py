@@ -51,7 +51,7 @@ class RawPhoto:
         return int(self.pixels.shape[0])
 
 
-def srgb_encode(linear: Floats) -> Bytes:
+def srgb_encode(linear: NDArray[Any]) -> Bytes:
     """Linear light (0..1, clipped) to 8-bit sRGB."""
     index = np.clip(linear, 0.0, 1.0)
     coded = np.where(index <= 0.0031308, index * np.float32(12.92), 1.055 * np.power(index, np.float32(1 / 2.4)) - np.float32(0.055))
@@ -64,7 +64,7 @@ def _decode_table() -> Floats:
     return np.where(coded <= 0.04045, coded / 12.92, ((coded + 0.055) / 1.055) ** 2.4).astype(np.float32)
 
 
-def srgb_decode(coded: Bytes) -> Floats:
+def srgb_decode(coded: NDArray[Any]) -> Floats:
     """8-bit sRGB to linear light 0..1, float32."""
     return np.asarray(_decode_table()[coded], np.float32)
 
@@ -151,7 +151,7 @@ def read_mask(path: Path) -> tuple[Bytes, int]:
     Of RGBA files the alpha channel is the mask if it is not opaque. Raises UnreadablePhotoError.
     """
     pixels, spec = _decode(path)
-    orientation = int(spec.get_int_attribute("Orientation", 1) or 1)
+    orientation = int(str(spec.getattribute("Orientation") or 1))
     plane = pixels[..., 0]
     if spec.alpha_channel >= 0 and float(pixels[..., spec.alpha_channel].min()) < (255 if pixels.dtype == np.uint8 else 1.0):
         plane = pixels[..., spec.alpha_channel]
@@ -175,10 +175,10 @@ def to_working(photo: RawPhoto, mask: Bytes | None, max_size: int) -> tuple[Byte
     """
     size = working_size(photo.width, photo.height, max_size)
     reduced = size != (photo.width, photo.height)
-    rgb = photo.pixels
+    pixels = photo.pixels
     weight = photo.alpha
     if reduced:
-        linear = srgb_decode(rgb) if rgb.dtype == np.uint8 else rgb
+        linear: Any = srgb_decode(pixels) if pixels.dtype == np.uint8 else pixels
         if weight is not None:
             share = weight.astype(np.float32)[..., None] / 255
             total = cv2.resize(share, size, interpolation=cv2.INTER_AREA)[..., None]
@@ -187,12 +187,12 @@ def to_working(photo: RawPhoto, mask: Bytes | None, max_size: int) -> tuple[Byte
         else:
             linear = cv2.resize(linear, size, interpolation=cv2.INTER_AREA)
         rgb = srgb_encode(linear)
-    elif rgb.dtype != np.uint8:
-        rgb = srgb_encode(rgb)
+    else:
+        rgb = np.asarray(pixels) if pixels.dtype == np.uint8 else srgb_encode(pixels)
     if weight is not None:
         rgb = fill_clear(rgb, weight)
     if mask is not None and reduced:
-        mask = cv2.resize(mask, size, interpolation=cv2.INTER_AREA)
+        mask = np.asarray(cv2.resize(mask, size, interpolation=cv2.INTER_AREA), np.uint8)
     return np.ascontiguousarray(rgb, np.uint8), None if mask is None else np.ascontiguousarray(mask, np.uint8)
 
 

@@ -69,7 +69,7 @@ class PosedPhotos:
         )
 
     def mask(self, index: int, max_size: int | None = None) -> tuple[Camera, Bytes | None]:
-        """Mask `index` (h, w) 8-bit with the longer side at most `max_size` (area filter), or None, and its camera to match; reads no photo."""
+        """Camera and mask `index` (h, w), or None for the latter, with the longer side at most `max_size` (area filter); reads no photo."""
         import cv2
 
         camera = self.cameras.cameras[index]

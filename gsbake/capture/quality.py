@@ -1,7 +1,7 @@
 """What a photo is worth: blur, exposure, and whether another photo already shows the same.
 
-Blur follows Crété, Dolmiere, Ladret, Nicolas, *The blur effect* (SPIE 2007): how little a photo changes when it is blurred again. Unlike the
-variance of the Laplacian it does not call smooth objects blurred.
+Blur follows Crété, Dolmiere, Ladret, Nicolas, *The blur effect* (SPIE 2007): how little a photo changes when it is blurred again.
+Unlike the variance of the Laplacian it does not call smooth objects blurred.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ def measure(rgb: Bytes, mask: Bytes | None) -> Quality:
     inside = mask if mask is not None and (mask > 127).any() else None
     grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
     small = cv2.resize(rgb, (256, 256), interpolation=cv2.INTER_AREA)
-    luminance = srgb_decode(small) @ _LUMINANCE
+    luminance = srgb_decode(np.asarray(small, np.uint8)) @ _LUMINANCE
     stops = np.log2(np.maximum(luminance, 1e-4))
     if inside is not None:
         share = cv2.resize(inside, (256, 256), interpolation=cv2.INTER_AREA) > 127

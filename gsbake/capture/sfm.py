@@ -1,13 +1,12 @@
 """Structure from motion with COLMAP (Schönberger, Frahm, *Structure-from-Motion Revisited*, CVPR 2016), as the steps of one database.
 
-Features (SIFT), pairs, matches, mapping in two passes: strict thresholds build a sound core; if photos are missing they are matched with all
-others and registered to it under weaker thresholds. Runs inside the process of `solve_worker`.
+Features (SIFT), pairs, matches, mapping in two passes: strict thresholds build a sound core; if photos are missing they are matched
+with all others and registered to it under weaker thresholds. Runs inside the process of `solve_worker`.
 """
 
 from __future__ import annotations
 
 import shutil
-import sqlite3
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -27,6 +26,8 @@ Tick = Callable[[str, int, int], None]
 WEAK_INLIERS, WEAK_SHARE = 15, 0.15
 #: Largest features per photo in the ranking of pairs.
 RANKING_FEATURES = 512
+#: Pairs matched between two lines in COLMAP's log, by which `solve` tells the progress.
+BLOCK = 64
 
 
 @dataclass(frozen=True)
@@ -66,33 +67,14 @@ class Solver:
         return sorted(name for lens in self.lenses for name in lens.names)
 
     @contextmanager
-    def _timed(self, part: str, table: str = "", total: int = 0) -> Iterator[None]:
-        """Time a part; while it runs tell the progress by the number of rows in a table of the database."""
+    def _timed(self, part: str, total: int) -> Iterator[None]:
+        """Announce a part and time it."""
         start = time.perf_counter()
-        done = threading.Event()
-
-        def watch() -> None:
-            while not done.wait(0.5):
-                self.tick(part, min(self._rows(table), total), total)
-
         self.tick(part, 0, total)
-        watcher = threading.Thread(target=watch, daemon=True) if table else None
-        if watcher:
-            watcher.start()
         try:
             yield
         finally:
-            done.set()
-            if watcher:
-                watcher.join()
             self.seconds[part] = self.seconds.get(part, 0.0) + time.perf_counter() - start
-
-    def _rows(self, table: str) -> int:
-        try:
-            with closing(sqlite3.connect(f"file:{self.database}?mode=ro", uri=True, timeout=0.1)) as base:
-                return int(base.execute(f"select count(*) from {table}").fetchone()[0])
-        except sqlite3.Error:  # not there yet, or locked for a moment
-            return 0
 
     def features(self) -> None:
         """Find SIFT features in all photos; kept in the database, so that an interrupted run does not repeat it."""
@@ -107,7 +89,7 @@ class Solver:
         options.max_image_size = self.max_size
         options.sift.max_num_features = self.max_features
         options.sift.peak_threshold = self.peak_threshold
-        with self._timed("features", "keypoints", len(self.names)):
+        with self._timed("features", len(self.names)):
             for lens in self.lenses:
                 reader = pycolmap.ImageReaderOptions()
                 reader.camera_model = "SIMPLE_RADIAL"
@@ -119,11 +101,9 @@ class Solver:
                 )
         with closing(pycolmap.Database.open(str(self.database))) as base:
             for lens in self.lenses:
-                camera = base.read_camera(base.read_image_with_name(f"{lens.names[0]}.png").camera_id)
+                camera = base.read_camera(_image(base, lens.names[0]).camera_id)
                 if lens.focal is not None:
-                    params = np.array(camera.params)
-                    params[0] = lens.focal
-                    camera.params = params
+                    camera.params = [lens.focal, *list(camera.params)[1:]]
                     camera.has_prior_focal_length = True
                     base.update_camera(camera)
         marker.touch()
@@ -133,11 +113,11 @@ class Solver:
         count = len(self.names)
         if kind == "exhaustive":
             return pairing.exhaustive(count)
-        with self._timed("pairs"):
+        with self._timed("pairs", count):
             few = []
             with closing(pycolmap.Database.open(str(self.database))) as base:
                 for name in self.names:
-                    image = base.read_image_with_name(f"{name}.png")
+                    image = _image(base, name)
                     points = np.asarray(base.read_keypoints(image.image_id))
                     words = np.asarray(base.read_descriptors(image.image_id).data)
                     # Keypoints are x, y and the affine shape a11 a12 a21 a22, whose determinant is the scale squared.
@@ -164,9 +144,8 @@ class Solver:
         geometry.ransac.random_seed = self.seed
         chosen = pycolmap.ImportedPairingOptions()
         chosen.match_list_path = str(listing)
-        chosen.block_size = 64
-        before = self._rows("two_view_geometries")
-        with self._timed("matching", "two_view_geometries", before + len(pairs)):
+        chosen.block_size = BLOCK
+        with self._timed("matching", len(pairs)):
             pycolmap.match_image_pairs(str(self.database), options, chosen, geometry, pycolmap.Device.cpu)
 
     def _mapper(self, weak: bool) -> Any:
@@ -206,7 +185,7 @@ class Solver:
                 count = min(count + 1, total)
                 self.tick("mapping", count, total)
 
-        with self._timed("mapping", total=total):
+        with self._timed("mapping", total):
             models = pycolmap.incremental_mapping(
                 str(self.database),
                 str(self.folder),
@@ -224,7 +203,7 @@ class Solver:
         out = self.work / "global"
         shutil.rmtree(out, ignore_errors=True)
         out.mkdir()
-        with self._timed("mapping", total=len(self.names)):
+        with self._timed("mapping", len(self.names)):
             pycolmap.calibrate_view_graph(str(self.database))
             models = pycolmap.global_mapping(str(self.database), str(self.folder), str(out), options)
         return largest(list(models.values()))
@@ -253,11 +232,19 @@ class Solver:
         return model
 
 
+def _image(base: Any, name: str) -> Any:
+    """The database's entry of a photo; KeyError when its features could not be found."""
+    image = base.read_image_with_name(f"{name}.png")
+    if image is None:
+        raise KeyError(f"COLMAP took no features from photo {name}")
+    return image
+
+
 def registered_names(model: Any | None) -> set[str]:
     """Names of the photos a reconstruction places."""
     if model is None:
         return set()
-    return {Path(image.name).stem if "." in image.name else image.name for image in model.images.values() if image.has_pose}
+    return {image.name.rsplit(".", 1)[0] for image in model.images.values() if image.has_pose}
 
 
 def largest(models: Sequence[Any]) -> Any | None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import selectors
 import signal
 import subprocess
@@ -38,6 +39,34 @@ def _kill(child: subprocess.Popen[bytes]) -> None:
     child.wait()
 
 
+class _Log:
+    """Progress from COLMAP's log, since its long calls take no callback. (Its database must not be read meanwhile: a second SQLite in
+    the same process breaks the first one's locks.)"""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._offset = 0
+        self._part, self._total, self._files = "", 0, 0
+
+    def begin(self, part: str, total: int) -> None:
+        """A part began; what the log counts from now on belongs to it."""
+        if part != self._part:
+            self._part, self._total, self._files = part, total, 0
+
+    def poll(self) -> tuple[str, int, int] | None:
+        """What has been done of the current part, when the log says so."""
+        with self._path.open("rb") as file:
+            file.seek(self._offset)
+            text = file.read()
+        text = text[: text.rfind(b"\n") + 1]
+        self._offset += len(text)
+        if self._part == "features":
+            self._files += text.count(b"Processed file [")
+            return (self._part, min(self._files, self._total), self._total) if text else None
+        blocks = re.findall(rb"Processing block \[(\d+)/(\d+)\]", text) if self._part == "matching" else []
+        return (self._part, int(blocks[-1][0]) - 1, int(blocks[-1][1])) if blocks else None
+
+
 def _last_line(log: Path) -> str:
     lines = [line.strip() for line in log.read_text(errors="replace").splitlines() if line.strip()] if log.exists() else []
     return lines[-1] if lines else "no message"
@@ -52,6 +81,7 @@ def run_job(job: Mapping[str, Any], out: Path, watch: Watch, limit: float | None
     order = out / "job.json"
     order.write_text(json.dumps({**job, "out": str(out)}))
     log = out / "colmap.log"
+    counted = _Log(log)
     deadline = None if limit is None else time.monotonic() + limit
     command = [sys.executable, "-m", "gsbake.capture.solve_worker", str(order), str(os.getpid())]
     environment = dict(os.environ)
@@ -71,6 +101,8 @@ def run_job(job: Mapping[str, Any], out: Path, watch: Watch, limit: float | None
                 if watch.stop() or (deadline is not None and time.monotonic() > deadline):
                     return None
                 if not ready.select(_POLL):
+                    if (done := counted.poll()) is not None:
+                        watch.progress(*done)
                     continue
                 data = child.stdout.read()
                 if data == b"":
@@ -79,6 +111,7 @@ def run_job(job: Mapping[str, Any], out: Path, watch: Watch, limit: float | None
                 for line in lines:
                     with suppress(ValueError, KeyError, TypeError):  # anything else a library prints
                         note = json.loads(line)
+                        counted.begin(note["part"], note["total"])
                         watch.progress(note["part"], note["done"], note["total"])
         code = child.wait()
     finally:

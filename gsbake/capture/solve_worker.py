@@ -1,7 +1,7 @@
 """The process in which COLMAP runs: reads a job (JSON file), writes the result into a folder, tells progress in JSON lines on stdout.
 
-A process of its own because COLMAP's long calls cannot be interrupted from within but a process can be killed, and because its memory goes back.
-It ends with its parent.
+A process of its own because COLMAP's long calls cannot be interrupted from within but a process can be killed, and because its memory
+goes back. It ends with its parent.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ from gsbake.capture.cameras import Camera, CameraSet
 from gsbake.capture.cloud import write_cloud
 from gsbake.capture.colmap import pycolmap
 from gsbake.capture.model import camera_of, cloud
-from gsbake.capture.normalise import up_direction, upright_rotation
 from gsbake.capture.pairs import exhaustive, near_views
 from gsbake.capture.sfm import Lens, Solver, registered_names
+from gsbake.capture.vertical import up_direction, upright_rotation
 
-#: Distances of a triangulated point to the photos' features that are tolerated, in pixels.
+#: When progress was last told: it is rationed, since mapping calls back thousands of times.
 _LAST = {"time": 0.0}
 
 

@@ -80,7 +80,7 @@ def _given_poses(path: Path) -> Path:
             raise BadInputError(f"The folder {path} holds no poses (transforms.json, a COLMAP model or poses_bounds.npy).")
         return found
     if path.suffix.lower() not in (".json", ".npy"):
-        raise BadInputError(f"The poses {path} are of no known format; give a transforms.json, a COLMAP model folder or a poses_bounds.npy.")
+        raise BadInputError(f"The poses {path} are of no known format; give a transforms.json, a COLMAP model or a poses_bounds.npy.")
     return path
 
 
@@ -103,8 +103,5 @@ def discover(photos: Path, masks: Path | None = None, poses: Path | None = None)
         masks = next((h / "masks" for h in holders if (h / "masks").is_dir()), None)
     elif not Path(masks).is_dir():
         raise BadInputError(f"The mask folder {masks} does not exist.")
-    if poses is None:
-        poses = next((found for h in holders if (found := find_poses(h)) is not None), None)
-    else:
-        poses = _given_poses(Path(poses))
-    return Sources(photos, None if masks is None else Path(masks), poses)
+    beside = next((found for h in holders if (found := find_poses(h)) is not None), None) if poses is None else _given_poses(Path(poses))
+    return Sources(photos, None if masks is None else Path(masks), beside)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -21,8 +22,8 @@ def standing_background(files: Sequence[tuple[Path, Path]]) -> tuple[bool, str]:
     greys, outside = [], []
     shapes = set()
     for photo, mask in files:
-        grey = cv2.imread(str(photo), cv2.IMREAD_REDUCED_GRAYSCALE_2)
-        solid = cv2.imread(str(mask), cv2.IMREAD_REDUCED_GRAYSCALE_2)
+        grey: Any = cv2.imread(str(photo), cv2.IMREAD_REDUCED_GRAYSCALE_2)
+        solid: Any = cv2.imread(str(mask), cv2.IMREAD_REDUCED_GRAYSCALE_2)
         shapes.add(grey.shape)
         greys.append(cv2.resize(grey, (_SIZE, _SIZE), interpolation=cv2.INTER_AREA).astype(np.float32))
         # A margin keeps shadows and soft edges of the object out.

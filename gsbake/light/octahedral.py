@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 
 from .cubemap import Array, Index, normalise
 
-
 #: Directions whose absolute coordinates sum to less than this are not normalised any further.
 SHORTEST = 0.05
 

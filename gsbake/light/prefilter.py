@@ -25,14 +25,14 @@ from scipy.spatial import cKDTree
 from . import cubemap, octahedral
 from .cubemap import Array, Index
 
-#: Roughness of the levels: .08 to .5 as in METHOD, .7 so that the interpolation up to 1 stays within 2 %, and 1. At roughness 1 the
+#: Roughness of the levels: .08 to .5 as in METHOD, .7 so that the interpolation up to 1 stays within a few %, and 1. At roughness 1 the
 #: head-on GGX density is constant, so the n·l weighted lobe *is* the cosine lobe and the last level is the irradiance divided by π.
 ROUGHNESS = (0.08, 0.16, 0.26, 0.38, 0.5, 0.7, 1.0)
 
 #: Edge of the sharpest octahedral map per unit of cube edge: its texels are then no wider than the cube's anywhere.
 _SHARPEST = 3.0
 
-#: Octahedral texels across the square root of a lobe's solid angle 4πα², and the least edge (bilinear lookup within 2 %).
+#: Octahedral texels across the square root of a lobe's solid angle 4πα², and the least edge (bilinear lookup within a few %).
 _LOBE_TEXELS = 2.2
 _SMOOTHEST = 24
 

@@ -47,7 +47,7 @@ class Splat(Section):
     shading: Literal["colour", "pbr"] = Field("colour", description="colour: plain colour with view dependence; pbr: deferred split-sum shading with a learnt environment light.")
     sh_degree: int = Field(1, ge=0, le=2, description="Degree of the view dependence (spherical harmonics) in colour shading.")
     max_surfels: int = Field(60_000, ge=100, description="Upper bound on the number of surfels.")
-    env_size: int = Field(32, ge=4, le=256, description="Edge of the environment cube map in texels.")
+    env_size: int = Field(32, ge=4, le=128, description="Edge of the environment cube map in texels.")
 
 
 class Train(Section):

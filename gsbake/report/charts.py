@@ -66,6 +66,16 @@ def ticks(low: float, high: float, count: int = 4) -> list[float]:
     return [k * step for k in range(first, math.floor(high / step + 1e-9) + 1)]
 
 
+def log_ticks(low: float, high: float, most: int = 6) -> list[float]:
+    """Values of 1, 2 and 5 times powers of ten within low..high (both above 0); powers of ten alone where that makes more than `most`."""
+    powers = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
+    for factors in ((1, 2, 5), (1, 3), (1,)):
+        found = [m * 10.0**k for k in powers for m in factors if low <= m * 10.0**k <= high]
+        if len(found) <= most:
+            break
+    return found
+
+
 def _thin(curve: Curve, log: bool) -> list[tuple[float, float]]:
     """The curve's finite points, averaged over neighbours down to CURVE_POINTS."""
     points = [(x, y) for x, y in zip(curve.x, curve.y, strict=True) if math.isfinite(x) and math.isfinite(y) and (y > 0 or not log)]
@@ -98,12 +108,16 @@ def lines(curves: Sequence[Curve], title: str, log: bool = False) -> str:
 
     out = [f'<svg class="chart lines" viewBox="0 0 {width} {height}" role="img" aria-label="{escape(title)}">']
     out.append(f'<text class="title" x="{left}" y="15">{escape(title)}</text>')
-    for y in ticks(y0, y1):
-        shown = number(10**y) if log else number(y)
-        out.append(f'<line class="grid" x1="{left}" x2="{width - right}" y1="{py(y):.1f}" y2="{py(y):.1f}"/>')
-        out.append(f'<text class="tick" x="{left - 6}" y="{py(y) + 3.5:.1f}" text-anchor="end">{shown}</text>')
-    for x in ticks(x0, x1):
-        out.append(f'<text class="tick" x="{px(x):.1f}" y="{height - 8}" text-anchor="middle">{number(x)}</text>')
+    values = log_ticks(10**y0, 10**y1) if log else ticks(y0, y1)
+    if len(values) < 2:  # a logarithmic axis over a narrow range
+        values = ticks(10**y0, 10**y1)
+    for value, shown in zip(values, labels(values), strict=True):
+        y = py(scale(value))
+        out.append(f'<line class="grid" x1="{left}" x2="{width - right}" y1="{y:.1f}" y2="{y:.1f}"/>')
+        out.append(f'<text class="tick" x="{left - 6}" y="{y + 3.5:.1f}" text-anchor="end">{shown}</text>')
+    steps = ticks(x0, x1)
+    for x, shown in zip(steps, labels(steps), strict=True):
+        out.append(f'<text class="tick" x="{px(x):.1f}" y="{height - 8}" text-anchor="middle">{shown}</text>')
     at = float(width - right)
     for k in reversed(range(len(kept))):
         name, points = kept[k]
@@ -115,17 +129,26 @@ def lines(curves: Sequence[Curve], title: str, log: bool = False) -> str:
     return "".join(out) + "</svg>"
 
 
-def number(value: float) -> str:
-    """A short number for an axis: 0, 0.25, 12, 3k, 1e-4."""
+def labels(values: Sequence[float]) -> list[str]:
+    """Short numbers for an axis, with as many digits as it takes to tell them apart."""
+    for digits in range(3, 9):
+        out = [number(value, digits) for value in values]
+        if len(set(out)) == len(set(values)):
+            break
+    return out
+
+
+def number(value: float, digits: int = 3) -> str:
+    """A short number for an axis: 0, 0.25, 12, 3k, 1e-4; `digits` significant ones where it is no power of ten."""
     if value == 0 or abs(value) < 1e-12:
         return "0"
     if abs(value) >= 1e6:
-        return f"{value / 1e6:.3g}M"
+        return f"{value / 1e6:.{digits}g}M"
     if abs(value) >= 1000:
-        return f"{value / 1000:.3g}k"
+        return f"{value / 1000:.{digits}g}k"
     if abs(value) < 1e-3:
-        return f"{value:.0e}".replace("e-0", "e-")
-    return f"{value:.3g}"
+        return f"{value:.{digits - 3}e}".replace("e-0", "e-")
+    return f"{value:.{digits}g}"
 
 
 def duration(seconds: float) -> str:
@@ -144,5 +167,5 @@ def size(count: float) -> str:
     """Bytes as a person reads them: 812 kB, 3.4 MB, 1.9 GB."""
     for unit, step in (("GB", 1e9), ("MB", 1e6)):
         if count >= step:
-            return f"{count / step:.1f} {unit}"
+            return f"{count / step:.{0 if count >= 100 * step else 1}f} {unit}"
     return f"{count / 1e3:.0f} kB"

@@ -106,7 +106,7 @@ def relit_panels(
         shaders: dict[str, Shader] = {"As photographed": unlit}
         lights: tuple[Light, ...] = ()
     else:
-        lit = {"Learnt light": learnt, **{name: procedural(name) for name in PROCEDURAL}}
+        lit = {"Learnt light": learnt, **{name: procedural(name, learnt.light.size) for name in PROCEDURAL}}
         shaders = dict(lit)
         lights = tuple(Light(name, hdr_base64(shader.equirectangular())) for name, shader in lit.items())
     panels = []
@@ -137,7 +137,7 @@ def headline(manifests: Manifests, asset: Asset, bytes_: int, scored: Sequence[S
     out += [
         Figure("Photos", f"{photos[0]} of {photos[1]}", "placed"),
         Figure("Triangles", f"{len(asset.faces):,}".replace(",", " ")),
-        Figure("Textures", f"{width} × {height}"),
+        Figure("Textures", f"{width}²" if width == height else f"{width} × {height}"),
         Figure("GLB", size(bytes_)),
         Figure("Time", duration(total_seconds(manifests)), "all stages"),
     ]

@@ -73,5 +73,5 @@ class LitShader:
 
 
 def procedural(name: str, size: int = 32) -> LitShader:
-    """The shader of a procedural light by its name in PROCEDURAL."""
+    """The shader of a procedural light by its name in PROCEDURAL, as a cube map with faces of `size` texels."""
     return LitShader(EnvironmentLight.from_function(PROCEDURAL[name], size))

@@ -146,7 +146,7 @@ def read_log(path: Path) -> dict[str, list[float]]:
 
 def training_charts(logs: Mapping[str, Mapping[str, Sequence[float]]]) -> tuple[str, ...]:
     """Charts of the columns that the logs have; the steps of a later log go on where the one before ended."""
-    titles = {"psnr": "PSNR on held-out photos (dB)", "surfels": "Surfels", "sdf_median": "Median distance |s|", "gamma": "Sharpness γ"}
+    titles = {"psnr": "PSNR (dB)", "surfels": "Surfels", "sdf_median": "Median distance |s|", "gamma": "Sharpness γ"}
     charts = []
     for column, title in titles.items():
         curves, start = [], 0.0

@@ -74,5 +74,5 @@ def map_panels(asset: Asset) -> tuple[Panel, ...]:
             span = f"{low:.2f} everywhere" if high - low < 0.004 else f"{caption}, {low:.2f}–{high:.2f}"
             out.append(panel(title, span, grey(asset.orm[..., k])))
     charts = int(chart_of_faces(asset.faces, len(asset.uv)).max()) + 1 if len(asset.faces) else 0
-    out.append(panel("UV sheet", f"{charts} charts, {len(asset.faces):,} triangles".replace(",", " "), uv_sheet(asset)))
+    out.append(panel("UV sheet", f"{charts} charts, {len(asset.faces)} triangles", uv_sheet(asset)))
     return tuple(out)

@@ -12,7 +12,7 @@ import torch
 from gsbake.capture.posed import PosedPhotos
 from gsbake.pipeline.stage import Context
 from gsbake.splat.surfels import Surfels
-from gsbake.splat.trainer import EVALUATE_EVERY, Plan, Trainer
+from gsbake.splat.trainer import Plan, Trainer
 from gsbake.splat.views import held_out, load_views
 
 CHECKPOINT_VERSION = 1
@@ -57,10 +57,11 @@ class Session:
         trainer, ctx = self.trainer, self.ctx
         saved = time.monotonic()
         live: dict[str, float] = {}
+        every = max(20, min(250, trainer.plan.iterations // 12))  # a curve to look at, at little cost
         with ctx.part("train"):
             while trainer.done < trainer.end:
                 figures = trainer.step()
-                if trainer.done % EVALUATE_EVERY == 0 or trainer.done >= trainer.end:
+                if trainer.done % every == 0 or trainer.done >= trainer.end:
                     live["psnr"] = trainer.record()["psnr"]
                 ctx.progress(trainer.done, trainer.end, "", surfels=figures["surfels"], **live)
                 if ctx.stop_requested():

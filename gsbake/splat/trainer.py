@@ -24,7 +24,6 @@ from gsbake.splat.views import TrainView
 #: Shares of the run: SDF losses start, densifying starts and ends.
 SDF_FROM, DENSIFY_FROM, DENSIFY_TO = 1 / 30, 1 / 60, 0.6
 DENSIFY_EVERY = 100
-EVALUATE_EVERY = 250
 #: Early stop: gain of held-out PSNR (dB) and change of the SDF median over three evaluations that count as standing still.
 STILL_DB, STILL_SDF = 0.05, 0.02
 COOL_DOWN = 0.1

@@ -80,7 +80,7 @@ class BlockLattice:
         return out
 
 
-@nb.njit(cache=True)  # type: ignore[untyped-decorator]
+@nb.njit(cache=True)
 def _mark(scaled: Any, reach: float, wanted: Any) -> None:
     """Blocks whose samples lie within `reach` of `scaled` (n, 3), all in units of cells."""
     for p in range(scaled.shape[0]):
@@ -96,7 +96,7 @@ def _mark(scaled: Any, reach: float, wanted: Any) -> None:
                     wanted[a, b, c] = True
 
 
-@nb.njit(cache=True)  # type: ignore[untyped-decorator]
+@nb.njit(cache=True)
 def gather(index: Any, values: Any, start: Any, out: Any) -> None:
     """Copy the samples from lattice position `start` (3,) on into the dense `out`; samples of missing blocks stay as they are."""
     for i in range(out.shape[0]):

@@ -157,7 +157,8 @@ def deviation(points: Vertices, vertices: Vertices, faces: Faces) -> float:
 
 def _labels(count: int, faces: Faces) -> NDArray[Any]:
     """The loose piece (count,) each vertex belongs to."""
-    links = sparse.coo_matrix((np.ones(2 * len(faces), np.int8), (faces[:, [0, 1]].ravel(), faces[:, [1, 2]].ravel())), shape=(count, count))
+    start, end = faces[:, [0, 1]].ravel(), faces[:, [1, 2]].ravel()
+    links = sparse.coo_matrix((np.ones(len(start), np.int8), (start, end)), shape=(count, count))
     return np.asarray(connected_components(links, directed=False)[1])
 
 

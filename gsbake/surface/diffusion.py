@@ -22,7 +22,7 @@ from gsbake.splat.threads import run_chunks
 from gsbake.surface.blocks import EDGE, BlockLattice, Floats
 
 #: Slopes (per sample) below this count as flat when conductivities are computed; it keeps the film a few samples thick.
-FLAT = 0.05
+FLAT = 0.01
 
 
 def diffuse(lattice: BlockLattice, values: Floats, unknown: NDArray[np.bool_], sweeps: int, rate: float) -> None:
@@ -77,7 +77,7 @@ def _call(kernel: Any, arguments: tuple[Any, ...], start: int, stop: int) -> Non
 
 
 @nb.njit(cache=True, nogil=True, inline="always")
-def _place(index: Any, coords: Any, row: int, i: int, j: int, k: int) -> int:
+def _place(index: Any, coords: Any, row: int, i: int, j: int, k: int) -> Any:
     """The block that holds the sample at block-local (i, j, k), at most one step outside block `row`; -1 when there is none."""
     if 0 <= i < EDGE and 0 <= j < EDGE and 0 <= k < EDGE:
         return row

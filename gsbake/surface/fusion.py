@@ -26,7 +26,7 @@ TILE = 8
 
 
 @nb.njit(cache=True, nogil=True)
-def reach_tiles(inverse_depth: Any, cosine: Any, outside: Any, truncation: float) -> Any:
+def reach_tiles(inverse_depth: Any, outside: Any, truncation: Any) -> Any:
     """Per tile of 8 x 8 pixels the z-depth behind which the view has nothing to say: -1 = nothing at all, inf = a mask speaks."""
     height, width = inverse_depth.shape
     out = np.full((-(-height // TILE), -(-width // TILE)), np.float32(-1))
@@ -35,15 +35,27 @@ def reach_tiles(inverse_depth: Any, cosine: Any, outside: Any, truncation: float
             if outside[v, u] > 0:
                 out[v // TILE, u // TILE] = np.inf
             elif inverse_depth[v, u] > 0:
-                # One truncation for interpolation between pixels, the rest for the slant.
-                far = np.float32(1) / inverse_depth[v, u] + truncation * (np.float32(1) + np.float32(1) / cosine[v, u])
+                # One truncation behind the surface, one for interpolation between pixels.
+                far = np.float32(1) / inverse_depth[v, u] + np.float32(2) * truncation
                 out[v // TILE, u // TILE] = max(out[v // TILE, u // TILE], far)
     return out
 
 
 @nb.njit(cache=True, nogil=True, inline="always")
 def _hidden(
-    x0: Any, y0: Any, z0: Any, cell: Any, rotation: Any, translation: Any, fx: Any, fy: Any, cx: Any, cy: Any, width: Any, height: Any, reach: Any
+    x0: Any,
+    y0: Any,
+    z0: Any,
+    cell: Any,
+    rotation: Any,
+    translation: Any,
+    fx: Any,
+    fy: Any,
+    cx: Any,
+    cy: Any,
+    width: int,
+    height: int,
+    reach: Any,
 ) -> Any:
     """Whether a block (first sample x0, y0, z0) lies outside the view or behind everything it shows."""
     half = np.float32((EDGE - 1) / 2) * cell
@@ -75,8 +87,8 @@ def fuse_view(
     stop: int,
     coords: Any,
     lower: Any,
-    cell: float,
-    truncation: float,
+    cell: Any,
+    truncation: Any,
     rotation: Any,
     translation: Any,
     intrinsics: Any,
@@ -85,8 +97,8 @@ def fuse_view(
     cosine: Any,
     outside: Any,
     reach: Any,
-    hull_weight: float,
-    free_weight: float,
+    hull_weight: Any,
+    free_weight: Any,
     values: Any,
     totals: Any,
     seen: Any,
@@ -148,20 +160,23 @@ def fuse_view(
                     share = weight[iv, iu]
                     if inv <= 0 or share <= 0:
                         continue
-                    distance = (one / inv - z) * slant * cosine[iv, iu] / truncation
-                    if distance < -one:
+                    # Behind the surface the length along the ray counts: a grazing ray leaves a convex body soon after it
+                    # entered, and what it says about the far side would swell the body.
+                    along = (one / inv - z) * slant / truncation
+                    if along < -one:
                         continue
+                    distance = along * cosine[iv, iu]
                     if distance > one:
                         distance = one
                         share *= free_weight
-                    elif distance < -half:
-                        share *= np.float32(2.0) * (one + distance)
+                    elif along < -np.float32(0.25):
+                        share *= np.float32(4.0 / 3.0) * (one + along)
                     total = totals[n, i, j, k] + share
                     if total > 0:
                         values[n, i, j, k] += (distance - values[n, i, j, k]) * share / total
                         totals[n, i, j, k] = total
                         # Farther behind, "inside" is a guess along this ray (below a rim it is wrong): left to the filling.
-                        if distance > -half:
+                        if along > -half:
                             seen[n, i, j, k] |= BY_DEPTH
 
 

@@ -23,7 +23,7 @@ SUPER = 8 * EDGE
 NUDGE = 2e-3
 
 
-@nb.njit(cache=True)  # type: ignore[untyped-decorator]
+@nb.njit(cache=True)
 def coarse_values(coarse: Any, start: Any, ratio: float, scale: float, out: Any) -> None:
     """Fill the dense `out`, whose first sample is fine sample `start`, with the trilinear `coarse` lattice times `scale`, kept in ±1.
 
@@ -54,8 +54,8 @@ def march(
 ) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
     """The zero set of `values` (n, 8, 8, 8; negative inside; not a number = unknown) as `vertices` (v, 3), `faces` (f, 3), outward.
 
-    Without `coarse`, cubes with an unknown corner are left out, so the surface ends where knowledge ends. With `coarse` (a dense field
-    on the same box, `ratio` fine cells per sample, multiplied by `scale`) samples outside the blocks take its values and the surface is closed.
+    Without `coarse`, cubes with an unknown corner are left out, so the surface ends where knowledge ends. With `coarse` (a dense field on
+    the same box, `ratio` fine cells per sample, multiplied by `scale`) samples outside the blocks take its values and it is closed.
     """
     sizes = np.array(lattice.samples, np.int64)
     points: list[NDArray[np.float64]] = []
@@ -93,13 +93,13 @@ def _super_blocks(lattice: BlockLattice, coarse: Floats | None, ratio: float) ->
         for b in range(0, lattice.shape[1], per):
             for c in range(0, lattice.shape[2], per):
                 # One block more: the shared layer belongs to the next super-block.
-                near = (lattice.index[a : a + per + 1, b : b + per + 1, c : c + per + 1] >= 0).any()
+                near = bool((lattice.index[a : a + per + 1, b : b + per + 1, c : c + per + 1] >= 0).any())
                 start = np.array([a, b, c], np.int64) * EDGE
                 if not near and coarse is not None:
                     lo = np.floor(start / ratio).astype(int)
                     hi = np.ceil((start + SUPER + 1) / ratio).astype(int) + 2
                     part = coarse[lo[0] : hi[0], lo[1] : hi[1], lo[2] : hi[2]]
-                    near = part.size > 0 and part.min() < 0 < part.max()
+                    near = bool(part.size > 0 and part.min() < 0 < part.max())
                 if near:
                     out.append(start)
     return out

@@ -36,7 +36,7 @@ class NormalGather:
         intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy], np.float32)
         pose = np.concatenate([camera.R, camera.t[:, None]], 1).astype(np.float32)
         maps = (view.inverse, view.weight, np.ascontiguousarray(normal, np.float32))
-        fixed = (self._vertices, pose, intrinsics, *maps, self._tolerance, self._sum, self._weight)
+        fixed: tuple[Any, ...] = (self._vertices, pose, intrinsics, *maps, self._tolerance, self._sum, self._weight)
         run_chunks(lambda start, stop: _gather(start, stop, *fixed), len(self._vertices))
 
     def normals(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -63,7 +63,7 @@ def follow_normals(
 ) -> Vertices:
     """Vertices (v, 3) moved along the `target` normals (v, 3, weighted by `trust` (v,) in 0..1) to agree with them.
 
-    Waves shorter than about `reach` edges follow the normals, longer ones the positions. No vertex moves farther than `limit`.
+    Waves shorter than `reach` (world units) follow the normals, longer ones the positions. No vertex moves farther than `limit`.
     """
     if len(faces) == 0 or reach <= 0:
         return vertices
@@ -77,8 +77,12 @@ def follow_normals(
     middle = normal[a] + normal[b]
     middle /= np.maximum(np.linalg.norm(middle, axis=1, keepdims=True), 1e-12)
     span = vertices[a] - vertices[b]
-    # A wave of length `reach` edges has (2π / reach)² of its square as squared slope per edge; three edges meet per vertex.
-    strength = (reach / (2 * np.pi)) ** 2 / 3 * np.minimum(trust[a], trust[b])
+    # Slopes count, not rises: a sliver's short edge speaks as loudly as a long one (to a point: its slope is less certain).
+    length = np.linalg.norm(span, axis=1)
+    typical = float(length.mean())
+    # A wave as long as the reach rises by 2π · edge / reach of its amplitude per edge along it. Three edges per vertex, most of them
+    # oblique, make that 2/3 in sum over squares: with its inverse such a wave is halved.
+    strength = 1.5 * (reach / (2 * np.pi * np.maximum(length, 0.3 * typical))) ** 2 * np.minimum(trust[a], trust[b])
     tilt = (span * middle).sum(1)
     along_a, along_b = (normal[a] * middle).sum(1), (normal[b] * middle).sum(1)
     n, rows = len(vertices), np.arange(len(keys))
@@ -92,8 +96,20 @@ def follow_normals(
     return vertices + np.clip(shift, -limit, limit)[:, None] * normal
 
 
-@nb.njit(cache=True, nogil=True, fastmath=True)  # type: ignore[untyped-decorator]
-def _gather(start: int, stop: int, vertices: Any, pose: Any, intrinsics: Any, inverse: Any, weight: Any, normal: Any, tolerance: float, out: Any, total: Any) -> None:
+@nb.njit(cache=True, nogil=True, fastmath=True)
+def _gather(
+    start: int,
+    stop: int,
+    vertices: Any,
+    pose: Any,
+    intrinsics: Any,
+    inverse: Any,
+    weight: Any,
+    normal: Any,
+    tolerance: Any,
+    out: Any,
+    total: Any,
+) -> None:
     """Bilinear normals where all four pixels show the vertex, the nearest pixel's otherwise."""
     height, width = inverse.shape
     for n in range(start, stop):

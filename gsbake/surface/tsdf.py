@@ -2,14 +2,17 @@
 
 Two passes over the views, one view in memory at a time:
 `survey` looks where the surface is: it marks the blocks each depth map touches and fuses the view into a small dense lattice;
-`allocate` then fills what no view saw in that lattice by diffusion (Davis et al., *Filling holes in complex surfaces using volumetric
-diffusion*, 3DPVT 2002: Laplace's equation between what is known to be inside and what is known to be empty), which adds the blocks where the
-closing surface runs; `integrate` fuses the views into the fine blocks. `mesh` marches them.
+`allocate` then fills what no view saw in that lattice (`gsbake.surface.diffusion`: a film of least area between what is known to be
+inside and what is known to be empty) and adds the blocks where the closing surface runs; `integrate` fuses the views into the fine
+blocks; `mesh` marches them.
 
-Every block exists before the first view is integrated, so each sample hears every view: what one view puts in mid-air the others carve away.
+Every block exists before the first view is integrated, so each sample hears every view: what one view puts in mid-air the others
+carve away.
 """
 
 from __future__ import annotations
+
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -32,7 +35,7 @@ SEAM_SWEEPS, SEAM_ROUNDS = 12, 3
 #: Steepness that turns the survey's known distances into sides before filling.
 SIDE = 4.0
 #: Rounds of reweighting on the survey lattice; the area hardly changes after these.
-ROUNDS = 32
+ROUNDS = 10
 
 
 class FusedBlocks:
@@ -54,7 +57,7 @@ class FusedBlocks:
     def add(self, view: DepthView) -> None:
         """Fuse one view."""
         camera = view.camera
-        fixed = (
+        fixed: tuple[Any, ...] = (
             self.lattice.coords,
             self.lattice.lower.astype(np.float32),
             np.float32(self.lattice.cell),
@@ -66,7 +69,7 @@ class FusedBlocks:
             view.weight,
             view.cosine,
             view.outside,
-            reach_tiles(view.inverse, view.cosine, view.outside, np.float32(self.truncation)),
+            reach_tiles(view.inverse, view.outside, np.float32(self.truncation)),
             np.float32(HULL_WEIGHT),
             np.float32(FREE_WEIGHT),
             self.values,
@@ -83,7 +86,9 @@ class SparseTsdf:
     the ball is empty) the surface closes inside it; without, the surface is cut open there.
     """
 
-    def __init__(self, lower: ArrayLike, upper: ArrayLike, cell: float, truncation: float, ball: float | None = None, solid: bool = True) -> None:
+    def __init__(
+        self, lower: ArrayLike, upper: ArrayLike, cell: float, truncation: float, ball: float | None = None, solid: bool = True
+    ) -> None:
         self.lattice = BlockLattice(lower, upper, cell)
         self.truncation = float(truncation)
         self.ball = ball
@@ -174,8 +179,8 @@ class SparseTsdf:
             vertices, faces = march(self.lattice, fused.values)
         if self.ball is not None and not self.solid:
             keep = (np.linalg.norm(vertices, axis=1) <= self.ball)[faces].all(1)
-            used, faces = np.unique(faces[keep], return_inverse=True)
-            vertices, faces = vertices[used], faces.reshape(-1, 3).astype(np.int32)
+            used, inverse = np.unique(faces[keep], return_inverse=True)
+            vertices, faces = vertices[used], inverse.reshape(-1, 3).astype(np.int32)
         return vertices, faces
 
     def _outside(self, lattice: BlockLattice) -> NDArray[np.bool_]:

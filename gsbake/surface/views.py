@@ -128,8 +128,8 @@ def _cosine(camera: Camera, normal: Floats) -> Floats:
     return np.where(length > 0.5, value, 0).astype(np.float32)
 
 
-@nb.njit(cache=True)  # type: ignore[untyped-decorator]
-def _supported(depth: Any, cosine: Any, tolerance: float, pixel: float) -> Any:
+@nb.njit(cache=True)
+def _supported(depth: Any, cosine: Any, tolerance: Any, pixel: Any) -> Any:
     """Whether at least two of the eight neighbours lie on the same layer: within `tolerance` plus what the slant explains."""
     height, width = depth.shape
     out = np.zeros(depth.shape, np.bool_)

@@ -47,8 +47,8 @@ def cameras(views: int, size: int, seed: int, background: bool = False) -> tuple
     start = draw.uniform(0, 2 * np.pi)
     out = []
     for i in range(views):
-        # Even in sin(elevation) = even in area; a golden-ratio stride keeps neighbours in name apart in height too.
-        share = (i * 0.7548776662466927 + 0.5 / views) % 1.0
+        # Even in sin(elevation) = even in area; an irrational stride spreads any every-n-th choice of photos over the heights.
+        share = (i * math.sqrt(2) + 0.5 / views) % 1.0
         height = math.sin(math.radians(low)) * (1 - share) + math.sin(math.radians(high)) * share
         azimuth = start + 2 * np.pi * i / views + draw.normal(0, 0.05)
         flat = math.sqrt(1 - height * height)

@@ -2,8 +2,8 @@
 
 Empty texels: a rim around each chart takes the nearest chart texel, so that bilinear filtering never reads another chart; everything
 farther is a smooth average pulled down an image pyramid, which keeps mip maps free of foreign colours and compresses well.
-Unseen surface: values are spread over the mesh itself, as the harmonic function that continues what was seen; it follows the surface
-and never leaks through a thin wall.
+Unseen surface: values are spread over the mesh itself, as the harmonic function that continues what was seen, which follows the surface and
+does not leak through a thin wall; what it misses on coarse triangles is spread from the texels around the gap.
 
 Gortler et al., *The Lumigraph*, SIGGRAPH 1996 (pull-push).
 """
@@ -92,6 +92,9 @@ def continue_over_surface(values: NDArray[Any], seen: NDArray[np.bool_], texels:
         precondition = diags(1 / np.maximum(inner.diagonal(), 1e-12))
         for k in range(columns):
             vertex[unknown, k] = cg(inner, right[:, k], x0=vertex[unknown, k], rtol=1e-4, maxiter=2000, M=precondition)[0]
-    out = given.copy()
-    out[~seen] = np.einsum("nk,nkc->nc", texels.bary[~seen], vertex[triangles[texels.face[~seen]]])
-    return out
+    smooth = np.einsum("nk,nkc->nc", texels.bary, vertex[triangles[texels.face]]).astype(np.float32)
+    # What the vertices of coarse triangles cannot say, the texels around the gap do: their residual is spread in the image.
+    where = texels.image(seen.astype(np.float32))[..., 0] > 0
+    residual = _pulled(texels.image(np.where(seen[:, None], given - smooth, 0)), where).reshape(-1, columns)[texels.index]
+    low, high = given[seen].min(0), given[seen].max(0)
+    return np.where(seen[:, None], given, np.clip(smooth + residual, low, high))

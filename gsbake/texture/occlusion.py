@@ -90,7 +90,8 @@ def _filter(value: Floats, position: Floats, normal: Floats, reach: np.float32) 
         for i in range(size):
             if not value[j, i] >= 0:
                 continue
-            total, weight = 0.0, 0.0
+            total: Any = 0.0
+            weight: Any = 0.0
             for y in range(max(0, j - FILTER), min(size, j + FILTER + 1)):
                 for x in range(max(0, i - FILTER), min(size, i + FILTER + 1)):
                     if not value[y, x] >= 0:
@@ -101,8 +102,8 @@ def _filter(value: Floats, position: Floats, normal: Floats, reach: np.float32) 
                         turn += normal[y, x, c] * normal[j, i, c]
                     if gap > reach * reach or turn < 0.8:
                         continue
-                    w = float(turn - 0.8) * (1.0001 - gap / (reach * reach))
-                    total += w * float(value[y, x])
+                    w = (turn - 0.8) * (1.0001 - gap / (reach * reach))
+                    total += w * value[y, x]
                     weight += w
             if weight > 0:
                 out[j, i] = total / weight

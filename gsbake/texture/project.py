@@ -113,7 +113,9 @@ class ProjectionBlender:
         if pixels < 1.5:
             return camera, picture, mask
         size = (max(2, round(camera.width / pixels)), max(2, round(camera.height / pixels)))
-        reduced = np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), np.float32).reshape(size[1], size[0], -1)
+        # Plane by plane: OpenCV's area filter takes at most four channels.
+        planes = [cv2.resize(np.ascontiguousarray(picture[..., c]), size, interpolation=cv2.INTER_AREA) for c in range(picture.shape[2])]
+        reduced = np.asarray(np.stack(planes, 2), np.float32)
         return camera.scaled(*size), reduced, np.asarray(cv2.resize(mask, size, interpolation=cv2.INTER_AREA), np.float32)
 
 

@@ -61,7 +61,9 @@ class Runner:
     def __init__(self, root: Path) -> None:
         self.root = root
 
-    def ingest(self, photos: Path, masks: Path | None = None, poses: Path | None = None, **settings: Any) -> tuple[dict[str, Any], FakeContext]:
+    def ingest(
+        self, photos: Path, masks: Path | None = None, poses: Path | None = None, **settings: Any
+    ) -> tuple[dict[str, Any], FakeContext]:
         from stages.ingest import run
 
         found = discover(photos, masks, poses)
@@ -72,7 +74,8 @@ class Runner:
     def poses(self, **settings: Any) -> tuple[dict[str, Any], FakeContext]:
         from stages.poses import run
 
-        ctx = FakeContext(self.root / "poses", {"ingest": self.root / "ingest"}, Profile.model_validate({"poses": settings}), self.root / "c2")
+        profile = Profile.model_validate({"poses": settings})
+        ctx = FakeContext(self.root / "poses", {"ingest": self.root / "ingest"}, profile, self.root / "c2")
         return run(ctx), ctx
 
 

@@ -16,7 +16,7 @@ def pixels(content: bytes) -> np.ndarray:
 
 
 def test_colour_is_coded_in_srgb_and_the_rest_is_linear() -> None:
-    grey = np.full((4, 4, 3), 0.2140411)  # linear value of sRGB one half
+    grey = np.full((4, 4, 3), 0.2158605)  # linear value of the sRGB code 128
     sheets = quantise(grey, grey, np.tile([0.5, 0.5, 1.0], (4, 4, 1)))
     assert (sheets.base_color == 128).all() and (sheets.orm == 55).all()
     assert sheets.normal is not None and (sheets.normal == [128, 128, 255]).all()

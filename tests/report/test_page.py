@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import pytest
 
-from gsbake.report.charts import Bar, Curve, bars, duration, lines, number, size, ticks
+from gsbake.report.charts import Bar, Curve, bars, duration, labels, lines, log_ticks, number, size, ticks
 from gsbake.report.html import (
     Check,
     Comparison,
@@ -184,6 +184,21 @@ def test_log_lines_are_straight_for_exponentials() -> None:
     np.testing.assert_allclose(np.diff(points[:, 1]), np.diff(points[:, 1])[0], atol=0.11)
 
 
+def test_log_ticks() -> None:
+    np.testing.assert_allclose(log_ticks(0.9, 31), [1, 2, 5, 10, 20])
+    np.testing.assert_allclose(log_ticks(1e-4, 1.5), [1e-4, 1e-3, 1e-2, 1e-1, 1])
+    np.testing.assert_allclose(log_ticks(4e-3, 2), [1e-2, 3e-2, 1e-1, 3e-1, 1])
+
+
+def test_labels_tell_ticks_apart() -> None:
+    assert labels([20.32, 20.34]) == ["20.32", "20.34"]
+    assert labels([0.0, 500.0, 1000.0]) == ["0", "500", "1k"]
+    assert labels([1e-4, 2e-4]) == ["1e-4", "2e-4"] and labels([3.0]) == ["3"]
+    narrow = lines([Curve("a", [0, 1], [20.33, 20.34])], "t", log=True)
+    shown = [t.text for t in ET.fromstring(narrow).iter("text") if t.get("text-anchor") == "end"]
+    assert len(shown) >= 2 and len(set(shown)) == len(shown)
+
+
 def test_long_curves_are_thinned() -> None:
     x = list(range(30_000))
     root = ET.fromstring(lines([Curve("a", x, [float(i) for i in x])], "t"))
@@ -210,6 +225,6 @@ def test_durations(seconds: float, text: str) -> None:
     assert duration(seconds) == text
 
 
-@pytest.mark.parametrize(("count", "text"), [(812_345, "812 kB"), (3_400_000, "3.4 MB"), (1.94e9, "1.9 GB")])
+@pytest.mark.parametrize(("count", "text"), [(812_345, "812 kB"), (3_400_000, "3.4 MB"), (512e6, "512 MB"), (1.94e9, "1.9 GB")])
 def test_sizes(count: float, text: str) -> None:
     assert size(count) == text

@@ -67,7 +67,7 @@ def test_the_same_mesh_gives_the_same_atlas(bumpy: tuple[np.ndarray, np.ndarray]
 def test_packing_keeps_shape_and_handedness() -> None:
     rng = np.random.default_rng(3)
     triangles = rng.uniform(0, 1, (40, 3, 2))
-    flip = np.cross(np.pad(triangles[:, 1] - triangles[:, 0], ((0, 0), (0, 1))), np.pad(triangles[:, 2] - triangles[:, 0], ((0, 0), (0, 1))))[:, 2] < 0
+    flip = np.linalg.det(np.stack([triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]], 1)) < 0
     triangles[flip] = triangles[flip][:, [0, 2, 1]]
     faces = np.arange(120).reshape(-1, 3)
     packed = pack(triangles.reshape(-1, 2), faces, np.arange(40), 256, 2)

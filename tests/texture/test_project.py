@@ -69,7 +69,7 @@ def test_highlights_and_exposures_fall_away(sphere: RayCaster) -> None:
     error = np.abs(solved.values - paint(p)).max(1)
     assert np.median(error) < 0.004 and np.quantile(error, 0.98) < 0.015
     plain = blender.result(solve_exposure=False)
-    assert np.median(np.abs(plain.values - paint(p)).max(1)) > 0.015
+    assert np.median(np.abs(plain.values - paint(p)).max(1)) > 0.01
 
 
 def test_surround_never_reaches_the_surface(sphere: RayCaster) -> None:
@@ -94,7 +94,8 @@ def test_only_what_a_view_sees_is_seen(sphere: RayCaster) -> None:
 
 def test_what_stands_in_front_hides(sphere: RayCaster) -> None:
     ball = trimesh.creation.icosphere(subdivisions=3, radius=0.3)
-    both = trimesh.util.concatenate([trimesh.Trimesh(sphere.vertices, sphere.faces), trimesh.Trimesh(ball.vertices + [0, 1.5, 0], ball.faces)])
+    ball.apply_translation([0, 1.5, 0])
+    both = trimesh.util.concatenate([trimesh.Trimesh(sphere.vertices, sphere.faces), ball])
     p = points()
     blender = ProjectionBlender(p, p, RayCaster(both.vertices, both.faces), 3, 0.02)
     d = np.array([0.0, 1.0, 0.0])

@@ -1,0 +1,204 @@
+from __future__ import annotations
+
+import json
+import os
+import time
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+
+from gsbake.capture.cameras import Camera, CameraSet
+from gsbake.capture.posed import PosedPhotos
+from gsbake.capture.solve import Watch, run_job
+from gsbake.pipeline.errors import BadInputError, InterruptedRun
+from tests.capture.conftest import FakeContext, Runner
+
+
+def textured_board(size: int = 600) -> np.ndarray[Any, np.dtype[np.uint8]]:
+    """A picture full of corners at several scales."""
+    rng = np.random.default_rng(5)
+    board = np.zeros((size, size, 3), np.float32)
+    for cells in (8, 25, 75, 200):
+        board += cv2.resize(rng.random((cells, cells, 3)).astype(np.float32), (size, size), interpolation=cv2.INTER_CUBIC)
+    return np.asarray(np.clip(board * 64, 0, 255), np.uint8)
+
+
+def photograph(camera: Camera, board: np.ndarray[Any, Any]) -> np.ndarray[Any, np.dtype[np.uint8]]:
+    """What a camera sees of a board in the plane z = 0 that spans [-1, 1]², with a step in it: the right half lies at z = 0.4."""
+    rays, eye = camera.rays(), camera.centre
+    photo = np.full((camera.height, camera.width, 3), 90, np.uint8)
+    depth = np.full((camera.height, camera.width), np.inf)
+    for z, sides in ((0.0, (-1.0, 0.0)), (0.4, (0.0, 1.0))):
+        s = (z - eye[2]) / rays[..., 2]
+        hit = eye + s[..., None] * rays
+        inside = (s > 0) & (hit[..., 0] > sides[0]) & (hit[..., 0] < sides[1]) & (np.abs(hit[..., 1]) < 1) & (s < depth)
+        at = ((hit[..., :2] + 1) * 0.5 * (board.shape[0] - 1)).astype(np.float32)
+        seen = cv2.remap(board, at[..., 0], at[..., 1], cv2.INTER_LINEAR)
+        photo[inside], depth[inside] = seen[inside], s[inside]
+    return photo
+
+
+def board_capture(folder: Path, count: int = 8) -> list[Camera]:
+    """Photos of the board from an arc, and their true cameras."""
+    (folder / "images").mkdir(parents=True)
+    board = textured_board()
+    cameras = []
+    for i in range(count):
+        a = np.radians(-40 + 80 * i / (count - 1))
+        eye = np.array([3 * np.sin(a), -1.5 + 0.1 * i, 3 * np.cos(a)])
+        forward = -eye / np.linalg.norm(eye)
+        right = np.cross(forward, (0, 1.0, 0))
+        right /= np.linalg.norm(right)
+        rot = np.stack([right, np.cross(forward, right), forward])
+        camera = Camera(f"b{i}", 320, 240, 380.0, 380.0, 160.0, 120.0, rot, -rot @ eye)
+        Image.fromarray(photograph(camera, board)).save(folder / "images" / f"b{i}.png")
+        cameras.append(camera)
+    return cameras
+
+
+def transforms(folder: Path, cameras: list[Camera]) -> None:
+    frames = [{"file_path": f"images/{c.name}.png", "transform_matrix": c.camera_to_world_opengl().tolist()} for c in cameras]
+    c = cameras[0]
+    body = {"fl_x": c.fx, "cx": c.cx, "cy": c.cy, "w": c.width, "h": c.height, "frames": frames}
+    (folder / "transforms.json").write_text(json.dumps(body))
+
+
+def aligned_error(found: np.ndarray[Any, Any], true: np.ndarray[Any, Any]) -> float:
+    """Largest distance between point sets (n, 3) after the best similarity (Umeyama 1991), over the spread of the true ones."""
+    a, b = found - found.mean(0), true - true.mean(0)
+    u, s, vt = np.linalg.svd(b.T @ a)
+    sign = np.diag([1, 1, np.sign(np.linalg.det(u @ vt))])
+    scale = (s @ np.diag(sign)) / (a**2).sum()
+    return float(np.linalg.norm(scale * a @ (u @ sign @ vt).T - b, axis=1).max() / np.linalg.norm(b, axis=1).max())
+
+
+def test_solved_poses_are_the_true_ones(tmp_path: Path, runner: Runner) -> None:
+    true = board_capture(tmp_path / "cap")
+    runner.ingest(tmp_path / "cap")
+    results, ctx = runner.poses(max_features=2000)
+    assert results["registered"] == 8 and results["reprojection_px"] < 0.8 and results["poses"] == "solved"
+    posed = PosedPhotos.open(ctx.out)
+    cameras = posed.cameras.cameras
+    assert aligned_error(np.stack([c.centre for c in cameras]), np.stack([c.centre for c in true])) < 0.02
+    assert [c.distortion for c in cameras] == [()] * 8
+    view = posed.view(3)
+    assert view.rgb.shape == (cameras[3].height, cameras[3].width, 3)
+    cloud = posed.points()
+    assert cloud is not None and len(cloud[0]) > 200
+    assert np.median(np.linalg.norm(cloud[0], axis=1)) < 1
+    assert {"cameras.bin", "images.bin", "points3D.bin"} <= {p.name for p in (ctx.out / "sparse").iterdir()}
+    assert {"features", "matching", "mapping", "undistortion", "normalisation"} <= set(ctx.parts)
+    assert any(text == "features" and done for done, _, text in ctx.progressed)
+    ups = np.stack([-c.R[1] for c in cameras]) @ posed.cameras.to_world.rotation.T
+    assert ups[:, 2].mean() > 0.5
+
+
+def test_given_poses_keep_their_frame_and_points_are_triangulated(tmp_path: Path, runner: Runner) -> None:
+    true = board_capture(tmp_path / "cap")
+    transforms(tmp_path / "cap", true)
+    runner.ingest(tmp_path / "cap", max_size=160)
+    results, ctx = runner.poses(max_features=2000)
+    assert "skipped" in ctx.decisions["structure from motion"] and "poses given" in ctx.decisions["structure from motion"]
+    posed = PosedPhotos.open(ctx.out)
+    world = posed.cameras.to_world
+    for camera, wanted in zip(posed.cameras.cameras, true, strict=True):
+        back = camera.moved(world)
+        assert np.allclose(back.R, wanted.R, atol=1e-9) and np.allclose(back.t, wanted.t, atol=1e-9)
+        assert (back.fx, back.cx, back.width) == (190, 80, 160)
+    assert results["points"] > 50
+    cloud = posed.points()
+    assert cloud is not None
+    height = world.apply(cloud[0])[:, 2]
+    assert np.median(np.minimum(np.abs(height), np.abs(height - 0.4))) < 0.02  # they lie on the board's two planes
+
+
+def test_photos_of_unrelated_places(tmp_path: Path, runner: Runner) -> None:
+    (tmp_path / "images").mkdir()
+    rng = np.random.default_rng(0)
+    for i in range(4):
+        photo = cv2.resize(rng.integers(0, 255, (30, 40, 3), np.uint8), (320, 240), interpolation=cv2.INTER_CUBIC)
+        Image.fromarray(np.asarray(photo, np.uint8)).save(tmp_path / "images" / f"p{i}.png")
+    runner.ingest(tmp_path)
+    with pytest.raises(BadInputError, match=r"placed only \d of 4 photos \(not p.*overlap"):
+        runner.poses(max_features=500)
+
+
+def test_too_few_given_poses(tmp_path: Path, runner: Runner) -> None:
+    true = board_capture(tmp_path / "cap", 4)
+    transforms(tmp_path / "cap", true[:2])
+    _, ctx = runner.ingest(tmp_path / "cap")
+    assert any("2 photos have no pose" in w for w in ctx.warnings)
+    with pytest.raises(BadInputError, match="Only 2 photos have a pose"):
+        runner.poses()
+
+
+def test_a_stop_kills_the_process(tmp_path: Path) -> None:
+    (tmp_path / "images").mkdir()
+    rng = np.random.default_rng(0)
+    for i in range(6):
+        Image.fromarray(rng.integers(0, 255, (900, 1200, 3), np.uint8)).save(tmp_path / "images" / f"p{i}.png", compress_level=0)
+    lens = {"names": [f"p{i}" for i in range(6)], "width": 1200, "height": 900, "focal": None}
+    (tmp_path / "work").mkdir()
+    job = {
+        "task": "solve", "photos": str(tmp_path / "images"), "masks": None, "work": str(tmp_path / "work"), "lenses": [lens],
+        "max_features": 8192, "peak_threshold": 0.001, "max_size": 1600, "threads": 1, "seed": 0, "matching": "exhaustive",
+        "mapper": "incremental",
+    }  # fmt: skip
+    parts: list[str] = []
+    asked: list[float] = []
+
+    def stop() -> bool:
+        if parts and not asked:
+            asked.append(time.monotonic())
+        return bool(asked)
+
+    assert run_job(job, tmp_path / "out", Watch(lambda part, done, total: parts.append(part), stop)) is None
+    assert time.monotonic() - asked[0] < 3
+    assert parts[0] == "features"
+    tails = [Path(f"/proc/{p}/cmdline") for p in os.listdir("/proc") if p.isdigit()] if Path("/proc").is_dir() else []
+    for tail in tails:
+        try:
+            assert str(tmp_path).encode() not in tail.read_bytes()
+        except OSError:
+            continue  # ended meanwhile
+
+
+def test_a_stopped_stage_says_so(tmp_path: Path, runner: Runner, monkeypatch: pytest.MonkeyPatch) -> None:
+    board_capture(tmp_path / "cap", 4)
+    runner.ingest(tmp_path / "cap")
+
+    def raised(self: FakeContext) -> None:
+        raise InterruptedRun("Stopped on request.")
+
+    monkeypatch.setattr(FakeContext, "stop_requested", lambda self: True)
+    monkeypatch.setattr(FakeContext, "check_stop", raised)
+    with pytest.raises(InterruptedRun):
+        runner.poses()
+
+
+def test_masks_centre_the_object(tmp_path: Path, runner: Runner) -> None:
+    """RGBA photos of a ball: the unit sphere's inner nine tenths hold just the ball."""
+    from tests.capture.test_hull import CENTRE, RADIUS, ball_mask, ring
+
+    (tmp_path / "images").mkdir()
+    cameras = ring(16)
+    for camera in cameras:
+        noise = np.random.default_rng(int(camera.name[1:])).integers(0, 255, (160, 160, 3), np.uint8)
+        Image.fromarray(np.dstack([noise, ball_mask(camera)])).save(tmp_path / "images" / f"{camera.name}.png")
+    transforms(tmp_path, cameras)
+    runner.ingest(tmp_path)
+    results, ctx = runner.poses(max_features=256)
+    assert results["centre"] == pytest.approx(CENTRE, abs=0.04) and results["radius"] == pytest.approx(RADIUS, rel=0.08)
+    assert "visual hull of 16 masks" in ctx.decisions["unit sphere"]
+    assert CameraSet.load(ctx.out / "cameras.json").to_world.scale == pytest.approx(results["radius"] / 0.9)
+
+
+@pytest.mark.slow
+def test_kermit(captures: Path, runner: Runner) -> None:
+    runner.ingest(captures / "kermit")
+    results, _ = runner.poses()
+    assert results["registered"] == 11 and results["reprojection_px"] < 0.6

@@ -1,0 +1,70 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from gsbake.capture.sources import Sources, discover, list_photos
+from gsbake.pipeline.errors import BadInputError
+
+
+def touch(*paths: Path) -> None:
+    for path in paths:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.touch()
+
+
+def test_capture_folder(tmp_path: Path) -> None:
+    touch(tmp_path / "images/a.JPG", tmp_path / "images/left/b.png", tmp_path / "masks/a.png", tmp_path / "transforms.json")
+    found = discover(tmp_path)
+    assert found == Sources(tmp_path / "images", tmp_path / "masks", tmp_path / "transforms.json")
+    assert [p.name for p in list_photos(found.photos)] == ["a.JPG", "b.png"]
+
+
+def test_photo_folder_takes_its_parents_masks_and_poses(tmp_path: Path) -> None:
+    touch(tmp_path / "photos/a.jpg", tmp_path / "masks/a.png", tmp_path / "sparse/0/cameras.bin")
+    found = discover(tmp_path / "photos")
+    assert found.masks is not None and found.masks.samefile(tmp_path / "masks")
+    assert found.poses is not None and found.poses.samefile(tmp_path / "sparse/0")
+
+
+def test_photos_beside_their_transforms(tmp_path: Path) -> None:
+    touch(tmp_path / "a.jpg", tmp_path / "transforms.json", tmp_path / "masks/a.jpg.png")
+    assert discover(tmp_path) == Sources(tmp_path, tmp_path / "masks", tmp_path / "transforms.json")
+
+
+def test_reference_data_is_never_looked_at(tmp_path: Path) -> None:
+    touch(tmp_path / "images/a.jpg", tmp_path / "gt/transforms.json", tmp_path / "gt/masks/a.png", tmp_path / "images/gt/b.jpg")
+    assert discover(tmp_path) == Sources(tmp_path / "images")
+    assert [p.name for p in list_photos(tmp_path / "images")] == ["a.jpg"]
+
+
+def test_named_folders_override(tmp_path: Path) -> None:
+    touch(tmp_path / "images/a.jpg", tmp_path / "masks/a.png", tmp_path / "m/a.png", tmp_path / "p/poses_bounds.npy")
+    found = discover(tmp_path, tmp_path / "m", tmp_path / "p")
+    assert found == Sources(tmp_path / "images", tmp_path / "m", tmp_path / "p/poses_bounds.npy")
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        ([], "does not exist"),
+        (["cap/readme.txt"], "no photos"),
+        (["cap/images/.hidden.jpg"], "no photos"),
+    ],
+)
+def test_bad_folders(tmp_path: Path, make: list[str], words: str) -> None:
+    touch(*(tmp_path / m for m in make))
+    with pytest.raises(BadInputError, match=words):
+        discover(tmp_path / "cap")
+
+
+def test_bad_overrides(tmp_path: Path) -> None:
+    touch(tmp_path / "images/a.jpg", tmp_path / "poses.txt", tmp_path / "empty/x")
+    with pytest.raises(BadInputError, match="mask folder"):
+        discover(tmp_path, masks=tmp_path / "nomasks")
+    for name, words in (("nope.json", "do not exist"), ("poses.txt", "no known format"), ("empty", "holds no poses")):
+        with pytest.raises(BadInputError, match=words):
+            discover(tmp_path, poses=tmp_path / name)
+    with pytest.raises(BadInputError, match="is a file"):
+        discover(tmp_path / "images/a.jpg")

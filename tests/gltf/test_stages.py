@@ -1,0 +1,286 @@
+"""Bake and export, from files to files, on a bumpy sphere whose base colour says where each point lies."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import trimesh
+from scipy.spatial import cKDTree
+
+from gsbake.capture.cameras import Camera, CameraSet, Similarity
+from gsbake.gltf.read import GltfAsset, read_glb
+from gsbake.gltf.tangents import frame_to_world
+from gsbake.pipeline.errors import BadInputError
+from gsbake.pipeline.settings import SettingsView
+from gsbake.pipeline.stage import Stage
+from gsbake.profile.schema import Bake, Export, Profile, Splat, Train
+from gsbake.surface.ply import write_ply
+from gsbake.texture.colour import LINEAR, encode_bytes
+from gsbake.texture.masters import read_exr, write_exr
+from gsbake.texture.texels import rasterise
+from stages import bake, export
+
+SIZE, RADIUS, PHOTO = 256, 0.9, 240
+#: Unit frame to world: half a metre of the object is one unit, turned and moved.
+TO_WORLD = Similarity(2.0, np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), np.array([3.0, 4, 5]))
+
+
+@dataclass
+class Desk:
+    """A context without an engine."""
+
+    out: Path
+    inputs: dict[str, Path]
+    settings: Any
+    seed: int = 0
+    threads: int = 2
+    device: str = "cpu"
+    warnings: list[str] = field(default_factory=list)
+
+    @property
+    def checkpoint(self) -> Path:
+        return self.out
+
+    @contextmanager
+    def part(self, name: str) -> Iterator[None]:
+        yield
+
+    def progress(self, done: int, total: int, text: str = "", **live: float) -> None:
+        assert 0 <= done <= total
+
+    def stop_requested(self) -> bool:
+        return False
+
+    def check_stop(self) -> None:
+        pass
+
+    def decide(self, what: str, choice: str, evidence: str) -> None:
+        pass
+
+    def warn(self, text: str) -> None:
+        self.warnings.append(text)
+
+
+def desk(stage: Stage, folder: Path, out: Path, **sections: Any) -> Desk:
+    out.mkdir()
+    profile = Profile(bake=Bake(size=SIZE, occlusion_rays=8), train=Train(holdout=0)).model_copy(update=sections)
+    return Desk(out, {name: folder / name for name in stage.needs}, SettingsView(profile, stage.settings, stage.name))
+
+
+def radius(direction: np.ndarray) -> np.ndarray:
+    return RADIUS * (1 + 0.015 * np.sin(9 * direction[:, 0] + 1) * np.cos(8 * direction[:, 1] + 3 * direction[:, 2]))
+
+
+def colour(p: np.ndarray) -> np.ndarray:
+    return 0.45 + 0.3 * p / RADIUS
+
+
+def look(direction: np.ndarray, name: str) -> Camera:
+    z = -direction / np.linalg.norm(direction)
+    x = np.cross(z, [0.2, 0.1, 1.0])
+    x /= np.linalg.norm(x)
+    rotation = np.stack([x, np.cross(z, x), z])
+    return Camera(name, PHOTO, PHOTO, 300, 300, PHOTO / 2, PHOTO / 2, rotation, -rotation @ (-3 * z))
+
+
+def paint(view: Camera) -> np.ndarray:
+    """The smooth sphere as the camera sees it, 8-bit sRGB."""
+    ray = view.rays().reshape(-1, 3)
+    ray /= np.linalg.norm(ray, axis=1, keepdims=True)
+    b = ray @ view.centre
+    root = b * b - (view.centre @ view.centre - RADIUS**2)
+    p = view.centre + (-b - np.sqrt(np.maximum(root, 0)))[:, None] * ray
+    return encode_bytes(np.where(root[:, None] > 0, colour(p), 0)).reshape(PHOTO, PHOTO, 3)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("run")
+    for name in ("ingest", "poses/photos", "mesh", "refine"):
+        (folder / name).mkdir(parents=True)
+    light, dense = trimesh.creation.icosphere(subdivisions=3), trimesh.creation.icosphere(subdivisions=5)
+    write_ply(folder / "mesh/mesh.ply", RADIUS * light.vertices, light.faces)
+    write_ply(folder / "mesh/dense.ply", dense.vertices * radius(dense.vertices)[:, None], dense.faces)
+    k = np.arange(14) + 0.5
+    height, turn = 1 - 2 * k / 14, np.pi * (1 + 5**0.5) * k
+    around = np.stack([np.sqrt(1 - height**2) * np.cos(turn), np.sqrt(1 - height**2) * np.sin(turn), height], 1)
+    cameras = tuple(look(d, f"p{i:02d}") for i, d in enumerate(around))
+    for camera in cameras:
+        cv2.imwrite(str(folder / "poses/photos" / f"{camera.name}.png"), paint(camera)[..., ::-1])
+    CameraSet(cameras, TO_WORLD, "given", metric=True).save(folder / "poses/cameras.json")
+    photos = [{"name": c.name, "source": f"/somewhere/{c.name.upper()}.JPG"} for c in cameras]
+    (folder / "ingest/photos.json").write_text(json.dumps({"photos": photos}))
+    result = bake.run(desk(bake.STAGE, folder, folder / "bake"))
+    assert result["unseen_share"] < 0.01 and result["detail_share"] > 0.99
+    context = desk(export.STAGE, folder, folder / "export", export=Export(copyright="me"))
+    result = export.run(context)
+    assert context.warnings == [] and result["scale"] == "metres" and result["triangles"] == 1280
+    return folder
+
+
+@pytest.fixture(scope="module")
+def asset(run: Path) -> GltfAsset:
+    return read_glb(run / "export" / "asset.glb")
+
+
+def unit_points(asset: GltfAsset) -> tuple[np.ndarray, Any, np.ndarray]:
+    """Texels of the asset, and their points in the unit frame: glTF (x, y, z) is world (x, -z, y)."""
+    uv = asset.attributes["TEXCOORD_0"]
+    texels = rasterise(uv, asset.faces, SIZE)
+    p = texels.interpolate(asset.attributes["POSITION"], asset.faces).astype(float)
+    world = np.stack([p[:, 0], -p[:, 2], p[:, 1]], 1)
+    return TO_WORLD.inverse().apply(world), texels, uv
+
+
+def test_every_file_is_there(run: Path) -> None:
+    assert {p.name for p in (run / "bake").iterdir()} == {"mesh.safetensors", "base_color.exr", "orm.exr", "normal.exr", "coverage.exr"}
+    names = {str(p.relative_to(run / "export")) for p in (run / "export").rglob("*") if p.is_file()}
+    sheets = {f"previews/{name}.png" for name in ("base_color", "orm", "normal", "uv")}
+    assert names == {"asset.glb", "cameras.json", "audit.json"} | sheets
+
+
+def test_base_colour_lies_where_it_belongs(asset: GltfAsset) -> None:
+    p, texels, _ = unit_points(asset)
+    image = asset.image("base_color")
+    assert image is not None
+    error = np.abs(LINEAR[image].reshape(-1, 3)[texels.index] - colour(p))
+    assert error.mean() < 0.005 and np.quantile(error, 0.99) < 0.03
+    assert image.min() > 20  # no black surround, not in the empty texels either
+
+
+def test_normal_map_gives_the_true_normals_in_the_assets_frame(asset: GltfAsset) -> None:
+    p, texels, _ = unit_points(asset)
+    n = texels.interpolate(asset.attributes["NORMAL"], asset.faces)
+    t = texels.interpolate(asset.attributes["TANGENT"], asset.faces)
+    image = asset.image("normal")
+    assert image is not None
+    shaded = frame_to_world(image.reshape(-1, 3)[texels.index] / 127.5 - 1, n, t)
+    direction = p / np.linalg.norm(p, axis=1, keepdims=True)
+    q = direction * radius(direction)[:, None]
+
+    def outside(x: np.ndarray) -> np.ndarray:
+        length = np.linalg.norm(x, axis=1)
+        return length - radius(x / length[:, None])
+
+    gradient = np.stack([outside(q + 1e-5 * e) - outside(q - 1e-5 * e) for e in np.eye(3)], 1) @ TO_WORLD.rotation.T
+    true = np.stack([gradient[:, 0], gradient[:, 2], -gradient[:, 1]], 1)
+    cosine = (shaded * true).sum(1) / np.linalg.norm(true, axis=1)
+    angle = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
+    assert angle.mean() < 1.5 and np.quantile(angle, 0.99) < 4
+
+
+def test_occlusion_roughness_metallic_are_packed(run: Path, asset: GltfAsset) -> None:
+    image = asset.image("orm")
+    assert image is not None and np.array_equal(image, asset.image("occlusion"))
+    assert (image[..., 1] == 204).all() and (image[..., 2] == 0).all() and image[..., 0].mean() > 240
+    assert read_exr(run / "bake/coverage.exr")[..., 1].mean() > 0.4
+
+
+def test_cameras_look_at_the_asset(run: Path, asset: GltfAsset) -> None:
+    body = json.loads((run / "export/cameras.json").read_text())
+    frame = body["frames"][3]
+    assert frame["file_path"] == "P03.JPG" and len(body["frames"]) == 14
+    centre = asset.attributes["POSITION"].mean(0)
+    matrix = np.array(frame["transform_matrix"])
+    towards = centre - matrix[:3, 3]
+    assert np.linalg.norm(towards) == pytest.approx(3 * TO_WORLD.scale, rel=0.01)
+    assert towards @ -matrix[:3, 2] / np.linalg.norm(towards) == pytest.approx(1, abs=1e-3)
+
+
+def test_trimesh_reads_the_same_surface(run: Path) -> None:
+    mesh = trimesh.load(run / "export/asset.glb", force="mesh")
+    assert mesh.is_winding_consistent and mesh.volume > 0
+    world = np.stack([mesh.vertices[:, 0], -mesh.vertices[:, 2], mesh.vertices[:, 1]], 1)
+    assert np.allclose(np.linalg.norm(TO_WORLD.inverse().apply(world), axis=1), RADIUS, atol=1e-4)
+    assert len(cKDTree(mesh.vertices).query_pairs(1e-9)) == 0 or len(mesh.vertices) > 642  # cut along seams only
+
+
+def test_the_same_input_gives_the_same_bytes(run: Path, tmp_path: Path) -> None:
+    bake.run(desk(bake.STAGE, run, tmp_path / "bake"))
+    assert (tmp_path / "bake/mesh.safetensors").read_bytes() == (run / "bake/mesh.safetensors").read_bytes()
+    for name in ("base_color", "orm", "normal"):
+        assert np.array_equal(read_exr(tmp_path / f"bake/{name}.exr"), read_exr(run / f"bake/{name}.exr"))
+    export.run(desk(export.STAGE, run, tmp_path / "export", export=Export(copyright="me")))
+    assert (tmp_path / "export/asset.glb").read_bytes() == (run / "export/asset.glb").read_bytes()
+
+
+def test_an_asset_over_the_triangle_limit_fails(run: Path, tmp_path: Path) -> None:
+    with pytest.raises(BadInputError, match="triangle count"):
+        export.run(desk(export.STAGE, run, tmp_path / "export", export=Export(max_triangles=1000)))
+
+
+def test_a_damaged_mesh_is_told(run: Path, tmp_path: Path) -> None:
+    context = desk(bake.STAGE, run, tmp_path / "bake")
+    context.inputs["mesh"] = tmp_path
+    (tmp_path / "mesh.ply").write_bytes((run / "mesh/mesh.ply").read_bytes()[:5000])
+    with pytest.raises(BadInputError, match=r"mesh\.ply"):
+        bake.run(context)
+
+
+def test_masters_are_half_floats_and_come_back(tmp_path: Path) -> None:
+    image = np.random.default_rng(0).random((5, 7, 3)).astype(np.float16)
+    write_exr(tmp_path / "a.exr", image)
+    assert np.array_equal(read_exr(tmp_path / "a.exr"), image.astype(np.float32))
+    with pytest.raises(BadInputError, match=r"b\.exr"):
+        read_exr(tmp_path / "b.exr")
+
+
+class Painted:
+    """Stands in for the surfel renderer: materials that follow the position, a light from world +x and above."""
+
+    @staticmethod
+    def load(folder: Path) -> Painted:
+        return Painted()
+
+    def gbuffer(self, camera: Camera) -> dict[str, np.ndarray]:
+        ray = camera.rays().reshape(-1, 3)
+        ray /= np.linalg.norm(ray, axis=1, keepdims=True)
+        b = ray @ camera.centre
+        root = b * b - (camera.centre @ camera.centre - RADIUS**2)
+        p = camera.centre + (-b - np.sqrt(np.maximum(root, 0)))[:, None] * ray
+        inside = (root > 0).reshape(camera.height, camera.width)
+        shape = (camera.height, camera.width)
+        planes = {"albedo": colour(p).reshape(*shape, 3), "roughness": (0.5 + 0.3 * p[:, 2]).reshape(shape)}
+        planes["metallic"] = (p[:, 0] > 0).reshape(shape)
+        planes = {k: np.where(inside[..., None] if v.ndim == 3 else inside, v, 0).astype(np.float32) for k, v in planes.items()}
+        return planes | {"alpha": inside.astype(np.float32)}
+
+
+def test_materials_and_light_of_a_relightable_asset(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from gsbake.light.environment import EnvironmentLight
+
+    monkeypatch.setattr("gsbake.splat.render.SurfelRenderer", Painted)
+    folder = tmp_path / "run"
+    folder.mkdir()
+    for name in ("ingest", "poses", "mesh"):
+        (folder / name).symlink_to(run / name)
+    (folder / "refine").mkdir()
+    towards = TO_WORLD.rotation.T @ np.array([0.8, 0, 0.6])  # world +x, a little above
+    light = EnvironmentLight.from_function(lambda d: np.tile(np.maximum(d @ towards, 0)[:, None] ** 40, (1, 3)) + 0.01, 32)
+    light.save(folder / "refine/light.safetensors")
+    pbr = Splat(shading="pbr")
+    bake.run(desk(bake.STAGE, folder, folder / "bake", splat=pbr))
+    result = export.run(desk(export.STAGE, folder, folder / "export", splat=pbr))
+    assert result["audit_passed"] > 30
+    asset = read_glb(folder / "export/asset.glb")
+    p, texels, _ = unit_points(asset)
+    orm, base = asset.image("orm"), asset.image("base_color")
+    assert orm is not None and base is not None
+    shown = orm.reshape(-1, 3)[texels.index] / 255
+    assert np.abs(LINEAR[base].reshape(-1, 3)[texels.index] - colour(p)).mean() < 0.005
+    assert np.abs(shown[:, 1] - (0.5 + 0.3 * p[:, 2])).mean() < 0.005
+    clear = np.abs(p[:, 0]) > 0.06
+    assert np.abs(shown[clear, 2] - (p[clear, 0] > 0)).mean() < 0.01
+    image = cv2.imread(str(folder / "export/light.hdr"), cv2.IMREAD_UNCHANGED)
+    row, column = np.unravel_index(image[..., 0].argmax(), image.shape[:2])
+    # three.js: u = atan2(z, x) / 2π + 1/2, v = asin(y) / π + 1/2 from the bottom; the light stands at glTF (0.8, 0.6, 0).
+    assert (column + 0.5) / image.shape[1] == pytest.approx(0.5, abs=0.02)
+    assert (row + 0.5) / image.shape[0] == pytest.approx(0.5 - np.arcsin(0.6) / np.pi, abs=0.02)
