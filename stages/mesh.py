@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 BALL = 1.05
 #: Truncation in cells, at least and at most; between them three times the depth noise.
 TRUNCATION_CELLS = (4.0, 10.0)
+#: Fainter surfels say nothing about where the object is.
+MIN_OPACITY = 0.05
 #: Holes with more border edges than this are openings, not holes, when nothing tells inside from outside.
 MAX_HOLE_EDGES = 400
 
@@ -56,7 +58,7 @@ def run(ctx: Context) -> dict[str, Any]:
 
 
 def _samples(folder: Path) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """The surfels on their zero set: points (n, 3), outward normals (n, 3), weights (n,) by area; those in the ball."""
+    """The surfels on their zero set: points (n, 3), outward normals (n, 3), weights (n,) by area and opacity; those in the ball."""
     import numpy as np
 
     from gsbake.splat.surfels import Surfels
@@ -66,10 +68,11 @@ def _samples(folder: Path) -> tuple[NDArray[np.float64], NDArray[np.float64], ND
     sdf = surfels.sdf.detach().cpu().numpy().astype(np.float64).reshape(-1, 1)
     points = surfels.position.detach().cpu().numpy().astype(np.float64) - sdf * normal
     weights = surfels.scale.detach().cpu().numpy().astype(np.float64).prod(1)
-    keep = np.isfinite(points).all(1) & (np.linalg.norm(points, axis=1) <= BALL)
+    opacity = surfels.opacity().detach().cpu().numpy().astype(np.float64).reshape(-1)
+    keep = np.isfinite(points).all(1) & (np.linalg.norm(points, axis=1) <= BALL) & (opacity > MIN_OPACITY)
     if keep.sum() < 10:
         raise BadInputError("mesh: fewer than ten surfels lie in the object's sphere; the training failed, see its figures in the report.")
-    weights = weights[keep]
+    weights = (weights * opacity)[keep]
     return points[keep], normal[keep], weights / max(float(np.median(weights)), 1e-12)
 
 

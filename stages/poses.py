@@ -83,6 +83,7 @@ def _job(ctx: Context, task: str, entries: Sequence[dict[str, Any]], ingest: Pat
         "max_features": settings.max_features,
         "peak_threshold": settings.peak_threshold,
         "max_size": settings.max_size,
+        "fine": settings.fine_features,
         "threads": ctx.threads,
         "seed": ctx.seed,
     }
@@ -142,6 +143,7 @@ def _solve(ctx: Context, entries: Sequence[dict[str, Any]], ingest: Path, out: P
         "cameras": len(job["lenses"]),
         "matching": kind,
         "masked_features": masks is not None,
+        "fine_features": result["fine_features"],
         "seconds": result["seconds"],
     }
 

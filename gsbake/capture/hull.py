@@ -31,6 +31,8 @@ WRONG_VIEWS = 0.03
 SEEN_SHARE = 0.25
 #: At most this many votes are kept per point, which bounds how many views may be wrong.
 _KEEP = 8
+#: Cells from the surface beyond which the distance outside need only be a lower bound.
+_BAND = 6.0
 
 
 @nb.njit(parallel=True, fastmath=True, cache=True)
@@ -44,6 +46,8 @@ def _carve(
     lens (v, 4) fx, fy, cx, cy; poses (v, 3, 4) world→camera.
     """
     views = starts.shape[0]
+    most_wrong = min(int(wrong_share * views + 0.5), _KEEP - 1)
+    far = _BAND * cell
     out = np.empty((n, n, n), np.float32)
     for i in nb.prange(n):
         worst = np.empty(_KEEP, np.float64)
@@ -77,7 +81,11 @@ def _carve(
                             worst[slot] = worst[slot - 1]
                             slot -= 1
                         worst[slot] = value
-                if seen < least_seen:
+                        if worst[most_wrong] > far:  # no later view can bring it back
+                            break
+                if worst[most_wrong] > far:
+                    out[i, j, k] = worst[most_wrong]
+                elif seen < least_seen:
                     out[i, j, k] = cell
                 else:
                     allowed = min(int(wrong_share * seen + 0.5), _KEEP - 1, seen - 1)
@@ -113,13 +121,15 @@ def carve(
     starts = np.concatenate([[0], np.cumsum(sizes.prod(1))[:-1]]).astype(np.int64)
     lens = np.array([(c.fx, c.fy, c.cx, c.cy) for c in cameras], float).reshape(-1, 4)
     poses = np.array([np.concatenate([c.R, c.t[:, None]], 1) for c in cameras], float).reshape(-1, 3, 4)
+    # Views in an order that jumps around the object: what is empty is found so after a few.
+    order = np.argsort(np.arange(len(fields)) * 0.6180339887498949 % 1.0)
     cell = 2.0 * radius / resolution
     least = max(2, int(np.ceil(SEEN_SHARE * len(fields))))
     flat = np.concatenate([f.ravel() for f in fields])
-    return _carve(flat, starts, sizes, lens, poses, np.asarray(centre, float) - radius, cell, resolution, wrong_views, least)
+    return _carve(flat, starts[order], sizes[order], lens[order], poses[order], np.asarray(centre, float) - radius, cell, resolution, wrong_views, least)
 
 
-def _largest_parts(inside: NDArray[np.bool_], share: float = 0.01) -> NDArray[np.bool_]:
+def _largest_parts(inside: NDArray[np.bool_], share: float = 0.05) -> NDArray[np.bool_]:
     """Drop loose pieces smaller than `share` of the largest (left where silhouettes cross in empty space)."""
     from scipy import ndimage
 

@@ -119,7 +119,7 @@ def read_photo(path: Path) -> RawPhoto:
     Raises UnreadablePhotoError when the file is broken, truncated or holds values that are no numbers.
     """
     pixels, spec = _decode(path)
-    tags = {a.name: a.value for a in spec.extra_attribs}
+    tags: dict[str, Any] = {a.name: a.value for a in spec.extra_attribs}
     names = [str(n).upper() for n in spec.channelnames]
     alpha_at = spec.alpha_channel if spec.alpha_channel >= 0 else (names.index("A") if "A" in names else -1)
     colour_at = [i for i in range(pixels.shape[2]) if i != alpha_at]
@@ -151,7 +151,7 @@ def read_mask(path: Path) -> tuple[Bytes, int]:
     Of RGBA files the alpha channel is the mask if it is not opaque. Raises UnreadablePhotoError.
     """
     pixels, spec = _decode(path)
-    orientation = int(str(spec.getattribute("Orientation") or 1))
+    orientation = spec.get_int_attribute("Orientation", 1) or 1
     plane = pixels[..., 0]
     if spec.alpha_channel >= 0 and float(pixels[..., spec.alpha_channel].min()) < (255 if pixels.dtype == np.uint8 else 1.0):
         plane = pixels[..., spec.alpha_channel]

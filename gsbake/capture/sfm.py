@@ -26,6 +26,8 @@ Tick = Callable[[str, int, int], None]
 WEAK_INLIERS, WEAK_SHARE = 15, 0.15
 #: Largest features per photo in the ranking of pairs.
 RANKING_FEATURES = 512
+#: Features per photo with which the finest octave is left out, and the share of photos that may then fail before it is added after all.
+ENOUGH, POOR = 1500, 0.05
 #: Pairs matched between two lines in COLMAP's log, by which `solve` tells the progress.
 BLOCK = 64
 
@@ -51,10 +53,12 @@ class Solver:
     max_features: int
     peak_threshold: float
     max_size: int
+    fine: bool | str
     threads: int
     seed: int
     tick: Tick
     seconds: dict[str, float] = field(default_factory=dict)
+    upsampled: bool = False
 
     @property
     def database(self) -> Path:
@@ -76,28 +80,60 @@ class Solver:
         finally:
             self.seconds[part] = self.seconds.get(part, 0.0) + time.perf_counter() - start
 
-    def features(self) -> None:
-        """Find SIFT features in all photos; kept in the database, so that an interrupted run does not repeat it."""
-        marker = self.work / "features.done"
-        if marker.exists():
-            return
-        for old in self.work.glob("*"):
-            shutil.rmtree(old) if old.is_dir() else old.unlink()
+    def _extraction(self) -> Any:
         options = pycolmap.FeatureExtractionOptions()
         options.num_threads = self.threads
         options.use_gpu = False
         options.max_image_size = self.max_size
         options.sift.max_num_features = self.max_features
         options.sift.peak_threshold = self.peak_threshold
+        options.sift.first_octave = -1 if self.upsampled else 0
+        return options
+
+    def _needs_fine(self) -> bool:
+        """Whether a few photos show that features of the finest octave are needed."""
+        names = self.names
+        sample = [names[i] for i in sorted({0, len(names) // 2, len(names) - 1})]
+        base_file = self.work / "probe.db"
+        self.upsampled = False
+        pycolmap.extract_features(
+            str(base_file),
+            str(self.folder),
+            [f"{name}.png" for name in sample],
+            pycolmap.CameraMode.PER_IMAGE,
+            self._reader(),
+            self._extraction(),
+            pycolmap.Device.cpu,
+        )
+        with closing(pycolmap.Database.open(str(base_file))) as base:
+            counts = [base.num_keypoints_for_image(image.image_id) for image in base.read_all_images()]
+        return not counts or float(np.median(counts)) < min(ENOUGH, 0.5 * self.max_features)
+
+    def _reader(self) -> Any:
+        reader = pycolmap.ImageReaderOptions()
+        reader.camera_model = "SIMPLE_RADIAL"
+        if self.mask_folder is not None:
+            reader.mask_path = str(self.mask_folder)
+        return reader
+
+    def features(self) -> None:
+        """Find SIFT features in all photos; kept in the database, so that an interrupted run does not repeat it.
+
+        The finest octave (photos enlarged twice) costs five times as much and holds most features but not the best ones; in "auto" it is
+        left out where the others are enough.
+        """
+        marker = self.work / "features.done"
+        if marker.exists():
+            self.upsampled = marker.read_text() == "fine"
+            return
+        self._clear()
         with self._timed("features", len(self.names)):
+            self.upsampled = self._needs_fine() if self.fine == "auto" else bool(self.fine)
+            options = self._extraction()
             for lens in self.lenses:
-                reader = pycolmap.ImageReaderOptions()
-                reader.camera_model = "SIMPLE_RADIAL"
-                if self.mask_folder is not None:
-                    reader.mask_path = str(self.mask_folder)
                 files = [f"{name}.png" for name in lens.names]
                 pycolmap.extract_features(
-                    str(self.database), str(self.folder), files, pycolmap.CameraMode.SINGLE, reader, options, pycolmap.Device.cpu
+                    str(self.database), str(self.folder), files, pycolmap.CameraMode.SINGLE, self._reader(), options, pycolmap.Device.cpu
                 )
         with closing(pycolmap.Database.open(str(self.database))) as base:
             for lens in self.lenses:
@@ -106,7 +142,11 @@ class Solver:
                     camera.params = [lens.focal, *list(camera.params)[1:]]
                     camera.has_prior_focal_length = True
                     base.update_camera(camera)
-        marker.touch()
+        marker.write_text("fine" if self.upsampled else "coarse")
+
+    def _clear(self) -> None:
+        for old in self.work.glob("*"):
+            shutil.rmtree(old) if old.is_dir() else old.unlink()
 
     def choose_pairs(self, kind: str) -> list[pairing.Pair]:
         """Pairs of photos (indices into `names`) to match."""
@@ -214,7 +254,15 @@ class Solver:
         return [i for i, name in enumerate(self.names) if name not in there]
 
     def solve(self, kind: str, mapper: str) -> Any | None:
-        """The largest reconstruction found, or None."""
+        """The largest reconstruction found, or None. In "auto" a poor one is tried again with the finest octave of features."""
+        model = self._solve(kind, mapper)
+        if self.fine == "auto" and not self.upsampled and len(self.missing(model)) > POOR * len(self.names):
+            self._clear()
+            self.fine = True
+            model = largest([m for m in (model, self._solve(kind, mapper)) if m is not None])
+        return model
+
+    def _solve(self, kind: str, mapper: str) -> Any | None:
         self.features()
         marker = self.work / "matches.done"
         if not marker.exists():

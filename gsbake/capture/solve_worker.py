@@ -59,6 +59,7 @@ def _solver(job: Mapping[str, Any]) -> Solver:
         max_features=job["max_features"],
         peak_threshold=job["peak_threshold"],
         max_size=job["max_size"],
+        fine=job["fine"],
         threads=job["threads"],
         seed=job["seed"],
         tick=_tell,
@@ -83,6 +84,7 @@ def _write(model: Any, out: Path, solver: Solver, solved: bool) -> dict[str, Any
     return {
         "registered": len(placed),
         "points": len(points),
+        "fine_features": solver.upsampled,
         "reprojection_px": float(model.compute_mean_reprojection_error()) if len(points) else None,
         "track_length": float(model.compute_mean_track_length()) if len(points) else None,
         "missing": [name for name in solver.names if name not in registered_names(model)],

@@ -46,8 +46,8 @@ def default_threads() -> int:
 
 
 def thread_environment(threads: int) -> dict[str, str]:
-    """The environment in which every library's thread pool has `threads` threads."""
-    return dict.fromkeys(_POOLS, str(threads))
+    """The environment in which every library's thread pool has `threads` threads, and idle OpenMP threads sleep instead of spinning."""
+    return dict.fromkeys(_POOLS, str(threads)) | {"OMP_WAIT_POLICY": "PASSIVE"}
 
 
 def torch_cuda_build() -> str | None:

@@ -39,6 +39,9 @@ class Poses(Section):
         "auto", description="Find features only inside the masks; auto does so where the background stands still (turntables)."
     )
     max_size: int = Field(1600, ge=64, le=16384, description="Longer side in pixels at which features are found.")
+    fine_features: bool | Literal["auto"] = Field(
+        "auto", description="Find features in photos enlarged twice too (5 times the cost); auto does so where there are few others or photos fail to register."
+    )
 
 
 class Splat(Section):

@@ -12,6 +12,7 @@ import torch
 from gsbake.capture.posed import PosedPhotos
 from gsbake.pipeline.stage import Context
 from gsbake.splat.surfels import Surfels
+from gsbake.splat.threads import configure
 from gsbake.splat.trainer import Plan, Trainer
 from gsbake.splat.views import held_out, load_views
 
@@ -25,6 +26,7 @@ class Session:
     def __init__(self, ctx: Context, posed: PosedPhotos, surfels: Surfels, light: Any, iterations: int, coarse_share: float, densify: bool) -> None:
         """Load the photos at `train.max_size`; go on from the newest checkpoint if this stage was interrupted."""
         self.ctx = ctx
+        configure(ctx.threads)
         settings = ctx.settings
         with ctx.part("load photos"):
             full, half = load_views(posed, settings.train.max_size)

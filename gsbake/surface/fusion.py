@@ -21,6 +21,8 @@ from gsbake.surface.blocks import EDGE
 BY_DEPTH, BY_MASK = 1, 2
 
 
+#: What a view says about a block.
+LOOK, NOTHING, BEHIND = 0, 1, 2
 #: Edge of the tiles in which a view's reach is summed up, in pixels.
 TILE = 8
 
@@ -42,7 +44,7 @@ def reach_tiles(inverse_depth: Any, outside: Any, truncation: Any) -> Any:
 
 
 @nb.njit(cache=True, nogil=True, inline="always")
-def _hidden(
+def _glance(
     x0: Any,
     y0: Any,
     z0: Any,
@@ -57,7 +59,7 @@ def _hidden(
     height: int,
     reach: Any,
 ) -> Any:
-    """Whether a block (first sample x0, y0, z0) lies outside the view or behind everything it shows."""
+    """What a view says about a block (first sample x0, y0, z0): LOOK at its samples, NOTHING, or it lies BEHIND all that is shown."""
     half = np.float32((EDGE - 1) / 2) * cell
     x, y, z = x0 + half, y0 + half, z0 + half
     px = rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2] * z + translation[0]
@@ -65,20 +67,22 @@ def _hidden(
     pz = rotation[2, 0] * x + rotation[2, 1] * y + rotation[2, 2] * z + translation[2]
     radius = np.float32(1.7320508) * half
     if pz + radius <= 0:
-        return True
+        return NOTHING
     if pz <= np.float32(1.5) * radius:
-        return False
+        return LOOK
     rx, ry = px / pz, py / pz
     spread = radius / (pz - radius)
     du, dv = fx * spread * np.sqrt(1 + rx * rx), fy * spread * np.sqrt(1 + ry * ry)
     u, v = fx * rx + cx, fy * ry + cy
     if u + du < 0 or v + dv < 0 or u - du >= width or v - dv >= height:
-        return True
+        return NOTHING
     far = np.float32(-1)
     for row in range(max(0, int(v - dv) // TILE), min(reach.shape[0] - 1, int(v + dv) // TILE) + 1):
         for col in range(max(0, int(u - du) // TILE), min(reach.shape[1] - 1, int(u + du) // TILE) + 1):
             far = max(far, reach[row, col])
-    return pz - radius > far
+    if far < 0:
+        return NOTHING
+    return BEHIND if pz - radius > far else LOOK
 
 
 @nb.njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
@@ -102,11 +106,16 @@ def fuse_view(
     values: Any,
     totals: Any,
     seen: Any,
+    hidden: Any,
+    hidden_blocks: Any,
 ) -> None:
     """Add one view to blocks start..stop of the running means `values` (n, 8, 8, 8) with weights `totals` and flags `seen`.
 
+    `hidden` and, for whole blocks, `hidden_blocks` (n,) count the views whose surface lies before the sample.
+
     `inverse_depth` (h, w) holds 1/z, 0 = none; `cosine` (h, w) the cosine between normal and ray; `outside` (h, w) the distance
-    in pixels outside the object's mask (0 inside); `reach` is `reach_tiles` of the view. `intrinsics` is (fx, fy, cx, cy), pixel centres at +.5.
+    in pixels outside the object's mask (0 inside); `reach` is `reach_tiles` of the view; `intrinsics` is (fx, fy, cx, cy),
+    pixel centres at +.5.
     """
     height, width = inverse_depth.shape
     fx, fy, cx, cy = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]
@@ -116,7 +125,10 @@ def fuse_view(
         x0 = np.float32(lower[0] + cell * coords[n, 0] * EDGE)
         y0 = np.float32(lower[1] + cell * coords[n, 1] * EDGE)
         z0 = np.float32(lower[2] + cell * coords[n, 2] * EDGE)
-        if _hidden(x0, y0, z0, cell, rotation, translation, fx, fy, cx, cy, width, height, reach):
+        glance = _glance(x0, y0, z0, cell, rotation, translation, fx, fy, cx, cy, width, height, reach)
+        if glance == BEHIND:
+            hidden_blocks[n] += 1
+        if glance != LOOK:
             continue
         for i in range(EDGE):
             px = x0 + np.float32(i) * cell
@@ -164,6 +176,7 @@ def fuse_view(
                     # entered, and what it says about the far side would swell the body.
                     along = (one / inv - z) * slant / truncation
                     if along < -one:
+                        hidden[n, i, j, k] += 1
                         continue
                     distance = along * cosine[iv, iu]
                     if distance > one:

@@ -30,6 +30,8 @@ SURVEY_SAMPLES = 128
 HULL_WEIGHT = 2.0
 #: Weight of "empty here, far before the surface" against "the surface is near": one stray ray must not erode a thin part.
 FREE_WEIGHT = 0.5
+#: Emptiness that is seen with less than this weight per view that finds the place hidden is doubted.
+DOUBT = 0.03
 #: Fine sweeps that smooth the seam between what was seen and what was filled.
 SEAM_SWEEPS, SEAM_ROUNDS = 12, 3
 #: Steepness that turns the survey's known distances into sides before filling.
@@ -48,11 +50,13 @@ class FusedBlocks:
         self.values = np.zeros(shape, np.float32)
         self.totals = np.zeros(shape, np.float32)
         self.seen = np.zeros(shape, np.uint8)
+        self.hidden = np.zeros(shape, np.uint16)
+        self.hidden_blocks = np.zeros(len(lattice), np.int32)
 
     @property
     def nbytes(self) -> int:
         """Memory of the samples in bytes."""
-        return self.values.nbytes + self.totals.nbytes + self.seen.nbytes
+        return self.values.nbytes + self.totals.nbytes + self.seen.nbytes + self.hidden.nbytes
 
     def add(self, view: DepthView) -> None:
         """Fuse one view."""
@@ -75,8 +79,18 @@ class FusedBlocks:
             self.values,
             self.totals,
             self.seen,
+            self.hidden,
+            self.hidden_blocks,
         )
         run_chunks(lambda start, stop: fuse_view(start, stop, *fixed), len(self.lattice))
+
+    def doubt(self) -> None:
+        """Forget "empty" where hardly any view says so and many say that it is hidden: rays that slipped through a gap.
+
+        A mask's word stands. Without this, single rays hollow the inside out, where nothing speaks against them.
+        """
+        against = self.hidden + self.hidden_blocks[:, None, None, None]
+        self.seen[(self.values > 0) & (self.totals < DOUBT * against) & (self.seen & BY_MASK == 0)] = 0
 
 
 class SparseTsdf:
@@ -125,6 +139,7 @@ class SparseTsdf:
     def allocate(self) -> None:
         """Between the passes: fill what no view saw (coarsely), and allocate the blocks the surface runs through."""
         field = self.survey_field
+        field.doubt()
         unknown = field.seen == 0
         field.values[field.seen == BY_MASK] = 1
         if self.solid:
@@ -162,6 +177,7 @@ class SparseTsdf:
         fused, filled = self._fused, self._filled
         if fused is None or filled is None:
             raise RuntimeError("survey, allocate and integrate before meshing")
+        fused.doubt()
         unknown = fused.seen == 0
         if close:
             scale = self.survey_field.truncation / self.truncation

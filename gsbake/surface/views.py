@@ -66,15 +66,16 @@ class DepthView:
 
     @staticmethod
     def from_gbuffer(camera: Camera, buffers: Mapping[str, Any], mask: NDArray[np.uint8] | None, tolerance: float) -> DepthView:
-        """From rendered "depth", "median_depth", "normal", "alpha"; `tolerance` (world) is how much two layers may differ to be one.
+        """From rendered "depth", "median_depth", "normal", "alpha"; `tolerance` (world) is how far apart two layers must be.
 
-        The expected depth is used where it agrees with the median depth, the median elsewhere (there the mean lies between two layers).
+        The expected depth is used where it agrees with the median depth (to a quarter of that), the median elsewhere (there the mean lies
+        between two layers).
         Weight: alpha × cosine × 1/z² (a far pixel sees a larger patch less exactly), relative to the mean distance.
         """
         alpha = np.asarray(buffers["alpha"], np.float32).reshape(camera.height, camera.width)
         expected = np.asarray(buffers["depth"], np.float32).reshape(alpha.shape)
         median = np.asarray(buffers["median_depth"], np.float32).reshape(alpha.shape)
-        depth = np.where(np.abs(expected - median) < tolerance, expected, median)
+        depth = np.where(np.abs(expected - median) < tolerance / 4, expected, median)
         cosine = _cosine(camera, np.asarray(buffers["normal"], np.float32))
         good = (alpha > MIN_ALPHA) & np.isfinite(depth) & (depth > 0) & (cosine > MIN_COSINE)
         depth = np.where(good, depth, 0).astype(np.float32)

@@ -198,7 +198,7 @@ def test_resolution_follows_the_evidence() -> None:
     assert surfel_spacing(grid) == pytest.approx(0.02, rel=0.15)
     cameras = [camera_at(np.array([3.0, 0, 0]), "c", 160)]
     assert pixel_footprint(cameras, np.zeros(3)) == pytest.approx(3 / (160 * 1.2))
-    assert choose(2.0, 0.02, 0.001, 0, 384).cells == 200
+    assert choose(2.0, 0.02, 0.001, 0, 384).cells == 150
     assert choose(2.0, 0.002, 0.02, 0, 384).cells == 134
     bounded = choose(2.0, 0.001, 0.001, 0, 384)
     assert bounded.cells == 384 and "bounded" in bounded.reason
