@@ -1,6 +1,6 @@
 """Milliseconds of the rasteriser on a sphere of surfels that fills 56 % of the frame.
 
-    python -m benchmarks.raster --surfels 50000 --size 512 --channels 10 --json
+python -m benchmarks.raster --surfels 50000 --size 512 --channels 10 --json
 """
 
 from __future__ import annotations

@@ -126,7 +126,8 @@ def carve(
     cell = 2.0 * radius / resolution
     least = max(2, int(np.ceil(SEEN_SHARE * len(fields))))
     flat = np.concatenate([f.ravel() for f in fields])
-    return _carve(flat, starts[order], sizes[order], lens[order], poses[order], np.asarray(centre, float) - radius, cell, resolution, wrong_views, least)
+    return _carve(flat, starts[order], sizes[order], lens[order], poses[order], np.asarray(centre, float) - radius, cell, resolution,
+    wrong_views, least)
 
 
 def _largest_parts(inside: NDArray[np.bool_], share: float = 0.05) -> NDArray[np.bool_]:

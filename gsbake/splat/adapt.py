@@ -34,7 +34,8 @@ class Statistics:
         return Statistics(torch.zeros(n), torch.zeros(n), torch.zeros(n))
 
     def add(self, screen_grad: Tensor, touched: Tensor, size: int) -> None:
-        """Collect one backward pass: gradients (n, ≥2) w.r.t. the screen centre in pixels, weights (n,); `size` makes them resolution-free."""
+        """Collect one backward pass: gradients (n, ≥2) w.r.t. the screen centre in pixels, weights (n,); `size` makes them
+        resolution-free."""
         seen = touched > 0
         self.gradient += torch.where(seen, screen_grad[:, :2].norm(dim=1) * (size / 2), 0.0)
         self.views += seen
@@ -58,7 +59,9 @@ def replace_rows(surfels: Surfels, adam: Adam, keep: Tensor, children: Surfels |
 
 
 @torch.no_grad()
-def densify(surfels: Surfels, adam: Adam, stats: Statistics, budget: int, large: float, generator: torch.Generator, floor: float = 0.0) -> Surfels:
+def densify(
+    surfels: Surfels, adam: Adam, stats: Statistics, budget: int, large: float, generator: torch.Generator, floor: float = 0.0
+) -> Surfels:
     """Split (scale above `large`) or clone the surfels with the largest mean gradient until `budget` surfels exist.
 
     A split surfel becomes two of 1/1.6 its size at random places of its disc; a clone is a copy. Only gradients above `floor` count.
@@ -88,7 +91,8 @@ def densify(surfels: Surfels, adam: Adam, stats: Statistics, budget: int, large:
 
 @torch.no_grad()
 def prune(surfels: Surfels, adam: Adam, stats: Statistics | None, largest: float) -> tuple[Surfels, Tensor, dict[str, int]]:
-    """Drop surfels that are transparent, larger than `largest`, not finite, or (given statistics) touched by no view; returns also the kept index."""
+    """Drop surfels that are transparent, larger than `largest`, not finite, or (given statistics) touched by no view; returns also
+    the kept index."""
     dropped = {
         "transparent": surfels.opacity() < OPACITY_FLOOR,
         "too large": surfels.scale.max(1).values > largest,

@@ -1,6 +1,7 @@
 """The per-pixel losses fused in Numba: value and gradient in one go (what torch does in some forty small operations).
 
-Colour is (1 − λ) L1 + λ (1 − SSIM) with the 11-tap Gaussian window (Wang et al. 2004); the normal term compares blended normals with the normals of
+Colour is (1 − λ) L1 + λ (1 − SSIM) with the 11-tap Gaussian window (Wang et al. 2004); the normal term compares blended normals with
+the normals of
 the expected depth (2DGS, Huang et al. 2024). The plain PyTorch twins are `losses.colour` and `losses.normal_consistency`.
 """
 
@@ -124,7 +125,7 @@ def _colour_gradient(lo, hi, a, b, partial, share, grad, rows, window):  # type:
 
 class _Colour(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, image: Tensor, target: Tensor, share: float) -> Tensor:  # type: ignore[override]
+    def forward(ctx: Any, image: Tensor, target: Tensor, share: float) -> Tensor:
         a, b = image.detach().contiguous().numpy(), target.detach().contiguous().numpy()
         c, h, w = a.shape
         blurred, partial = np.empty((5, c, h, w), np.float32), np.empty((3, c, h, w), np.float32)
@@ -139,7 +140,7 @@ class _Colour(torch.autograd.Function):
         return torch.tensor(value, dtype=torch.float32)
 
     @staticmethod
-    def backward(ctx: Any, upstream: Tensor) -> Any:  # type: ignore[override]
+    def backward(ctx: Any, upstream: Tensor) -> Any:
         return ctx.saved_tensors[0] * upstream, None, None
 
 
@@ -152,7 +153,7 @@ def colour(image: Tensor, target: Tensor, ssim_share: float) -> Tensor:
 def _normal_rows(lo, hi, depth, alpha, normal, mask, rot, fx, fy, cx, cy, g_depth, g_alpha, g_normal, rows):  # type: ignore[no-untyped-def]
     """Value per row and gradients of Σ mask (alpha − n·n_depth), n_depth from the expected depth Σwz/Σw by central differences.
 
-    Writes the gradient w.r.t. the expected depth of rows lo−1..hi+1 into g_depth with +=, so chunks must be done in two colours (even, odd).
+    Writes the gradient w.r.t. the expected depth of rows lo−1..hi+1 into g_depth with +=, so chunks run in two colours (even, odd).
     """
     h, w = depth.shape
     for y in range(lo, hi):
@@ -197,7 +198,7 @@ def _normal_rows(lo, hi, depth, alpha, normal, mask, rot, fx, fy, cx, cy, g_dept
 
 class _Normal(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, depth: Tensor, alpha: Tensor, normal: Tensor, mask: Tensor, R: Tensor, view: Pinhole) -> Tensor:  # type: ignore[override]
+    def forward(ctx: Any, depth: Tensor, alpha: Tensor, normal: Tensor, mask: Tensor, R: Tensor, view: Pinhole) -> Tensor:
         d, a, n, m, r = (x.detach().contiguous().numpy() for x in (depth, alpha, normal, mask, R))
         h, w = d.shape
         g_depth, g_alpha, g_normal = torch.zeros(h, w), torch.empty(h, w), torch.empty(3, h, w)
@@ -223,7 +224,7 @@ class _Normal(torch.autograd.Function):
         return torch.tensor(rows.sum(dtype=np.float64) / count, dtype=torch.float32)
 
     @staticmethod
-    def backward(ctx: Any, upstream: Tensor) -> Any:  # type: ignore[override]
+    def backward(ctx: Any, upstream: Tensor) -> Any:
         factor = upstream / ctx.count
         return *(g * factor for g in ctx.saved_tensors), None, None, None
 

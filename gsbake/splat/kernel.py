@@ -5,9 +5,11 @@ den = 1 + wx dx + wy dy, the plane hit is u = (ux dx + uy dy)/den, v = (vx dx + 
 ρ = min(u² + v², 2 (dx² + dy²)); α = min(.99, o e^{−ρ/2}), skipped below 1/255; a pixel stops once its transmittance is below 1e-4.
 
 Backward walks front to back: what still lies behind a surfel is the total minus the prefix, so nothing is stored per pixel and surfel. Each
-(tile, surfel) pair writes its gradient into a slot of its own, summed per surfel afterwards: no atomics, and the result does not depend on threads.
+(tile, surfel) pair writes its gradient into a slot of its own, summed per surfel afterwards: no atomics, and the result does not
+depend on threads.
 
-Written for LLVM's vectoriser: `error_model="numpy"`, unsigned indices, one scratch buffer with constant offsets, selects instead of branches.
+Written for LLVM's vectoriser: `error_model="numpy"`, unsigned indices, one scratch buffer with constant offsets, selects instead of
+branches.
 `fastmath` leaves NaN alone ("nnan" would let a NaN pass every guard and crash).
 """
 
@@ -33,10 +35,10 @@ T_STOP = 1e-4
 ALPHA_MIN = 1.0 / 255.0
 ALPHA_MAX = 0.99
 
-_JIT: dict[str, Any] = {"nogil": True, "fastmath": FAST, "error_model": "numpy", "cache": True, "boundscheck": False}
+JIT: dict[str, Any] = {"nogil": True, "fastmath": FAST, "error_model": "numpy", "cache": True, "boundscheck": False}
 
 
-@njit(**_JIT)
+@njit(**JIT)
 def _exp_neg(t):  # type: ignore[no-untyped-def]
     """exp(−t) for t ≥ 0, clamped at 8: degree-6 polynomial of t/16, then four squarings."""
     y = np.float32(-0.0625) * (t if t < np.float32(8.0) else np.float32(8.0))
@@ -55,14 +57,15 @@ def _exp_neg(t):  # type: ignore[no-untyped-def]
 
 @lru_cache(maxsize=16)
 def forward_kernel(channels: int) -> Any:
-    """Compiled forward for one feature count: `f(order, lo, hi, starts, ids, geo, rows, opacity, features, width, height, tiles_x, out, used)`."""
+    """Compiled forward for one feature count: `f(order, lo, hi, starts, ids, geo, rows, opacity, features, width, height, tiles_x,
+    out, used)`."""
     c_n = np.uint64(channels)
     row_size = np.uint64((EXTRA + 2 + channels) * LANES)
     half_size = np.uint64(TILE) * row_size
     n8 = np.uint64(LANES)
     o_t, o_z, o_d, o_b1, o_b2, o_m, o_w, o_f = (np.uint64(i * LANES) for i in range(8))
 
-    @njit(**_JIT)
+    @njit(**JIT)
     def forward(order, lo, hi, starts, ids, geo, box, opacity, features, width, height, tiles_x, out, used):  # type: ignore[no-untyped-def]
         s = np.empty(np.uint64(2) * half_size, np.float32)
         live = np.empty(2 * TILE, np.bool_)
@@ -172,9 +175,6 @@ def forward_kernel(channels: int) -> Any:
     return forward
 
 
-
-
-
 @lru_cache(maxsize=16)
 def backward_kernel(channels: int) -> Any:
     """Compiled backward: fills one gradient slot per (tile, surfel) pair, see the module's notes."""
@@ -196,7 +196,7 @@ def backward_kernel(channels: int) -> Any:
     acc_f = np.uint64(SLOT * LANES)
     acc_size = (SLOT + channels) * LANES
 
-    @njit(**_JIT)
+    @njit(**JIT)
     def backward(order, lo, hi, starts, ids, slots, geo, box, opacity, features, width, height, tiles_x, out, used, grad, result):  # type: ignore[no-untyped-def]
         s = np.empty(total, np.float32)
         a = np.zeros(acc_size, np.float32)
@@ -373,7 +373,7 @@ def backward_kernel(channels: int) -> Any:
     return backward
 
 
-@njit(**_JIT)
+@njit(**JIT)
 def sum_slots(lo, hi, offsets, result, sums):  # type: ignore[no-untyped-def]
     """Sum each surfel's gradient slots (contiguous in `result`) into `sums` (n, SLOT + channels)."""
     n_j = result.shape[1]
@@ -383,32 +383,3 @@ def sum_slots(lo, hi, offsets, result, sums):  # type: ignore[no-untyped-def]
         for k in range(offsets[g], offsets[g + 1]):
             for j in range(n_j):
                 sums[g, j] += result[k, j]
-
-
-@njit(**_JIT)
-def fill_tiles(order, box, tiles_x, offsets, cursor, ids, slots):  # type: ignore[no-untyped-def]
-    """Counting sort: append each surfel, front to back, to the lists of the tiles its box touches."""
-    for i in range(order.shape[0]):
-        g = order[i]
-        slot = offsets[g]
-        for ty in range(box[g, 2] // TILE, box[g, 3] // TILE + 1):
-            for tx in range(box[g, 0] // TILE, box[g, 1] // TILE + 1):
-                tile = ty * tiles_x + tx
-                at = cursor[tile]
-                cursor[tile] = at + 1
-                ids[at] = g
-                slots[at] = slot
-                slot += 1
-
-
-@njit(**_JIT)
-def count_tiles(box, visible, tiles_x, per_tile, per_surfel):  # type: ignore[no-untyped-def]
-    """How many pairs each tile and each surfel has; box (n, 4) int32 is clipped, inclusive xmin, xmax, ymin, ymax in pixels."""
-    for g in range(box.shape[0]):
-        n = 0
-        if visible[g]:
-            for ty in range(box[g, 2] // TILE, box[g, 3] // TILE + 1):
-                for tx in range(box[g, 0] // TILE, box[g, 1] // TILE + 1):
-                    per_tile[ty * tiles_x + tx] += 1
-                    n += 1
-        per_surfel[g] = n

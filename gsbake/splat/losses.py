@@ -1,6 +1,7 @@
 """The training losses, each a plain function of rendered planes (weights live in the profile's [loss] section).
 
-Colour as 3DGS (L1 and SSIM); median sharpness and projection as Zhu et al. 2025 (DSDF); normal consistency and distortion as 2DGS (Huang et al. 2024).
+Colour as 3DGS (L1 and SSIM); median sharpness and projection as Zhu et al. 2025 (DSDF); normal consistency and distortion as 2DGS
+(Huang et al. 2024).
 """
 
 from __future__ import annotations
@@ -53,7 +54,9 @@ def median_sharpness(sdf: Tensor, gamma: Tensor) -> Tensor:
     return F.relu(median_target(max(median, 1e-6)) - gamma).sum()
 
 
-def projection(position: Tensor, normal: Tensor, sdf: Tensor, visible: Tensor, depth: Tensor, R: Tensor, t: Tensor, view: Pinhole) -> Tensor:
+def projection(
+    position: Tensor, normal: Tensor, sdf: Tensor, visible: Tensor, depth: Tensor, R: Tensor, t: Tensor, view: Pinhole
+) -> Tensor:
     """Mean |D(uv(μ')) − z(μ')| over visible surfels with μ' = μ − s n inside the frame and errors below `PROJECTION_RANGE`.
 
     `depth` (h, w) is the alpha-normalised expected depth, detached here; 0 marks pixels without a surface.
@@ -76,7 +79,8 @@ def projection(position: Tensor, normal: Tensor, sdf: Tensor, visible: Tensor, d
 
 
 def depth_normals(depth: Tensor, R: Tensor, view: Pinhole) -> Tensor:
-    """World normals (3, h, w) of a z-depth map (h, w) by central differences of back-projected pixels, facing the camera; zero at the frame."""
+    """World normals (3, h, w) of a z-depth map (h, w) by central differences of back-projected pixels, facing the camera; zero at the
+    frame."""
     x = (torch.arange(view.width, dtype=depth.dtype) + 0.5 - view.cx) / view.fx
     y = (torch.arange(view.height, dtype=depth.dtype) + 0.5 - view.cy) / view.fy
     p = torch.stack([depth * x, depth * y[:, None], depth])
@@ -97,7 +101,8 @@ def mask_entropy(alpha: Tensor, mask: Tensor) -> Tensor:
 
 
 def smoothness(planes: Tensor, guide: Tensor, mask: Tensor) -> Tensor:
-    """Edge-aware smoothness of (c, h, w) planes: mean |∇planes| · exp(−10 |∇grey|) inside the mask (h, w); guide (h, w) is the photo's grey."""
+    """Edge-aware smoothness of (c, h, w) planes: mean |∇planes| · exp(−10 |∇grey|) inside the mask (h, w); guide (h, w) is the
+    photo's grey."""
     loss = planes.new_zeros(())
     for axis in (1, 2):
         d = planes.diff(dim=axis).abs().mean(0)

@@ -229,9 +229,10 @@ class Project(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(  # type: ignore[override]
+    def forward(
         ctx: Any, mu: Tensor, quat: Tensor, log_scale: Tensor, opacity: Tensor, R: Tensor, t: Tensor, pinhole: Pinhole, cull: bool
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Project; see the class."""
         n = mu.shape[0]
         geo, normal = torch.empty(n, 9), torch.empty(n, 3)
         box, visible = torch.zeros(n, 4, dtype=torch.int32), torch.zeros(n, dtype=torch.bool)
@@ -245,7 +246,8 @@ class Project(torch.autograd.Function):
         return geo, normal, box, visible
 
     @staticmethod
-    def backward(ctx: Any, g_geo: Tensor, g_normal: Tensor, _box: Any, _visible: Any) -> Any:  # type: ignore[override]
+    def backward(ctx: Any, g_geo: Tensor, g_normal: Tensor, _box: Any, _visible: Any) -> Any:
+        """Chain the screen and normal gradients to surfels and pose."""
         mu, quat, log_scale, R, t, geo, visible = ctx.saved_tensors
         n = mu.shape[0]
         g_mu, g_quat, g_scale = torch.empty(n, 3), torch.empty(n, 4), torch.empty(n, 2)

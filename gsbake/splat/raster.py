@@ -12,18 +12,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsbake.splat.kernel import (
-    EXTRA,
-    SLOT,
-    TILE,
-    backward_kernel,
-    count_tiles,
-    fill_tiles,
-    forward_kernel,
-    sum_slots,
-)
+from gsbake.splat.binning import bin_surfels
+from gsbake.splat.kernel import EXTRA, SLOT, backward_kernel, forward_kernel, sum_slots
 from gsbake.splat.projection import Pinhole, Project
-from gsbake.splat.threads import run_chunks, thread_count
+from gsbake.splat.threads import run_chunks
 
 
 @dataclass
@@ -51,47 +43,18 @@ class Rendered:
         return torch.where(self.alpha > 1e-3, self.depth / self.alpha.clamp_min(1e-3), torch.zeros_like(self.depth))
 
 
-@dataclass(frozen=True)
-class Bins:
-    """Tile lists: pairs of tile t are `ids[starts[t]:starts[t + 1]]`, front to back; `slots` their gradient slots."""
-
-    starts: Any
-    ids: Any
-    slots: Any
-    offsets: Any
-    order: Any
-    tiles_x: int
-
-
-def bin_surfels(depth: Any, box: Any, visible: Any, width: int, height: int) -> Bins:
-    """Depth-sort the visible surfels once and deal them to 16x16 tiles (numpy arrays in and out)."""
-    n = len(depth)
-    tiles_x, tiles_y = -(-width // TILE), -(-height // TILE)
-    tiles = tiles_x * tiles_y
-    idx = np.flatnonzero(visible).astype(np.uint64)
-    # positive float32 sort as their bits; the index below keeps ties stable
-    keys = (depth[idx.astype(np.int64)].view(np.uint32).astype(np.uint64) << np.uint64(32)) | idx
-    keys.sort()
-    front = (keys & np.uint64(0xFFFFFFFF)).astype(np.int64)
-    per_tile, per_surfel = np.zeros(tiles, np.int64), np.zeros(n, np.int64)
-    count_tiles(box, visible, tiles_x, per_tile, per_surfel)
-    starts, offsets = np.zeros(tiles + 1, np.int64), np.zeros(n + 1, np.int64)
-    np.cumsum(per_tile, out=starts[1:])
-    np.cumsum(per_surfel, out=offsets[1:])
-    pairs = int(starts[-1])
-    ids, slots = np.empty(pairs, np.int32), np.empty(pairs, np.int64)
-    fill_tiles(front, box, tiles_x, offsets, starts[:-1].copy(), ids, slots)
-    # heavy tiles first, dealt in turn to the chunks, so that both threads end together
-    order = np.argsort(-per_tile, kind="stable")
-    chunks = max(1, thread_count() * 6)
-    order = np.concatenate([order[i::chunks] for i in range(chunks)])
-    return Bins(starts, ids, slots, offsets, order, tiles_x)
-
-
 class _Blend(torch.autograd.Function):
     @staticmethod
-    def forward(  # type: ignore[override]
-        ctx: Any, geo: Tensor, opacity: Tensor, features: Tensor, box: Tensor, visible: Tensor, width: int, height: int, stats: dict[str, Tensor]
+    def forward(
+        ctx: Any,
+        geo: Tensor,
+        opacity: Tensor,
+        features: Tensor,
+        box: Tensor,
+        visible: Tensor,
+        width: int,
+        height: int,
+        stats: dict[str, Tensor],
     ) -> Tensor:
         channels = features.shape[1]
         g, o, f = (x.detach().contiguous().numpy() for x in (geo, opacity, features))
@@ -109,7 +72,7 @@ class _Blend(torch.autograd.Function):
         return out
 
     @staticmethod
-    def backward(ctx: Any, grad: Tensor) -> Any:  # type: ignore[override]
+    def backward(ctx: Any, grad: Tensor) -> Any:
         geo, opacity, features, box, out = ctx.saved_tensors
         bins, used, (width, height) = ctx.bins, ctx.used, ctx.size
         channels, n = features.shape[1], features.shape[0]
@@ -147,9 +110,7 @@ def render(
     `rotation` (3, 3) and `translation` (3,) are world→camera (OpenCV axes); gradients flow to them too. With `normals_as_features`
     the world normals are blended as three more channels behind the given ones.
     """
-    geo, normal, box, visible = Project.apply(
-        position, quaternion, log_scale, opacity, rotation, translation, pinhole, cull_backfaces
-    )
+    geo, normal, box, visible = Project.apply(position, quaternion, log_scale, opacity, rotation, translation, pinhole, cull_backfaces)
     if geo.requires_grad:
         geo.retain_grad()
     if normals_as_features:

@@ -1,6 +1,8 @@
-"""Refinement between training and meshing: drop what the SDF, the silhouettes and visibility disown, and fill where the surface is under-sampled.
+"""Refinement between training and meshing: drop what the SDF, the silhouettes and visibility disown, and fill where the surface is
+under-sampled.
 
-Pruning by distance from the zero set follows GS-ROR² (prune |f(μ)| above a bound); seeding near the zero set where surfels are sparse follows
+Pruning by distance from the zero set follows GS-ROR² (prune |f(μ)| above a bound); seeding near the zero set where surfels are sparse
+follows
 GaussianRoom. The bound is in surfel spacings, so that it has no scene-dependent constant.
 """
 
@@ -27,7 +29,8 @@ SPARSE = 1.6
 
 
 def _visibility(surfels: Surfels, posed: PosedPhotos, max_size: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Largest summed weight in any view (n,), views that disown the centre (outside the mask by 2 px), and mean |depth − z| of surfel against surface."""
+    """Largest summed weight in any view (n,), views that disown the centre (outside the mask by 2 px), and mean |depth − z| of surfel
+    against surface."""
     n = len(surfels)
     best, outside = torch.zeros(n), torch.zeros(n)
     error, hits = torch.zeros(n), torch.zeros(n)
@@ -59,7 +62,8 @@ def _visibility(surfels: Surfels, posed: PosedPhotos, max_size: int) -> tuple[to
 
 
 def prune_and_densify(surfels: Surfels, posed: PosedPhotos, refine: Any, max_size: int, seed: int) -> tuple[Surfels, dict[str, int]]:
-    """Surfels after pruning and seeding, and the count of each rule; `refine` is the profile's section, `max_size` the size of the probing renders."""
+    """Surfels after pruning and seeding, and the count of each rule; `refine` is the profile's section, `max_size` the size of the
+    probing renders."""
     before = len(surfels)
     if before < 10:
         return surfels, {"before": before, "after": before}

@@ -40,8 +40,8 @@ class SurfelRenderer:
     def gbuffer(self, camera: Camera) -> dict[str, Image]:
         """Planes of one view as float32 arrays (h, w[, 3]).
 
-        "alpha"; "depth" (expected z-depth, alpha-normalised, 0 = none); "median_depth"; "normal" (unit frame, unit length, not flipped); and with materials
-        "albedo" (linear), "roughness", "metallic", else "colour" (sRGB from this camera).
+        "alpha"; "depth" (expected z-depth, alpha-normalised, 0 = none); "median_depth"; "normal" (unit frame, unit length, not
+        flipped); and with materials "albedo" (linear), "roughness", "metallic", else "colour" (sRGB from this camera).
         """
         view = _view(camera)
         out = rasterise(self.surfels, view)

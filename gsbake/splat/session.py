@@ -23,7 +23,9 @@ CHECKPOINT_SECONDS = 30.0
 class Session:
     """Runs a `Trainer` to its end inside a stage's context."""
 
-    def __init__(self, ctx: Context, posed: PosedPhotos, surfels: Surfels, light: Any, iterations: int, coarse_share: float, densify: bool) -> None:
+    def __init__(
+        self, ctx: Context, posed: PosedPhotos, surfels: Surfels, light: Any, iterations: int, coarse_share: float, densify: bool
+    ) -> None:
         """Load the photos at `train.max_size`; go on from the newest checkpoint if this stage was interrupted."""
         self.ctx = ctx
         configure(ctx.threads)

@@ -70,7 +70,8 @@ def _unit(v: Floats) -> Floats:
 def begin(posed: PosedPhotos, train: Any, splat: Any, seed: int) -> tuple[Surfels, str, str]:
     """Surfels to start from, the source taken ("hull", "points", "sphere") and the evidence for it.
 
-    `train` and `splat` are the profile's sections. With "auto" the hull wins when every photo has a mask, then SfM points (200 or more), then the sphere.
+    `train` and `splat` are the profile's sections. With "auto" the hull wins when every photo has a mask, then SfM points (200 or
+    more), then the sphere.
     """
     cloud = posed.points()
     n_points = 0 if cloud is None else len(cloud[0])

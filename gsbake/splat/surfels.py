@@ -115,9 +115,17 @@ def quaternion_to(normals: Tensor) -> Tensor:
 
 
 def create(
-    points: np.ndarray, normals: np.ndarray, spacing: np.ndarray, colours: np.ndarray | None, shading: str, sh_degree: int, sdf: float, gamma: float
+    points: np.ndarray,
+    normals: np.ndarray,
+    spacing: np.ndarray,
+    colours: np.ndarray | None,
+    shading: str,
+    sh_degree: int,
+    sdf: float,
+    gamma: float,
 ) -> Surfels:
-    """New surfels at points (n, 3) with unit normals (n, 3), neighbour distance `spacing` (n,) and sRGB colours (n, 3) in 0..1 or None (grey)."""
+    """New surfels at points (n, 3) with unit normals (n, 3), neighbour distance `spacing` (n,) and sRGB colours (n, 3) in 0..1 or
+    None (grey)."""
     n = len(points)
     position = torch.from_numpy(np.ascontiguousarray(points, np.float32))
     normal = torch.from_numpy(np.ascontiguousarray(normals, np.float32))

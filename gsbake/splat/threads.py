@@ -11,14 +11,14 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
 
-
 _configured = 0
 
 
 def configure(threads: int) -> None:
     """Give the kernels `threads` threads and torch one.
 
-    What torch is left with in a training step are many small operations: a team of OpenMP threads gains nothing on them, and whenever another
+    What torch is left with in a training step are many small operations: a team of OpenMP threads gains nothing on them, and whenever
+    another
     process holds a core every barrier waits for it (measured: 10x slower steps beside one busy process).
     """
     global _configured

@@ -1,6 +1,7 @@
 """Training: one loop over photos that fits surfels, their SDF samples, materials and the light (Zhu et al., ICCV 2025).
 
-The schedule is the paper's in shares of the run (of 30 000 steps: median, projection and distortion from 1 000, densify 500 to 15 000), with the
+The schedule is the paper's in shares of the run (of 30 000 steps: median, projection and distortion from 1 000, densify 500 to 15
+000), with the
 first part at half resolution. All state is in `state()`: a run resumed from a checkpoint ends with the same result.
 """
 
@@ -48,7 +49,8 @@ class Trainer:
     """Holds the state; `step()` does one iteration and returns its live figures."""
 
     def __init__(self, plan: Plan, surfels: Surfels, light: Any, views: list[TrainView], half: list[TrainView], held: list[int]) -> None:
-        """`views` and `half` are all photos at full and half training size; `held` the indices kept out; `light` an EnvironmentLight or None."""
+        """`views` and `half` are all photos at full and half training size; `held` the indices kept out; `light` an EnvironmentLight
+        or None."""
         self.plan, self.surfels, self.light = plan, surfels, light
         self.views, self.half = views, half
         self.held = held

@@ -22,9 +22,7 @@ TO_WORLD = np.array([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])
 
 
 def gsbake(*args: object, code: int = 0) -> subprocess.CompletedProcess[str]:
-    done = subprocess.run(
-        [sys.executable, "-m", "gsbake", *map(str, args)], capture_output=True, text=True, timeout=900, check=False
-    )
+    done = subprocess.run([sys.executable, "-m", "gsbake", *map(str, args)], capture_output=True, text=True, timeout=900, check=False)
     assert done.returncode == code, f"exit {done.returncode}\n{done.stdout[-2000:]}\n{done.stderr[-2000:]}"
     return done
 

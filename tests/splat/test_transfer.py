@@ -42,8 +42,8 @@ def test_derivative() -> None:
 
 
 def test_median_targets() -> None:
-    assert transfer.HALF == pytest.approx(1.7627, abs=1e-4)
-    assert transfer.GAMMA_GOAL == pytest.approx(4.549, abs=2e-3)
+    assert pytest.approx(1.7627, abs=1e-4) == transfer.HALF
+    assert pytest.approx(4.549, abs=2e-3) == transfer.GAMMA_GOAL
     assert float(transfer.opacity(torch.tensor(0.1), torch.tensor(transfer.GAMMA_GOAL))) == pytest.approx(0.95, abs=1e-5)
     assert float(transfer.opacity(torch.tensor(0.4), torch.tensor(transfer.median_target(0.4)))) == pytest.approx(0.5, abs=1e-6)
     assert math.isclose(transfer.median_target(0.01), transfer.GAMMA_GOAL)
