@@ -78,13 +78,16 @@ def extent_from_view(cameras: Sequence[Camera], points: Array | None) -> Extent:
             pixel, depth = camera.project(points)
             inner = np.abs(pixel - (camera.width / 2, camera.height / 2)) < (0.45 * camera.width, 0.45 * camera.height)
             shown += (depth > 0) & inner.all(1)
-        near = np.linalg.norm(points - point, axis=1) < 1.2 * frame
+        # Objects are framed by both sides of a photo: an upright one reaches farther than the shorter side of a portrait tells.
+        reach = 1.2 * frame * float(np.median([(c.width * c.height) ** 0.5 / min(c.width, c.height) for c in cameras]))
+        near = np.linalg.norm(points - point, axis=1) < reach
         common = points[near & (shown >= 0.6 * len(cameras))]
         if len(common) >= 50:
             low, high = np.quantile(common, [0.02, 0.98], axis=0)
             centre = 0.5 * (low + high)
-            radius = 1.05 * float(np.quantile(np.linalg.norm(common - centre, axis=1), 0.98))
-            return Extent(centre, min(max(radius, 0.2 * frame), limit, 1.2 * frame), f"{len(common)} points that most photos show")
+            # Points are found on texture; the object reaches beyond them (a fox's ears, say).
+            radius = 1.2 * float(np.quantile(np.linalg.norm(common - centre, axis=1), 0.98))
+            return Extent(centre, min(max(radius, 0.2 * frame), limit, reach), f"{len(common)} points that most photos show")
     return Extent(point, min(0.85 * frame, limit), "where the cameras look")
 
 

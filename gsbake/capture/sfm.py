@@ -25,7 +25,7 @@ Tick = Callable[[str, int, int], None]
 #: Thresholds of the second pass: inliers and their share that register a photo (COLMAP's own: 30 and 0.25).
 WEAK_INLIERS, WEAK_SHARE = 15, 0.15
 #: Largest features per photo in the ranking of pairs.
-RANKING_FEATURES = 512
+RANKING_FEATURES = 256
 #: Features per photo with which the finest octave is left out, and the share of photos that may then fail before it is added after all.
 ENOUGH, POOR = 1500, 0.05
 #: Pairs matched between two lines in COLMAP's log, by which `solve` tells the progress.
