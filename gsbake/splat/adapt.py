@@ -18,6 +18,8 @@ from gsbake.splat.surfels import Surfels
 
 #: Opacity below which a surfel is dropped (DSDF).
 OPACITY_FLOOR = 0.005
+#: Mean weight per view (in pixels) below which a surfel counts as hidden: it lies behind others and costs time without being seen.
+HIDDEN_WEIGHT = 0.05
 
 
 @dataclass
@@ -91,7 +93,7 @@ def densify(
 
 @torch.no_grad()
 def prune(surfels: Surfels, adam: Adam, stats: Statistics | None, largest: float) -> tuple[Surfels, Tensor, dict[str, int]]:
-    """Drop surfels that are transparent, larger than `largest`, not finite, or (given statistics) touched by no view; returns also
+    """Drop surfels that are transparent, larger than `largest`, not finite, or (given statistics) hidden in all views; returns also
     the kept index."""
     dropped = {
         "transparent": surfels.opacity() < OPACITY_FLOOR,
@@ -99,7 +101,7 @@ def prune(surfels: Surfels, adam: Adam, stats: Statistics | None, largest: float
         "not finite": ~torch.isfinite(surfels.position).all(1),
     }
     if stats is not None:
-        dropped["unseen"] = (stats.views == 0) & ~dropped["transparent"]
+        dropped["unseen"] = (stats.weight <= HIDDEN_WEIGHT * stats.views) & ~dropped["transparent"]
     bad = torch.stack(list(dropped.values())).any(0)
     keep = (~bad).nonzero()[:, 0]
     counts = {k: int(v.sum()) for k, v in dropped.items()}

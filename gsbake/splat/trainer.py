@@ -173,7 +173,8 @@ class Trainer:
 
     def _adapt(self) -> None:
         n = self.plan.iterations
-        if not self.plan.densify or self.done % DENSIFY_EVERY or self.done < max(DENSIFY_EVERY, DENSIFY_FROM * n):
+        every = max(DENSIFY_EVERY, len(self.used))  # every photo has its say before anything is dropped
+        if not self.plan.densify or self.done % every or self.done < max(every, DENSIFY_FROM * n):
             return
         if self.done > DENSIFY_TO * n:
             return

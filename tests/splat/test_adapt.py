@@ -61,11 +61,12 @@ def test_prune_reasons() -> None:
     s.log_scale[5] = 2.0
     s.position[7] = float("nan")
     stats = Statistics.zeros(200)
-    stats.views[:] = 1
-    stats.views[9] = 0
+    stats.views[:], stats.weight[:] = 2, 10.0
+    stats.views[9], stats.weight[9] = 0, 0.0
+    stats.weight[11] = 0.01  # hidden behind others
     kept, index, counts = prune(s, adam, stats, 0.25)
-    assert len(kept) == 196 and set(range(200)) - set(index.tolist()) == {3, 5, 7, 9}
-    assert counts == {"transparent": 1, "too large": 1, "not finite": 1, "unseen": 1}
+    assert len(kept) == 195 and set(range(200)) - set(index.tolist()) == {3, 5, 7, 9, 11}
+    assert counts == {"transparent": 1, "too large": 1, "not finite": 1, "unseen": 2}
 
 
 def test_adam_follows_the_published_rule() -> None:
