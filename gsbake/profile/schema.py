@@ -69,7 +69,7 @@ class Train(Section):
     lr_sdf: float = Field(0.005, gt=0, description="Adam rate of SDF samples.")
     lr_gamma: float = Field(0.03, gt=0, description="Adam rate of the sharpness.")
     lr_material: float = Field(1.6e-2, gt=0, description="Adam rate of colours and materials; decays to 1/10.")
-    lr_light: float = Field(1.6e-2, gt=0, description="Adam rate of the environment light; decays to 1/10.")
+    lr_light: float = Field(5e-2, gt=0, description="Adam rate of the environment light; decays to 1/10.")
 
 
 class Loss(Section):

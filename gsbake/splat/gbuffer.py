@@ -28,13 +28,13 @@ def rasterise(surfels: Surfels, view: TrainView, cull_backfaces: bool = False) -
     )  # fmt: skip
 
 
-def view_directions(view: TrainView) -> Tensor:
-    """Unit vectors (h, w, 3) from the surface to the camera, per pixel, in the unit frame."""
+def view_directions(view: TrainView, index: Tensor) -> Tensor:
+    """Unit vectors (n, 3) from the surface to the camera at the flat pixel indices (n,), in the unit frame."""
     p = view.pinhole
-    x = (torch.arange(p.width) + 0.5 - p.cx) / p.fx
-    y = (torch.arange(p.height) + 0.5 - p.cy) / p.fy
-    rays = torch.stack([x.expand(p.height, -1), y[:, None].expand(-1, p.width), torch.ones(p.height, p.width)], -1)
-    return -torch.nn.functional.normalize(rays @ view.R, dim=-1)
+    x = (index % p.width + 0.5 - p.cx) / p.fx
+    y = (index // p.width + 0.5 - p.cy) / p.fy
+    z = torch.rsqrt(x * x + y * y + 1)
+    return torch.stack([-x * z, -y * z, -z], 1) @ view.R
 
 
 def picture(out: Rendered, view: TrainView, tables: LightTables | None) -> Tensor:
@@ -49,7 +49,7 @@ def picture(out: Rendered, view: TrainView, tables: LightTables | None) -> Tenso
     index = (out.alpha.detach().reshape(-1) > ALPHA_SHADED).nonzero()[:, 0]
     alpha = out.alpha.reshape(-1)[index]
     g = (flat[:, index] / alpha.clamp_min(ALPHA_SHADED)).T
-    normal = torch.nn.functional.normalize(g[:, 5:8], dim=1, eps=1e-6)
-    rgb = shade(normal, view_directions(view).reshape(-1, 3)[index], g[:, :3], g[:, 3], g[:, 4], tables)
+    normal = g[:, 5:8] * torch.rsqrt((g[:, 5:8] ** 2).sum(1, keepdim=True).clamp_min(1e-12))
+    rgb = shade(normal, view_directions(view, index), g[:, :3], g[:, 3], g[:, 4], tables)
     image = torch.zeros(h * w, 3).index_copy(0, index, linear_to_srgb(rgb) * alpha[:, None])
     return image.T.reshape(3, h, w)

@@ -19,8 +19,9 @@ from torch import Tensor
 from gsbake.splat.reference import rotation_matrix
 from gsbake.splat.transfer import opacity
 
-#: Start values of the materials before the sigmoid: base colour .5, roughness .646, metallic .12 (dielectrics are the common case).
-ROUGHNESS_START, METALLIC_START = 0.6, -2.0
+#: Start values of roughness (.27) and metallic (.05) before the sigmoid. A smooth start lets reflections teach the light at once; from the
+#: paper's .646 the light stays a blur and the surfaces stay rough (docs/decisions/0003-smooth-start.md).
+ROUGHNESS_START, METALLIC_START = -1.0, -3.0
 SH0 = 0.28209479177387814  # Y_00
 SH1 = 0.4886025119029199  # Y_1m
 
