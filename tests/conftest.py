@@ -7,3 +7,4 @@ import os
 # Before any library with a thread pool is imported: the tests' own pools stay small, so that runs side by side do not fight.
 for _pool in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OPENCV_FOR_THREADS_NUM"):
     os.environ.setdefault(_pool, "2")
+os.environ.setdefault("NUMBA_THREADING_LAYER_PRIORITY", "omp workqueue tbb")  # an old TBB on the machine would only warn

@@ -46,8 +46,12 @@ def default_threads() -> int:
 
 
 def thread_environment(threads: int) -> dict[str, str]:
-    """The environment in which every library's thread pool has `threads` threads, and idle OpenMP threads sleep instead of spinning."""
-    return dict.fromkeys(_POOLS, str(threads)) | {"OMP_WAIT_POLICY": "PASSIVE"}
+    """The environment in which every library's thread pool has `threads` threads.
+
+    Idle OpenMP threads sleep instead of spinning, and Numba takes OpenMP before it looks at a TBB that may be too old.
+    """
+    sizes = dict.fromkeys(_POOLS, str(threads))
+    return sizes | {"OMP_WAIT_POLICY": "PASSIVE", "NUMBA_THREADING_LAYER_PRIORITY": "omp workqueue tbb"}
 
 
 def torch_cuda_build() -> str | None:

@@ -22,6 +22,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from gsbake.texture.packing import pack
+from gsbake.texture.texels import overlapping_faces
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -32,6 +33,8 @@ CLUSTER_FACES = 1000
 NOISY_DIHEDRAL = 0.2
 #: Laplacian steps of that smoothing.
 SMOOTHING_STEPS = 4
+#: Resolution at which charts that xatlas folded over themselves are looked for.
+CHECK_SIZE = 2048
 
 
 @dataclass(frozen=True)
@@ -71,16 +74,41 @@ def make_atlas(vertices: NDArray[Any], faces: NDArray[Any], size: int, padding: 
         raise ValueError("a mesh without faces has no atlas")
     gap = max(2, size // 128) if padding is None else padding
     source, uv, corner = _chart(_smoothed_when_noisy(points, triangles), triangles)
-    links = coo_matrix((np.ones(2 * len(corner)), (corner[:, [0, 1]].ravel(), corner[:, [1, 2]].ravel())), shape=(len(uv), len(uv)))
-    chart = connected_components(links, directed=False)[1][corner[:, 0]]
-    chart = np.unique(chart, return_inverse=True)[1]
+    chart = _islands(len(uv), corner)
     uv = _upright(points, triangles, uv, corner, chart)
     packed = pack(uv, corner, chart, size, gap)
+    for alone in (False, True, True):
+        folded = overlapping_faces(packed.uv / size, corner, CHECK_SIZE)
+        if not folded.any():
+            break
+        source, uv, corner = _detach(source, uv, corner, folded, alone)
+        chart = _islands(len(uv), corner)
+        packed = pack(uv, corner, chart, size, gap)
     final = packed.uv / size
     fill = float(np.abs(signed_areas(final, corner)).sum())
     final[:, 1] = 1 - final[:, 1]
     coordinates = np.clip(final, 0, 1).astype(np.float32)
     return Atlas(source.astype(np.int32), coordinates, corner.astype(np.int32), chart.astype(np.int32), size, fill)
+
+
+def _islands(count: int, corner: Ints) -> Ints:
+    """Chart (f,) of each face: faces that share a vertex of the atlas belong together."""
+    links = coo_matrix((np.ones(2 * len(corner)), (corner[:, [0, 1]].ravel(), corner[:, [1, 2]].ravel())), shape=(count, count))
+    label = connected_components(links, directed=False)[1][corner[:, 0]]
+    return np.asarray(np.unique(label, return_inverse=True)[1], np.int64)
+
+
+def _detach(source: Ints, uv: Floats, corner: Ints, folded: NDArray[np.bool_], alone: bool) -> tuple[Ints, Floats, Ints]:
+    """Give the folded faces (f,) vertices of their own, in connected groups or each `alone`: they become charts of their own."""
+    index = np.flatnonzero(folded)
+    group = np.arange(len(index)) if alone else _islands(len(uv), corner[index])
+    pairs = np.stack([np.repeat(group, 3), corner[index].ravel()], 1)
+    unique, inverse = np.unique(pairs, axis=0, return_inverse=True)
+    out = corner.copy()
+    out[index] = len(uv) + inverse.reshape(-1, 3)
+    kept, compact = np.unique(out, return_inverse=True)
+    from_old = np.concatenate([np.arange(len(uv)), unique[:, 1]])[kept]
+    return source[from_old], uv[from_old], compact.reshape(-1, 3)
 
 
 def _chart(points: Floats, faces: Ints) -> tuple[Ints, Floats, Ints]:

@@ -70,8 +70,18 @@ def rasterise(uv: NDArray[Any], faces: NDArray[Any], size: int) -> Texels:
 
 def overlapping(uv: NDArray[Any], faces: NDArray[Any], size: int) -> int:
     """How many texel centres of a texture of `size` lie in more than one of the triangles `faces` (f, 3) of `uv` (v, 2)."""
-    owner = np.full((size, size), -1, np.int32)
-    return int(_overlapping(np.asarray(uv, np.float64) * size, np.ascontiguousarray(faces, np.int32), owner))
+    return _overlaps(uv, faces, size)[0]
+
+
+def overlapping_faces(uv: NDArray[Any], faces: NDArray[Any], size: int) -> NDArray[np.bool_]:
+    """Which triangles (f,) cover a texel centre that an earlier one covers; without them nothing overlaps."""
+    return _overlaps(uv, faces, size)[1]
+
+
+def _overlaps(uv: NDArray[Any], faces: NDArray[Any], size: int) -> tuple[int, NDArray[np.bool_]]:
+    owner, later = np.full((size, size), -1, np.int32), np.zeros(len(faces), np.bool_)
+    count = int(_overlapping(np.asarray(uv, np.float64) * size, np.ascontiguousarray(faces, np.int32), owner, later))
+    return count, later
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -113,8 +123,8 @@ def _draw(uv: Doubles, faces: NDArray[np.int32], owner: NDArray[np.int32], bary:
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _overlapping(uv: Doubles, faces: NDArray[np.int32], owner: NDArray[np.int32]) -> int:
-    """Texel centres that lie deeper than `MARGIN` in more than one triangle; `owner` (s, s) of -1 is scratch."""
+def _overlapping(uv: Doubles, faces: NDArray[np.int32], owner: NDArray[np.int32], later: NDArray[np.bool_]) -> int:
+    """Texel centres deeper than `MARGIN` in more than one triangle; `owner` (s, s) of -1 is scratch, `later` (f,) marks the later ones."""
     size = owner.shape[0]
     count = 0
     for f in range(faces.shape[0]):
@@ -137,6 +147,7 @@ def _overlapping(uv: Doubles, faces: NDArray[np.int32], owner: NDArray[np.int32]
                 if deep > MARGIN:
                     if owner[j, i] >= 0:
                         count += 1
+                        later[f] = True
                     owner[j, i] = f
     return count
 

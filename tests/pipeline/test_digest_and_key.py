@@ -116,4 +116,7 @@ def test_messages_are_one_line() -> None:
 
 
 def test_thread_environment_sizes_every_pool() -> None:
-    assert set(thread_environment(3).values()) == {"3"} and "NUMBA_NUM_THREADS" in thread_environment(3)
+    environment = thread_environment(3)
+    pools = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")
+    assert {environment[name] for name in pools} == {"3"}
+    assert environment["OMP_WAIT_POLICY"] == "PASSIVE"  # barriers must not spin beside another busy process

@@ -7,9 +7,9 @@ import pytest
 import trimesh
 from scipy.ndimage import distance_transform_edt
 
-from gsbake.texture.atlas import Atlas, make_atlas
+from gsbake.texture.atlas import Atlas, _detach, _islands, make_atlas
 from gsbake.texture.packing import pack
-from gsbake.texture.texels import overlapping, rasterise
+from gsbake.texture.texels import overlapping, overlapping_faces, rasterise
 
 SIZE = 256
 
@@ -84,3 +84,20 @@ def test_packing_keeps_shape_and_handedness() -> None:
 def test_an_empty_mesh_has_no_atlas() -> None:
     with pytest.raises(ValueError, match="without faces"):
         make_atlas(np.zeros((3, 3)), np.zeros((0, 3), int), SIZE)
+
+
+def test_folded_charts_are_taken_apart() -> None:
+    """A strip that winds more than once around a flat ring folds over itself in one chart; the detached faces overlap no more."""
+    turns = np.linspace(0, 3 * np.pi, 60)
+    inner = np.stack([np.cos(turns), np.sin(turns)], 1)
+    uv = np.concatenate([0.5 + 0.2 * inner, 0.5 + 0.4 * inner])
+    i = np.arange(59)
+    corner = np.stack([np.stack([i, i + 60, i + 1], 1), np.stack([i + 1, i + 60, i + 61], 1)], 1).reshape(-1, 3)  # along the strip
+    folded = overlapping_faces(uv, corner, 512)
+    assert 30 < folded.sum() < 50  # half a turn of one and a half lies double
+    source, apart, again = _detach(np.arange(120), uv, corner, folded, alone=False)
+    assert len(np.unique(_islands(len(apart), again))) == 2
+    assert np.allclose(apart[again], uv[corner]) and np.array_equal(source[again], corner)
+    chart = _islands(len(apart), again)
+    packed = pack(apart, again, chart, 512, 4)
+    assert overlapping(packed.uv / 512, again, 512) == 0
