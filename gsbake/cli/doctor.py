@@ -95,13 +95,11 @@ def machine_findings(out: Path) -> list[Finding]:
 
 
 def backend_finding() -> Finding:
-    """Which device `--device auto` takes, and what would bring the other."""
+    """Which device `--device auto` takes, and what else is there."""
     build, devices = torch_cuda_build(), cuda_devices()
-    if build is not None and devices:
-        return Finding("backend", f"cuda (torch for CUDA {build}, {devices} GPU)", True)
-    if devices:
-        return Finding("backend", "cpu; a GPU is there, but torch is a CPU build", True, "for the GPU, install a CUDA build of torch")
-    return Finding("backend", "cpu (no NVIDIA GPU)", True)
+    gpu = f"{devices} NVIDIA GPU there" if devices else "no NVIDIA GPU"
+    torch_build = f"torch for CUDA {build}" if build else "torch for the CPU"
+    return Finding("backend", f"cpu, where this version's kernels run ({gpu}, {torch_build})", True)
 
 
 def library_findings() -> list[Finding]:

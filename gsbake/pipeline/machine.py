@@ -78,19 +78,12 @@ def cuda_devices() -> int:
 
 
 def resolve_device(asked: str) -> str:
-    """ "cpu" or "cuda" for auto|cpu|cuda; UsageError when CUDA is asked for and cannot be had."""
-    if asked == "cpu":
+    """The device for auto|cpu|cuda: always "cpu", because this version's kernels run there only; UsageError when CUDA is asked for."""
+    if asked in ("auto", "cpu"):
         return "cpu"
-    if asked not in ("auto", "cuda"):
+    if asked != "cuda":
         raise UsageError(f"--device is auto, cpu or cuda, not '{asked}'.")
-    missing = ""
-    if torch_cuda_build() is None:
-        missing = "the installed torch is a CPU build"
-    elif cuda_devices() == 0:
-        missing = "the NVIDIA driver offers no device"
-    if asked == "cuda" and missing:
-        raise UsageError(f"--device cuda cannot be had: {missing}; `gsbake doctor` says more, and --device cpu always works.")
-    return "cpu" if missing else "cuda"
+    raise UsageError("--device cuda cannot be had: this version's kernels run on the CPU only; leave the option out or give --device cpu.")
 
 
 @cache

@@ -162,11 +162,8 @@ def test_replace_and_undo(run: Run, capture: Path, tmp_path: Path) -> None:
     ],
 )
 def test_each_mistake_has_its_sentence_and_code(
-    run: Run, capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arguments: list[str], code: int, says: str
+    run: Run, capture: Path, tmp_path: Path, arguments: list[str], code: int, says: str
 ) -> None:
-    import gsbake.pipeline.machine
-
-    monkeypatch.setattr(gsbake.pipeline.machine, "torch_cuda_build", lambda: None)
     (tmp_path / "empty").mkdir()
     (tmp_path / "two").mkdir()
     for name in ("a.png", "b.png"):
