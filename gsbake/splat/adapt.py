@@ -55,9 +55,7 @@ def replace_rows(surfels: Surfels, adam: Adam, keep: Tensor, children: Surfels |
     adam.select(names, keep, 0 if children is None else len(children))
     if children is None:
         return kept
-    join = {k: torch.cat([v, children.tensors()[k]]) for k, v in kept.tensors().items() if k != "gamma"}
-    attributes = {k.split(".", 1)[1]: v for k, v in join.items() if "." in k}
-    return Surfels(gamma=surfels.gamma, attributes=attributes, **{k: v for k, v in join.items() if "." not in k})
+    return kept.joined(children)
 
 
 @torch.no_grad()

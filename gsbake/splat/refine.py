@@ -83,9 +83,7 @@ def prune_and_densify(surfels: Surfels, posed: PosedPhotos, refine: Any, max_siz
     added = _fill(kept, refine.densify_share, seed)
     counts["added"] = len(added)
     if len(added):
-        parts = {k: torch.cat([v, added.tensors()[k]]) for k, v in kept.tensors().items() if k != "gamma"}
-        attributes = {k.split(".", 1)[1]: v for k, v in parts.items() if "." in k}
-        kept = Surfels(gamma=kept.gamma, attributes=attributes, **{k: v for k, v in parts.items() if "." not in k})
+        kept = kept.joined(added)
     return kept, counts | {"after": len(kept)}
 
 
@@ -106,8 +104,7 @@ def _fill(surfels: Surfels, share: float, seed: int) -> Surfels:
     one, other = surfels.select(a), surfels.select(b)
     same_side = (one.normal() * other.normal()).sum(1) > 0.3
     one, other = one.select(same_side.nonzero()[:, 0]), other.select(same_side.nonzero()[:, 0])
-    middle = {k: (v + other.tensors()[k]) / 2 for k, v in one.tensors().items() if k not in ("gamma", "quaternion")}
-    normal = one.normal()
-    position = middle["position"] - middle["sdf"][:, None] * normal
-    attributes = {k.split(".", 1)[1]: v for k, v in middle.items() if "." in k}
-    return Surfels(position, one.quaternion.clone(), middle["log_scale"], middle["sdf"], surfels.gamma, attributes)
+    others = other.tensors()
+    middle = Surfels.of({k: v if k in ("gamma", "quaternion") else (v + others[k]) / 2 for k, v in one.tensors().items()})
+    middle.position = middle.position - middle.sdf[:, None] * middle.normal()
+    return middle

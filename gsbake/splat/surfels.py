@@ -67,6 +67,17 @@ class Surfels:
         own = {k: getattr(self, k) for k in ("position", "quaternion", "log_scale", "sdf", "gamma")}
         return own | {f"attributes.{k}": v for k, v in self.attributes.items()}
 
+    @staticmethod
+    def of(tensors: dict[str, Tensor]) -> Surfels:
+        """The surfels whose `tensors()` these are."""
+        attributes = {k.removeprefix("attributes."): v for k, v in tensors.items() if k.startswith("attributes.")}
+        return Surfels(attributes=attributes, **{k: v for k, v in tensors.items() if "." not in k})
+
+    def joined(self, more: Surfels) -> Surfels:
+        """These surfels, then `more`; the sharpness stays this one's."""
+        other = more.tensors()
+        return Surfels.of({k: v if k == "gamma" else torch.cat([v, other[k]]) for k, v in self.tensors().items()})
+
     def features(self, camera_centre: Tensor) -> Tensor:
         """What is blended per surfel: rgb (n, 3) seen from `camera_centre` (3,), or base colour, roughness, metallic (n, 5)."""
         a = self.attributes
@@ -102,8 +113,7 @@ class Surfels:
         """Read what `save` wrote."""
         with safe_open(str(path), "pt") as file:
             all_ = {k: file.get_tensor(k) for k in file.keys()}  # noqa: SIM118 (safetensors has no iterator)
-        attributes = {k.split(".", 1)[1]: v for k, v in all_.items() if k.startswith("attributes.")}
-        return Surfels(attributes=attributes, **{k: v for k, v in all_.items() if "." not in k})
+        return Surfels.of(all_)
 
 
 def quaternion_to(normals: Tensor) -> Tensor:

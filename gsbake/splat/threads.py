@@ -19,7 +19,7 @@ def configure(threads: int) -> None:
 
     What torch is left with in a training step are many small operations: a team of OpenMP threads gains nothing on them, and whenever
     another
-    process holds a core every barrier waits for it (measured: 10x slower steps beside one busy process).
+    process holds a core every barrier waits for it (seen: 10x slower steps beside one busy process).
     """
     global _configured
     import torch

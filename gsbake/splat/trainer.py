@@ -1,7 +1,7 @@
 """Training: one loop over photos that fits surfels, their SDF samples, materials and the light (Zhu et al., ICCV 2025).
 
-The schedule is the paper's in shares of the run (of 30 000 steps: median, projection and distortion from 1 000, densify 500 to 15
-000), with the
+The schedule is the paper's in shares of the run (of 30 000 steps: median, projection and distortion from 1 000, densify 500
+to 15 000), with the
 first part at half resolution. All state is in `state()`: a run resumed from a checkpoint ends with the same result.
 """
 
@@ -236,9 +236,7 @@ class Trainer:
 
     def restore(self, state: dict[str, Any]) -> None:
         """Go on from what `state` returned."""
-        own = state["surfels"]
-        attributes = {k.split(".", 1)[1]: v for k, v in own.items() if "." in k}
-        self.surfels = Surfels(attributes=attributes, **{k: v for k, v in own.items() if "." not in k})
+        self.surfels = Surfels.of(state["surfels"])
         self.adam.load(state["adam"])
         self.generator.set_state(state["generator"])
         if self.light is not None:
