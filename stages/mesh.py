@@ -9,9 +9,12 @@ from gsbake.pipeline.errors import BadInputError
 from gsbake.pipeline.stage import Context, Stage
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     import numpy as np
     from numpy.typing import NDArray
 
+    from gsbake.capture.cameras import Camera
     from gsbake.capture.posed import PosedPhotos
     from gsbake.surface.resolution import Resolution
     from gsbake.surface.spool import ViewSpool
@@ -21,7 +24,7 @@ if TYPE_CHECKING:
 BALL = 1.05
 #: Truncation in cells, at least and at most; between them three times the depth noise.
 TRUNCATION_CELLS = (4.0, 10.0)
-#: Fainter surfels say nothing about where the object is.
+#: Surfels below this share of the transfer's peak opacity say nothing about where the object is.
 MIN_OPACITY = 0.05
 #: Holes with more border edges than this are openings, not holes, when nothing tells inside from outside.
 MAX_HOLE_EDGES = 400
@@ -54,7 +57,7 @@ def run(ctx: Context) -> dict[str, Any]:
                 "mesh: the trained surfels show no surface inside the object's sphere; look at the training figures in the report, "
                 "give masks, or train longer (train.iterations)."
             )
-        return _finish(ctx, dense, spool, resolution, noise)
+        return _finish(ctx, dense, posed, spool, resolution, noise)
 
 
 def _samples(folder: Path) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
@@ -69,7 +72,7 @@ def _samples(folder: Path) -> tuple[NDArray[np.float64], NDArray[np.float64], ND
     points = surfels.position.detach().cpu().numpy().astype(np.float64) - sdf * normal
     weights = surfels.scale.detach().cpu().numpy().astype(np.float64).prod(1)
     opacity = surfels.opacity().detach().cpu().numpy().astype(np.float64).reshape(-1)
-    keep = np.isfinite(points).all(1) & (np.linalg.norm(points, axis=1) <= BALL) & (opacity > MIN_OPACITY)
+    keep = np.isfinite(points).all(1) & (np.linalg.norm(points, axis=1) <= BALL) & (opacity > MIN_OPACITY * surfels.transfer.peak)
     if keep.sum() < 10:
         raise BadInputError("mesh: fewer than ten surfels lie in the object's sphere; the training failed, see its figures in the report.")
     weights = (weights * opacity)[keep]
@@ -168,9 +171,14 @@ def _field(
 
 
 def _finish(
-    ctx: Context, dense: tuple[NDArray[np.float64], NDArray[np.int32]], spool: ViewSpool, resolution: Resolution, noise: float
+    ctx: Context,
+    dense: tuple[NDArray[np.float64], NDArray[np.int32]],
+    posed: PosedPhotos,
+    spool: ViewSpool,
+    resolution: Resolution,
+    noise: float,
 ) -> dict[str, Any]:
-    """Clean, refine along the normals, decimate, write."""
+    """Clean, refine along the normals, fit to the masks, decimate, write."""
     from gsbake.surface import clean
     from gsbake.surface.ply import write_ply
 
@@ -187,6 +195,8 @@ def _finish(
             if settings.holes == "close":
                 vertices, faces = clean.close_holes(vertices, faces, MAX_HOLE_EDGES)
             shape = clean.topology(vertices, faces)
+    with ctx.part("silhouettes"):
+        vertices = _polish(ctx, posed, vertices, faces)
         write_ply(ctx.out / "dense.ply", vertices, faces)
     ctx.check_stop()
     with ctx.part("decimate"):
@@ -230,9 +240,34 @@ def _follow(
     return follow_normals(vertices, faces, target, trust, reach * cell, limit=1.5 * cell)
 
 
+def _polish(ctx: Context, posed: PosedPhotos, vertices: NDArray[np.float64], faces: NDArray[np.int32]) -> NDArray[np.float64]:
+    """Vertices moved until the silhouettes meet the masks, where every photo has one."""
+    from gsbake.surface.silhouette import polish
+
+    rounds = ctx.settings.mesh.silhouette_rounds
+    if not rounds or not posed.has_masks:
+        ctx.decide("silhouettes", "left as they are", "not every photo has a mask" if rounds else "the profile asks for no rounds")
+        return vertices
+
+    def views() -> Iterator[tuple[Camera, NDArray[np.uint8]]]:
+        for index in range(len(posed)):
+            ctx.check_stop()
+            view = posed.view(index)
+            if view.mask is not None:
+                yield view.camera, view.mask
+
+    polished = polish(vertices, faces, views, rounds, ctx.threads)
+    if polished.rims == 0:
+        ctx.decide("silhouettes", "left as they are", "the mesh's outline lies near the masks' border hardly anywhere")
+    else:
+        evidence = f"{polished.rims} rim points, in the median {polished.before:+.2f} px from the masks' border, now {polished.after:+.2f}"
+        ctx.decide("silhouettes", "surface moved to the masks", evidence)
+    return polished.vertices
+
+
 STAGE = Stage(
     name="mesh",
-    version=1,
+    version=2,
     title="Mesh",
     run=run,
     needs=("poses", "refine"),

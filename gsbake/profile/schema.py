@@ -49,6 +49,7 @@ class Splat(Section):
 
     shading: Literal["colour", "pbr"] = Field("colour", description="colour: plain colour with view dependence; pbr: deferred split-sum shading with a learnt environment light.")
     sh_degree: int = Field(1, ge=0, le=2, description="Degree of the view dependence (spherical harmonics) in colour shading.")
+    transfer: Literal["sech2", "bell", "gaussian", "laplace", "neus"] = Field("sech2", description="How an SDF sample becomes opacity: the discretized SDF's sech2, 3DGSR's bell, a Gaussian, or the laws of VolSDF (laplace) and NeuS on a thin layer.")
     max_surfels: int = Field(60_000, ge=100, description="Upper bound on the number of surfels.")
     env_size: int = Field(32, ge=4, le=128, description="Edge of the environment cube map in texels.")
 
@@ -103,6 +104,7 @@ class Mesh(Section):
     faces: int = Field(30_000, ge=100, description="Target triangle count of the asset.")
     smooth: int = Field(2, ge=0, description="Taubin smoothing steps on the dense mesh.")
     normal_reach: float = Field(8.0, ge=0, description="Waves shorter than this many cells follow the rendered normals instead of the depth; 0 leaves them.")
+    silhouette_rounds: int = Field(3, ge=0, description="Rounds of moving the surface until its silhouettes meet the masks; 0 leaves it.")
     min_component: Fraction = Field(0.02, description="Drop loose pieces with less than this share of the largest piece's area.")
 
 
