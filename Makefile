@@ -43,13 +43,13 @@ check: setup ## Lint and types
 	$(BIN)/mypy
 
 test: check ## Lint, types and the quick tests
-	$(BIN)/pytest -m "not slow"
+	$(BIN)/pytest -m "not slow and not stress"
 
-stress: setup ## The slow tests: kills at random moments, whole bakes of development captures where they are present
-	$(BIN)/pytest -m slow
+stress: setup ## The slow tests: hostile input at length, kills at random moments, whole bakes of development captures where present
+	$(BIN)/pytest -m "slow or stress"
 
-bench: setup ## Time the rasteriser
-	$(BIN)/python -m benchmarks.raster
+bench: setup ## Time rasteriser and training step, beside the PyTorch twin and a plain copy; writes benchmarks/results/raster.csv
+	$(BIN)/python -m benchmarks.table
 
 score: .score/.stamp ## Score an asset against its truth: SCORE_GT=capture/gt SCORE_ASSET=asset.glb SCORE_ARGS=--no-render
 	.score/bin/python $(SCORE_DIR)/score.py $(SCORE_GT) $(SCORE_ASSET) $(SCORE_ARGS)

@@ -5,4 +5,5 @@ from __future__ import annotations
 from gsbake.pipeline.registry import Registry
 
 #: Stage names in the order they run, and where each is declared.
-REGISTRY = Registry({name: f"stages.{name}:STAGE" for name in ("ingest", "poses", "train", "refine", "mesh", "bake", "export", "report")})
+ORDER = ("ingest", "poses", "stereo", "train", "refine", "mesh", "bake", "export", "report")
+REGISTRY = Registry({name: f"stages.{name}:STAGE" for name in ORDER})

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from gsbake.surface.raycast import RayCaster
     from gsbake.texture.atlas import Atlas
     from gsbake.texture.normals import Detail
+    from gsbake.texture.pixels import Pixels
     from gsbake.texture.project import Blended
     from gsbake.texture.texels import Texels
 
@@ -22,8 +23,14 @@ if TYPE_CHECKING:
 OCCLUSION_SIZE = 1024
 #: Held-out photos count this much: they fill only what no other photo saw, so that figures taken on them stay honest.
 HELD_OUT_WEIGHT = 1e-4
+#: Gains between photos below this factor are taken for view dependence, not exposure.
+STEADY = 1.25
 #: Within this share of a photo's longer side from the mask's border, pixels count less.
 MASK_MARGIN = 0.008
+#: Materials are fitted to at most this many pixels of each photo.
+MOST_PIXELS = 60_000
+#: Materials are fitted where the photos together saw a texel as well as this many frontal views do; elsewhere they are continued.
+LEAST_SEEN = 0.3
 #: Rendered materials count where the surfels are at least this opaque.
 SOLID = 0.8
 
@@ -33,7 +40,8 @@ class Surface:
     """The light mesh cut into charts.
 
     Per atlas vertex `position` (v, 3), `normal` (v, 3), `tangent` (v, 4); its texels, their points `at` (n, 3) and unit normals `facing`
-    (n, 3); `diagonal` of the bounding box and `texel` edge in the unit frame.
+    (n, 3); `caster` holds the mesh before it was cut, `whole` the cut one with the atlas'
+    triangles; `diagonal` of the bounding box and `texel` edge in the unit frame.
     """
 
     atlas: Atlas
@@ -44,6 +52,7 @@ class Surface:
     at: NDArray[np.float32]
     facing: NDArray[np.float32]
     caster: RayCaster
+    whole: RayCaster
     diagonal: float
     texel: float
 
@@ -71,7 +80,13 @@ def run(ctx: Context) -> dict[str, Any]:
     with ctx.part("occlusion"):
         open_share = _occlusion(ctx, surface, dense, detail)
     with ctx.part("projection"):
-        blended = _project_materials(ctx, surface) if ctx.settings.splat.shading == "pbr" else _project_photos(ctx, surface)
+        fits = ctx.settings.splat.shading == "pbr" and settings.fit_steps > 0
+        own = ctx.settings.splat.shading == "pbr" and not fits
+        blended = _project_materials(ctx, surface) if own else _project_photos(ctx, surface)
+    fit: dict[str, Any] = {}
+    if fits:
+        with ctx.part("fit"):
+            blended, fit = _fit_materials(ctx, surface, blended, detail, open_share)
     with ctx.part("flood"):
         if not blended.seen.any():
             raise BadInputError("bake: no photo sees the mesh; poses and mesh do not belong together, run from the poses stage again.")
@@ -104,6 +119,7 @@ def run(ctx: Context) -> dict[str, Any]:
         "detail_share": float(detail.found.mean()),
         "detail_bound": detail.bound,
         "largest_gain": float(np.exp(np.abs(np.log(blended.gains)).max())),
+        **fit,
     }
 
 
@@ -152,8 +168,8 @@ def _unwrap(ctx: Context, vertices: NDArray[np.float64], faces: NDArray[np.int64
     ctx.progress(1, 4, "atlas", charts=atlas.charts, fill=atlas.fill)
     return Surface(
         atlas, position, normal, frames.tangent, texels, texels.interpolate(position, atlas.faces), facing,
-        RayCaster(vertices, faces, ctx.threads), float(np.linalg.norm(np.ptp(vertices, axis=0))),
-        float(np.sqrt(area / (atlas.fill * size * size))),
+        RayCaster(vertices, faces, ctx.threads), RayCaster(position, atlas.faces, ctx.threads),
+        float(np.linalg.norm(np.ptp(vertices, axis=0))), float(np.sqrt(area / (atlas.fill * size * size))),
     )  # fmt: skip
 
 
@@ -225,12 +241,75 @@ def _project_photos(ctx: Context, surface: Surface) -> Blended:
     blended = blender.result(solve_exposure=ctx.settings.bake.equalise)
     if ctx.settings.bake.equalise:
         spread = float(np.exp(np.abs(np.log(blended.gains)).max()))
-        ctx.decide("exposure", f"equalised by up to {spread:.2f}x", f"{len(posed)} photos compared on the surface")
+        evidence = f"photos compared on the surface differ by up to {spread:.2f}x"
+        if spread < STEADY:  # what view dependence alone would show: dividing it out would wash reflections away
+            ctx.decide("exposure", "constant", evidence)
+            blended = blender.result()
+        else:
+            ctx.decide("exposure", "equalised", evidence)
     return blended
 
 
+def _fit_materials(
+    ctx: Context, surface: Surface, shown: Blended, detail: Detail, open_share: NDArray[np.float32]
+) -> tuple[Blended, dict[str, Any]]:
+    """Base colour, roughness, metallic (n, 5) fitted to the photos together with the light, which is written beside the textures.
+
+    `shown` is what the photos show (n, 3): the fit starts from it, and where the fit works on a coarser texture it gives the fine detail.
+    """
+    import numpy as np
+
+    from gsbake.capture.posed import PosedPhotos
+    from gsbake.splat.views import held_out
+    from gsbake.surface.resolution import pixel_footprint
+    from gsbake.texture.coarse import Coarse
+    from gsbake.texture.fit import TRIALS, MaterialFit, Priors, trial_roughness
+    from gsbake.texture.pixels import PixelReader
+
+    settings = ctx.settings.bake
+    posed = PosedPhotos.open(ctx.inputs["poses"])
+    sizes = [(c, min(1.0, settings.fit_size / max(c.width, c.height))) for c in posed.cameras.cameras]
+    cameras = [c.scaled(max(1, round(c.width * k)), max(1, round(c.height * k))) for c, k in sizes]
+    footprint = pixel_footprint(cameras, surface.position.mean(0))
+    coarse = Coarse.of(surface.atlas.uv, surface.atlas.faces, surface.texels, surface.texel, footprint)
+    ctx.decide("materials fitted at", f"{coarse.texels.size} texels", f"a texel is {coarse.edge / footprint:.2f} pixels of the photos")
+    reader = PixelReader(surface.whole, surface.atlas.uv, coarse.texels, surface.diagonal)
+    aside = set(held_out(len(posed), ctx.settings.train.holdout))
+    photos: list[Pixels] = []
+    held: list[Pixels] = []
+    for index in range(len(posed)):
+        ctx.check_stop()
+        view = posed.view(index, settings.fit_size)
+        pixels = reader.read(view.camera, view.rgb, view.mask).thinned(MOST_PIXELS)
+        (held if index in aside else photos).append(pixels.without_gain(shown.gains[index]))
+
+    def each(done: int, total: int) -> None:
+        ctx.check_stop()
+        ctx.progress(done, total, "materials and light")
+
+    priors = Priors(settings.smooth_prior, settings.dark_prior, settings.metal_prior, settings.white_prior)
+    normal, occlusion, base = (coarse.down(x) for x in (detail.normal, open_share[:, None], shown.values))
+
+    def start(roughness: float) -> MaterialFit:
+        return MaterialFit(coarse.texels, normal, occlusion[:, 0], base, ctx.settings.splat.env_size, priors, roughness)
+
+    trials = trial_roughness(start, photos, ctx.seed, lambda done, total: ctx.check_stop())
+    best = max(trials, key=lambda roughness: trials[roughness]) if trials else TRIALS[1]
+    evidence = ", ".join(f"{score:.2f} dB from {roughness:g}" for roughness, score in trials.items()) or "too few photos for trials"
+    ctx.decide("roughness starts at", f"{best:g}", evidence)
+    fitted = start(best).run(photos, held, settings.fit_steps, ctx.seed, each)
+    fitted.light.save(ctx.out / "light.safetensors")
+    values = coarse.up(fitted.values)
+    values[:, :3] *= coarse.detail(shown.values)
+    known = coarse.up(fitted.weight[:, None])[:, 0] > LEAST_SEEN * (coarse.edge / footprint) ** 2
+    figures: dict[str, Any] = {"fit_psnr": fitted.held_out, "fit_pixels": sum(map(len, photos)), "fit_texels": len(coarse.texels)}
+    return replace(shown, values=values, views=np.where(known, shown.views, 0)), figures
+
+
 def _project_materials(ctx: Context, surface: Surface) -> Blended:
-    """Base colour, roughness, metallic (n, 5) from the trained surfels, rendered at the photos' poses."""
+    """Base colour, roughness, metallic (n, 5) from the trained surfels, rendered at the photos' poses; their light goes with them."""
+    import shutil
+
     import numpy as np
 
     from gsbake.capture.posed import PosedPhotos
@@ -250,6 +329,7 @@ def _project_materials(ctx: Context, surface: Surface) -> Blended:
         solid = (buffers["alpha"] > SOLID).astype(np.uint8) * 255
         blender.add(camera, image, mask_weights(solid, MASK_MARGIN * size))
         ctx.progress(index + 1, len(posed), "materials onto the texture")
+    shutil.copyfile(ctx.inputs["refine"] / "light.safetensors", ctx.out / "light.safetensors")
     return blender.result()
 
 
@@ -272,10 +352,11 @@ def _save_mesh(ctx: Context, surface: Surface) -> None:
 
 STAGE = Stage(
     name="bake",
-    version=1,
+    version=2,
     title="Textures",
     run=run,
     needs=("poses", "refine", "mesh"),
-    settings=("bake.*", "splat.shading", "train.max_size", "train.holdout"),
+    settings=("bake.*", "splat.shading", "splat.env_size", "train.max_size", "train.holdout"),
     uses_device=True,
+    seeded=True,
 )

@@ -152,11 +152,8 @@ def _write_light(ctx: Context, frame: Similarity) -> None:
     from gsbake.light.environment import EnvironmentLight
     from gsbake.texture.masters import write_hdr
 
-    path = ctx.inputs["refine"] / "light.safetensors"
-    if not path.exists():
-        ctx.warn("export: the training left no environment light, so light.hdr is not written.")
-        return
-    write_hdr(ctx.out / "light.hdr", EnvironmentLight.load(path).equirectangular(LIGHT_HEIGHT, frame.rotation, "gltf"))
+    light = EnvironmentLight.load(ctx.inputs["bake"] / "light.safetensors")
+    write_hdr(ctx.out / "light.hdr", light.equirectangular(LIGHT_HEIGHT, frame.rotation, "gltf"))
 
 
 def _write_previews(ctx: Context, sheets: Sheets, mesh: GltfMesh) -> None:

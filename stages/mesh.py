@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 BALL = 1.05
 #: Truncation in cells, at least and at most; between them three times the depth noise.
 TRUNCATION_CELLS = (4.0, 10.0)
+#: Stereo replaces a rendered depth that it agrees with to this many cells.
+MEASURED_CELLS = 3.0
 #: Surfels below this share of the transfer's peak opacity say nothing about where the object is.
 MIN_OPACITY = 0.05
 #: Holes with more border edges than this are openings, not holes, when nothing tells inside from outside.
@@ -105,17 +107,29 @@ def _choose(ctx: Context, posed: PosedPhotos, points: NDArray[np.float64]) -> tu
 
 
 def _render(ctx: Context, posed: PosedPhotos, spool: ViewSpool, resolution: Resolution) -> None:
-    """Depth and normals at every photo's pose into the spool."""
+    """Depth and normals at every photo's pose into the spool; depths that stereo measured replace rendered ones that they agree with."""
     from gsbake.splat.render import SurfelRenderer
+    from gsbake.stereo.maps import read_depth
+    from gsbake.surface.measured import with_measured
     from gsbake.surface.views import DepthView
 
     renderer = SurfelRenderer.load(ctx.inputs["refine"], ctx.device)
+    stereo = ctx.inputs.get("stereo")
+    shares: list[float] = []
     for index in range(len(posed)):
         ctx.check_stop()
         photo = posed.view(index, ctx.settings.train.max_size)
         buffers = renderer.gbuffer(photo.camera)
-        spool.append(DepthView.from_gbuffer(photo.camera, buffers, photo.mask, TRUNCATION_CELLS[0] * resolution.cell), buffers["normal"])
+        view = DepthView.from_gbuffer(photo.camera, buffers, photo.mask, TRUNCATION_CELLS[0] * resolution.cell)
+        measured = None if stereo is None else stereo / "depth" / f"{photo.camera.name}.npz"
+        if measured is not None and measured.exists():
+            view, share = with_measured(view, *read_depth(measured), MEASURED_CELLS * resolution.cell)
+            shares.append(share)
+        spool.append(view, buffers["normal"])
         ctx.progress(index + 1, len(posed), "depth maps")
+    if shares:
+        share = 100 * sum(shares) / len(shares)
+        ctx.decide("depth", f"{share:.0f} % from stereo", f"there it agrees with the rendered depth to {MEASURED_CELLS:g} cells")
 
 
 def _noise(spool: ViewSpool) -> float:
@@ -270,7 +284,7 @@ STAGE = Stage(
     version=2,
     title="Mesh",
     run=run,
-    needs=("poses", "refine"),
+    needs=("poses", "stereo", "refine"),
     settings=("mesh.*", "train.max_size"),
     uses_device=True,
 )

@@ -124,6 +124,6 @@ STAGE = Stage(
     version=1,
     title="write the report",
     run=run,
-    needs=("ingest", "poses", "train", "refine", "mesh", "bake", "export"),
+    needs=("ingest", "poses", "stereo", "train", "refine", "mesh", "bake", "export"),
     settings=("report.*", "train.holdout"),
 )

@@ -16,7 +16,7 @@ def run(ctx: Context) -> dict[str, Any]:
     settings = ctx.settings
     posed = PosedPhotos.open(ctx.inputs["poses"])
     with ctx.part("start"):
-        surfels, kind, why = begin(posed, settings.train, settings.splat, ctx.seed)
+        surfels, kind, why = begin(posed, settings.train, settings.splat, ctx.seed, ctx.inputs["stereo"])
         ctx.decide("surfels start from", kind, why)
     light = None
     if settings.splat.shading == "pbr":
@@ -34,7 +34,7 @@ STAGE = Stage(
     version=1,
     title="train surfels",
     run=run,
-    needs=("poses",),
+    needs=("poses", "stereo"),
     settings=("train.*", "splat.*", "loss.*"),
     uses_device=True,
     seeded=True,

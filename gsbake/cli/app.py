@@ -43,6 +43,7 @@ app = typer.Typer(
 STAGE_HELP = {
     "ingest": "Read photos, masks and known poses.",
     "poses": "Find the cameras, and the object in front of them.",
+    "stereo": "Match the photos, for points on the surface to start from.",
     "train": "Train the surfels.",
     "refine": "Prune and densify the surfels, then fine-tune them.",
     "mesh": "Turn the surfels into a clean mesh.",

@@ -20,7 +20,7 @@ from rich.table import Table
 from rich.text import Text
 
 from gsbake.cli.wording import size
-from gsbake.pipeline.machine import cpu_name, cuda_devices, default_threads, torch_cuda_build, versions
+from gsbake.pipeline.machine import cpu_name, cuda_devices, default_threads, resolve_device, torch_cuda_build, versions
 
 #: Library (as pip calls it) → module that is imported to see whether it works.
 MODULES = {
@@ -99,7 +99,7 @@ def backend_finding() -> Finding:
     build, devices = torch_cuda_build(), cuda_devices()
     gpu = f"{devices} NVIDIA GPU there" if devices else "no NVIDIA GPU"
     torch_build = f"torch for CUDA {build}" if build else "torch for the CPU"
-    return Finding("backend", f"cpu, where this version's kernels run ({gpu}, {torch_build})", True)
+    return Finding("backend", f"{resolve_device('auto')} ({gpu}, {torch_build})", True)
 
 
 def library_findings() -> list[Finding]:

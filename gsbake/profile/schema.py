@@ -44,6 +44,17 @@ class Poses(Section):
     )
 
 
+class Stereo(Section):
+    """Multi-view stereo: depth where photos can be matched."""
+
+    enabled: Literal["auto", "always", "never"] = Field("auto", description="Match photos before training; auto leaves it out when they are too few or too small.")
+    max_size: int = Field(800, ge=64, le=4000, description="Longer side in pixels at which photos are matched.")
+    neighbours: int = Field(6, ge=1, le=8, description="Photos each photo is matched against.")
+    best_views: int = Field(4, ge=1, le=8, description="Of these, how many must fit at each pixel: the best ones there.")
+    confirming: int = Field(12, ge=1, le=32, description="Photos whose depths may confirm a photo's depths.")
+    min_views: int = Field(2, ge=1, le=10, description="Photos that must confirm a depth.")
+
+
 class Splat(Section):
     """The surfel model and its rasteriser."""
 
@@ -61,7 +72,7 @@ class Train(Section):
     max_size: int = Field(512, ge=16, description="Longer side of the training photos in pixels.")
     coarse_share: Fraction = Field(0.5, description="Share of the run at half resolution.")
     init_surfels: int = Field(20_000, ge=10, description="Surfels to start with.")
-    init: Literal["auto", "points", "hull", "sphere"] = Field("auto", description="Where surfels start: SfM points, visual hull, a sphere, or the best available.")
+    init: Literal["auto", "stereo", "points", "hull", "sphere"] = Field("auto", description="Where surfels start: stereo, SfM points, visual hull, a sphere, or the best available.")
     holdout: int = Field(8, ge=0, description="Every n-th photo is held out of training for the quality figure; 0 holds none out.")
     early_stop: bool = Field(True, description="Stop when held-out PSNR and the SDF median stand still.")
     lr_position: float = Field(8e-4, gt=0, description="Adam rate of positions at the start; decays to 1/100.")
@@ -115,6 +126,12 @@ class Bake(Section):
     normal_map: bool = Field(True, description="Bake a tangent-space normal map from the undecimated surface.")
     occlusion_rays: int = Field(64, ge=0, description="Rays per texel for ambient occlusion; 0 leaves it out.")
     equalise: bool = Field(True, description="Solve for one exposure gain per photo and channel before photos are fused into the base colour.")
+    fit_steps: int = Field(400, ge=0, description="Steps of fitting materials and light to the photos in texture space; 0 takes the surfels' own (splat.shading = pbr).")
+    fit_size: int = Field(800, ge=16, description="Longer side in pixels of the photos that materials are fitted to.")
+    smooth_prior: float = Field(0.03, ge=0, description="Neighbouring texels have the same material.")
+    dark_prior: float = Field(0.02, ge=0, description="What a reflection explains is not paint; also settles how bright the light is.")
+    metal_prior: float = Field(0.003, ge=0, description="Most things are not metal.")
+    white_prior: float = Field(0.005, ge=0, description="Most light is white.")
     roughness: Fraction = Field(0.8, description="Roughness of the whole asset when only colours were trained (splat.shading = colour).")
 
 
@@ -139,6 +156,7 @@ class Profile(Section):
     description: str = Field("", description="What the profile is for.")
     ingest: Ingest = Ingest()
     poses: Poses = Poses()
+    stereo: Stereo = Stereo()
     splat: Splat = Splat()
     train: Train = Train()
     loss: Loss = Loss()

@@ -16,7 +16,7 @@ from gsbake.report.charts import Bar, Curve, bars, duration, lines, size
 from gsbake.report.html import Check, Decision, StageRow, Warned
 
 #: Stages in the order they run in.
-ORDER = ("ingest", "poses", "train", "refine", "mesh", "bake", "export")
+ORDER = ("ingest", "poses", "stereo", "train", "refine", "mesh", "bake", "export")
 #: Folders that a capture keeps its photos in; the capture's name is the folder above.
 PHOTO_FOLDERS = {"photos", "images", "image", "input", "imgs", "rgb"}
 

@@ -16,7 +16,7 @@ from gsbake.splat.adam import Adam
 from gsbake.splat.reference import rotation_matrix
 from gsbake.splat.surfels import Surfels
 
-#: Opacity below which a surfel is dropped (DSDF).
+#: Share of the transfer's peak opacity below which a surfel is dropped (DSDF: .005, its peak is 1).
 OPACITY_FLOOR = 0.005
 #: Mean weight per view (in pixels) below which a surfel counts as hidden: it lies behind others and costs time without being seen.
 HIDDEN_WEIGHT = 0.05
@@ -31,9 +31,9 @@ class Statistics:
     weight: Tensor
 
     @staticmethod
-    def zeros(n: int) -> Statistics:
+    def zeros(n: int, device: str | torch.device = "cpu") -> Statistics:
         """Fresh statistics for n surfels."""
-        return Statistics(torch.zeros(n), torch.zeros(n), torch.zeros(n))
+        return Statistics(*(torch.zeros(n, device=device) for _ in range(3)))
 
     def add(self, screen_grad: Tensor, touched: Tensor, size: int) -> None:
         """Collect one backward pass: gradients (n, ≥2) w.r.t. the screen centre in pixels, weights (n,); `size` makes them
@@ -77,7 +77,7 @@ def densify(
     axes = rotation_matrix(parents.quaternion)[:, :, :2]
     children = []
     for _ in range(2):
-        offset = torch.randn(len(chosen), 2, generator=generator).clamp(-2, 2) * parents.scale
+        offset = torch.randn(len(chosen), 2, generator=generator).to(score.device).clamp(-2, 2) * parents.scale
         place = parents.position + torch.einsum("nij,nj->ni", axes, offset)
         child = parents.select(torch.arange(len(chosen)))
         child.position = torch.where(split[:, None], place, parents.position)
@@ -94,7 +94,7 @@ def prune(surfels: Surfels, adam: Adam, stats: Statistics | None, largest: float
     """Drop surfels that are transparent, larger than `largest`, not finite, or (given statistics) hidden in all views; returns also
     the kept index."""
     dropped = {
-        "transparent": surfels.opacity() < OPACITY_FLOOR,
+        "transparent": surfels.opacity() < OPACITY_FLOOR * surfels.transfer.peak,
         "too large": surfels.scale.max(1).values > largest,
         "not finite": ~torch.isfinite(surfels.position).all(1),
     }

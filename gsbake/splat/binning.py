@@ -8,18 +8,26 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from gsbake.splat.kernel import JIT, TILE
+from gsbake.splat.blocks import JIT, TILE
+from gsbake.splat.lanes import prefetch
 from gsbake.splat.threads import thread_count
+
+SHIFT = TILE.bit_length() - 1  # a division by TILE that knows nothing of negative numbers
+LOOK_AHEAD = 8
 
 
 @njit(**JIT)
 def fill_tiles(order, box, tiles_x, offsets, cursor, ids, slots):  # type: ignore[no-untyped-def]
     """Counting sort: append each surfel, front to back, to the lists of the tiles its box touches."""
-    for i in range(order.shape[0]):
+    last = order.shape[0] - 1
+    for i in range(last + 1):
+        coming = np.uint64(order[min(i + LOOK_AHEAD, last)])
+        prefetch(box, coming, 0)
+        prefetch(offsets, coming, 0)
         g = order[i]
         slot = offsets[g]
-        for ty in range(box[g, 2] // TILE, box[g, 3] // TILE + 1):
-            for tx in range(box[g, 0] // TILE, box[g, 1] // TILE + 1):
+        for ty in range(box[g, 2] >> SHIFT, (box[g, 3] >> SHIFT) + 1):
+            for tx in range(box[g, 0] >> SHIFT, (box[g, 1] >> SHIFT) + 1):
                 tile = ty * tiles_x + tx
                 at = cursor[tile]
                 cursor[tile] = at + 1
@@ -34,8 +42,8 @@ def count_tiles(box, visible, tiles_x, per_tile, per_surfel):  # type: ignore[no
     for g in range(box.shape[0]):
         n = 0
         if visible[g]:
-            for ty in range(box[g, 2] // TILE, box[g, 3] // TILE + 1):
-                for tx in range(box[g, 0] // TILE, box[g, 1] // TILE + 1):
+            for ty in range(box[g, 2] >> SHIFT, (box[g, 3] >> SHIFT) + 1):
+                for tx in range(box[g, 0] >> SHIFT, (box[g, 1] >> SHIFT) + 1):
                     per_tile[ty * tiles_x + tx] += 1
                     n += 1
         per_surfel[g] = n

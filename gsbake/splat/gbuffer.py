@@ -51,5 +51,5 @@ def picture(out: Rendered, view: TrainView, tables: LightTables | None) -> Tenso
     g = (flat[:, index] / alpha.clamp_min(ALPHA_SHADED)).T
     normal = g[:, 5:8] * torch.rsqrt((g[:, 5:8] ** 2).sum(1, keepdim=True).clamp_min(1e-12))
     rgb = shade(normal, view_directions(view, index), g[:, :3], g[:, 3], g[:, 4], tables)
-    image = torch.zeros(h * w, 3).index_copy(0, index, linear_to_srgb(rgb) * alpha[:, None])
+    image = torch.zeros(h * w, 3, device=alpha.device).index_copy(0, index, linear_to_srgb(rgb) * alpha[:, None])
     return image.T.reshape(3, h, w)

@@ -14,7 +14,8 @@ import torch
 from numba import njit
 from torch import Tensor
 
-from gsbake.splat.kernel import FAST
+from gsbake.splat import losses
+from gsbake.splat.blocks import FAST
 from gsbake.splat.projection import Pinhole
 from gsbake.splat.threads import run_chunks
 
@@ -145,7 +146,9 @@ class _Colour(torch.autograd.Function):
 
 
 def colour(image: Tensor, target: Tensor, ssim_share: float) -> Tensor:
-    """(1 − λ) L1 + λ (1 − SSIM) of sRGB images (3, h, w) float32; gradient to `image` only."""
+    """(1 − λ) L1 + λ (1 − SSIM) of sRGB images (3, h, w) float32; gradient to `image` only. On a GPU the PyTorch twin runs."""
+    if image.is_cuda:
+        return losses.colour(image, target, ssim_share)
     return torch.Tensor(_Colour.apply(image, target, ssim_share))
 
 
@@ -230,5 +233,8 @@ class _Normal(torch.autograd.Function):
 
 
 def normal_consistency(depth: Tensor, alpha: Tensor, normals: Tensor, mask: Tensor, R: Tensor, view: Pinhole) -> Tensor:
-    """Mean over `mask` of (Σw − Σw n · n_depth): blended world normals (3, h, w) against those of the expected depth (h, w)."""
+    """Mean over `mask` of (Σw − Σw n · n_depth): blended world normals (3, h, w) against those of the expected depth (h, w). On a GPU
+    the PyTorch twin runs."""
+    if depth.is_cuda:
+        return losses.normal_consistency(normals, alpha, losses.depth_normals(depth, R, view), mask)
     return torch.Tensor(_Normal.apply(depth, alpha, normals, mask, R, view))

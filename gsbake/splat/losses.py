@@ -13,7 +13,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from gsbake.splat.projection import Pinhole
-from gsbake.splat.transfer import median_target
+from gsbake.splat.transfer import Transfer
 
 #: Projection errors above this (unit frame) are other surfaces, not error.
 PROJECTION_RANGE = 0.1
@@ -48,10 +48,10 @@ def colour(image: Tensor, target: Tensor, ssim_share: float) -> Tensor:
     return loss + ssim_share * (1 - ssim(image, target)) if ssim_share else loss
 
 
-def median_sharpness(sdf: Tensor, gamma: Tensor) -> Tensor:
-    """relu(target(median |s|) − γ); the median is detached."""
+def median_sharpness(sdf: Tensor, gamma: Tensor, transfer: Transfer) -> Tensor:
+    """relu(target(median |s|) − γ) with the transfer's target; the median is detached."""
     median = float(sdf.detach().abs().median()) if len(sdf) else 1.0
-    return F.relu(median_target(max(median, 1e-6)) - gamma).sum()
+    return F.relu(transfer.median_target(max(median, 1e-6)) - gamma).sum()
 
 
 def projection(
@@ -81,8 +81,8 @@ def projection(
 def depth_normals(depth: Tensor, R: Tensor, view: Pinhole) -> Tensor:
     """World normals (3, h, w) of a z-depth map (h, w) by central differences of back-projected pixels, facing the camera; zero at the
     frame."""
-    x = (torch.arange(view.width, dtype=depth.dtype) + 0.5 - view.cx) / view.fx
-    y = (torch.arange(view.height, dtype=depth.dtype) + 0.5 - view.cy) / view.fy
+    x = (torch.arange(view.width, dtype=depth.dtype, device=depth.device) + 0.5 - view.cx) / view.fx
+    y = (torch.arange(view.height, dtype=depth.dtype, device=depth.device) + 0.5 - view.cy) / view.fy
     p = torch.stack([depth * x, depth * y[:, None], depth])
     du = p[:, 1:-1, 2:] - p[:, 1:-1, :-2]
     dv = p[:, 2:, 1:-1] - p[:, :-2, 1:-1]

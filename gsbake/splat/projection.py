@@ -19,7 +19,8 @@ import torch
 from numba import njit
 from torch import Tensor
 
-from gsbake.splat.kernel import ALPHA_MIN, FAST
+from gsbake.splat.blocks import FAST
+from gsbake.splat.kernel import ALPHA_MIN
 from gsbake.splat.threads import run_chunks
 
 #: |cos| between ray and plane below which a surfel counts as edge-on and is skipped.
@@ -27,6 +28,10 @@ EDGE_ON = 1e-3
 #: Coefficients are clamped to this: a surfel far smaller than a pixel is all low-pass anyway.
 COEF_MAX = np.float32(1e8)
 NEAR_Z = np.float32(0.02)
+#: Scales (unit frame) below this count as this; the quaternion's squared length likewise, below which it has no gradient.
+SCALE_MIN, QUATERNION_MIN = np.float32(1e-12), np.float32(1e-30)
+#: A surfel of this scale or more (or of none that is a number) is skipped: its square no longer fits a float32.
+SCALE_MAX = np.float32(1e18)
 
 _JIT: dict[str, Any] = {"nogil": True, "fastmath": FAST, "error_model": "numpy", "cache": True}
 
@@ -46,7 +51,7 @@ class Pinhole:
 @njit(**_JIT)
 def _axes(q0, q1, q2, q3):  # type: ignore[no-untyped-def]
     """Rotation matrix of a (w, x, y, z) quaternion of any length, row-major."""
-    n = np.float32(1.0) / np.sqrt(max(q0 * q0 + q1 * q1 + q2 * q2 + q3 * q3, np.float32(1e-30)))
+    n = np.float32(1.0) / np.sqrt(max(q0 * q0 + q1 * q1 + q2 * q2 + q3 * q3, QUATERNION_MIN))
     w, x, y, z = q0 * n, q1 * n, q2 * n, q3 * n
     two = np.float32(2.0)
     one = np.float32(1.0)
@@ -98,8 +103,10 @@ def _forward(lo, hi, mu, quat, log_scale, opacity, rot, t, fx, fy, cx, cy, width
         if cull and h > np.float32(0.0):
             continue
         su, sv = np.exp(log_scale[i, 0]), np.exp(log_scale[i, 1])
+        if not (su < SCALE_MAX and sv < SCALE_MAX):
+            continue
         k = c2 / h
-        ku, kv = k / max(su, np.float32(1e-12)), k / max(sv, np.float32(1e-12))
+        ku, kv = k / max(su, SCALE_MIN), k / max(sv, SCALE_MIN)
         xc, yc = fx * c0 / c2 + cx, fy * c1 / c2 + cy
         geo[i, 0], geo[i, 1] = xc, yc
         geo[i, 2] = min(max(ku * (b1 * c2 - b2 * c1) / fx, -COEF_MAX), COEF_MAX)
@@ -151,7 +158,8 @@ def _backward(lo, hi, mu, quat, log_scale, rot, t, fx, fy, visible, geo, g_geo, 
             n0, n1, n2 = t1 * b2 - t2 * b1, t2 * b0 - t0 * b2, t0 * b1 - t1 * b0
             h = n0 * c0 + n1 * c1 + n2 * c2
             k = c2 / h
-            isu, isv = np.exp(-log_scale[i, 0]), np.exp(-log_scale[i, 1])
+            su, sv = np.exp(log_scale[i, 0]), np.exp(log_scale[i, 1])
+            isu, isv = np.float32(1.0) / max(su, SCALE_MIN), np.float32(1.0) / max(sv, SCALE_MIN)
             ifx, ify = np.float32(1.0) / fx, np.float32(1.0) / fy
             g0, g1 = g_geo[i, 0], g_geo[i, 1]
             # a clamped coefficient passes no gradient
@@ -205,6 +213,8 @@ def _backward(lo, hi, mu, quat, log_scale, rot, t, fx, fy, visible, geo, g_geo, 
             g_pose[9] += gc0
             g_pose[10] += gc1
             g_pose[11] += gc2
+        if not qn * qn * QUATERNION_MIN < np.float32(0.99):
+            qn = np.float32(0.0)
         two = np.float32(2.0)
         # d R / d unit quaternion, columns T = (r00, r10, r20), B = (r01, r11, r21), N = (r02, r12, r22)
         dw = two * (qz * (gr10 - gr01) + qy * (gn_0 - gr20) + qx * (gr21 - gn_1))

@@ -1,6 +1,7 @@
 """Differentiable rasterisation of surfels: sort, bin and blend around the Numba kernel, as one autograd function.
 
-`render` is the one entry the rest of gsbake uses; `gsbake.splat.reference` is its readable twin.
+`render` is the one entry the rest of gsbake uses; `gsbake.splat.reference` is its readable twin. Tensors on a GPU go to
+`gsbake.splat.cuda`.
 """
 
 from __future__ import annotations
@@ -104,18 +105,30 @@ def render(
     pinhole: Pinhole,
     normals_as_features: bool = True,
     cull_backfaces: bool = False,
+    triton: bool | None = None,
 ) -> Rendered:
-    """Render surfels (float32, CPU): position (n, 3), quaternion (n, 4) as (w, x, y, z), log_scale (n, 2), opacity (n,), features (n, c).
+    """Render surfels: position (n, 3), quaternion (n, 4) as (w, x, y, z), log_scale (n, 2), opacity (n,), features (n, c); float32, all
+    on one device.
 
     `rotation` (3, 3) and `translation` (3,) are world→camera (OpenCV axes); gradients flow to them too. With `normals_as_features`
-    the world normals are blended as three more channels behind the given ones.
+    the world normals are blended as three more channels behind the given ones. `triton` chooses the kernels: by default the GPU's for
+    tensors on a GPU; they take tensors on the CPU only where Triton interprets (TRITON_INTERPRET=1).
     """
-    geo, normal, box, visible = Project.apply(position, quaternion, log_scale, opacity, rotation, translation, pinhole, cull_backfaces)
+    blend: Any = _Blend.apply
+    project: Any = Project.apply
+    if position.is_cuda if triton is None else triton:
+        from gsbake.splat.cuda.blend import Blend
+        from gsbake.splat.cuda.projection import project
+
+        blend = Blend.apply
+    geo, normal, box, visible = project(position, quaternion, log_scale, opacity, rotation, translation, pinhole, cull_backfaces)
     if geo.requires_grad:
         geo.retain_grad()
     if normals_as_features:
         features = torch.cat([features, normal], 1)
     stats: dict[str, Tensor] = {}
-    out = _Blend.apply(geo, opacity, features, box, visible, pinhole.width, pinhole.height, stats)
+    out = blend(geo, opacity, features, box, visible, pinhole.width, pinhole.height, stats)
     c = features.shape[1]
-    return Rendered(out[:c], out[c], out[c + 1], out[c + 4], out[c + 5].detach(), normal, visible, geo, stats)
+    # One split: taking the planes out one by one costs autograd a zero-filled copy of all of them each.
+    blended, depth, distortion, _, alpha, median = out.split([c, 1, 1, 2, 1, 1])
+    return Rendered(blended, depth[0], distortion[0], alpha[0], median[0].detach(), normal, visible, geo, stats)

@@ -71,7 +71,7 @@ def prune_and_densify(surfels: Surfels, posed: PosedPhotos, refine: Any, max_siz
     gap = torch.from_numpy(spacing(surfels.position.numpy().astype(float)).astype(np.float32))
     median_gap = float(gap.median())
     rules = {
-        "transparent": surfels.opacity() < OPACITY_FLOOR,
+        "transparent": surfels.opacity() < OPACITY_FLOOR * surfels.transfer.peak,
         "unseen": best < SEEN_WEIGHT,
         "outside the silhouettes": outside >= 2,
         "far from the zero set": (distance > refine.prune_distance * median_gap) & (best >= SEEN_WEIGHT) & (distance < 1.0),
@@ -105,6 +105,7 @@ def _fill(surfels: Surfels, share: float, seed: int) -> Surfels:
     same_side = (one.normal() * other.normal()).sum(1) > 0.3
     one, other = one.select(same_side.nonzero()[:, 0]), other.select(same_side.nonzero()[:, 0])
     others = other.tensors()
-    middle = Surfels.of({k: v if k in ("gamma", "quaternion") else (v + others[k]) / 2 for k, v in one.tensors().items()})
+    blended = {k: v if k in ("gamma", "quaternion") else (v + others[k]) / 2 for k, v in one.tensors().items()}
+    middle = Surfels.of(blended, one.transfer)
     middle.position = middle.position - middle.sdf[:, None] * middle.normal()
     return middle

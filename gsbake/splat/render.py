@@ -9,7 +9,6 @@ import torch
 from numpy.typing import NDArray
 
 from gsbake.capture.cameras import Camera
-from gsbake.pipeline.errors import UsageError
 from gsbake.splat.gbuffer import picture, rasterise
 from gsbake.splat.surfels import Surfels
 from gsbake.splat.views import TrainView, pose_of
@@ -26,15 +25,13 @@ class SurfelRenderer:
 
     @staticmethod
     def load(folder: Path, device: str = "cpu") -> SurfelRenderer:
-        """Load `surfels.safetensors` and, when it is there, `light.safetensors`; the rasteriser runs on the "cpu"."""
-        if device != "cpu":
-            raise UsageError(f"the rasteriser runs on the CPU in this version, not on {device!r}: use --device cpu.")
+        """Load `surfels.safetensors` and, when it is there, `light.safetensors`; the rasteriser runs on `device` ("cpu" or "cuda")."""
         light = None
         if (folder / "light.safetensors").exists():
             from gsbake.light.environment import EnvironmentLight
 
-            light = EnvironmentLight.load(folder / "light.safetensors")
-        return SurfelRenderer(Surfels.load(folder / "surfels.safetensors"), light)
+            light = EnvironmentLight.load(folder / "light.safetensors").to(device)
+        return SurfelRenderer(Surfels.load(folder / "surfels.safetensors").to(device), light)
 
     @torch.no_grad()
     def gbuffer(self, camera: Camera) -> dict[str, Image]:
@@ -43,7 +40,7 @@ class SurfelRenderer:
         "alpha"; "depth" (expected z-depth, alpha-normalised, 0 = none); "median_depth"; "normal" (unit frame, unit length, not
         flipped); and with materials "albedo" (linear), "roughness", "metallic", else "colour" (sRGB from this camera).
         """
-        view = _view(camera)
+        view = _view(camera, self.surfels.position.device)
         out = rasterise(self.surfels, view)
         alpha = out.alpha.clamp_min(1e-6)
         n = torch.nn.functional.normalize(out.features[-3:], dim=0, eps=1e-6)
@@ -55,17 +52,17 @@ class SurfelRenderer:
             planes |= {"albedo": features[..., :3], "roughness": features[..., 3], "metallic": features[..., 4]}
         else:
             planes["colour"] = features[..., :3].clamp(0, 1)
-        return {k: np.ascontiguousarray(v.numpy(), np.float32) for k, v in planes.items()}
+        return {k: np.ascontiguousarray(v.cpu().numpy(), np.float32) for k, v in planes.items()}
 
     @torch.no_grad()
     def photo(self, camera: Camera) -> tuple[Image, Image]:
         """Premultiplied sRGB picture (h, w, 3) and alpha (h, w) as training sees them."""
-        view = _view(camera)
+        view = _view(camera, self.surfels.position.device)
         out = rasterise(self.surfels, view)
         tables = None if self.light is None else self.light.prefilter()  # type: ignore[attr-defined]
-        return picture(out, view, tables).permute(1, 2, 0).numpy(), out.alpha.numpy()
+        return picture(out, view, tables).permute(1, 2, 0).cpu().numpy(), out.alpha.cpu().numpy()
 
 
-def _view(camera: Camera) -> TrainView:
+def _view(camera: Camera, device: torch.device) -> TrainView:
     r, t, centre, pinhole = pose_of(camera)
-    return TrainView(camera.name, torch.empty(0), None, r, t, centre, pinhole)
+    return TrainView(camera.name, torch.empty(0), None, r, t, centre, pinhole).to(device)

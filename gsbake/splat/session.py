@@ -31,10 +31,10 @@ class Session:
         configure(ctx.threads)
         settings = ctx.settings
         with ctx.part("load photos"):
-            full, half = load_views(posed, settings.train.max_size)
+            full, half = ([view.to(ctx.device) for view in views] for views in load_views(posed, settings.train.max_size))
         held = held_out(len(full), settings.train.holdout)
         plan = Plan(settings.train, settings.splat, settings.loss, iterations, coarse_share, densify, ctx.seed)
-        self.trainer = Trainer(plan, surfels, light, full, half, held)
+        self.trainer = Trainer(plan, surfels.to(ctx.device), None if light is None else light.to(ctx.device), full, half, held)
         self.before = len(surfels)
         self._resume()
 

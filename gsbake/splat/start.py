@@ -1,4 +1,4 @@
-"""Where surfels start: SfM points, the visual hull of the masks, or a sphere.
+"""Where surfels start: stereo points with the visual hull in their holes, SfM points, the visual hull of the masks, or a sphere.
 
 DSDF starts from a sphere of radius 1.1 (Zhu et al. 2025); a start near the surface needs far fewer steps.
 """
@@ -6,6 +6,7 @@ DSDF starts from a sphere of radius 1.1 (Zhu et al. 2025); a start near the surf
 from __future__ import annotations
 
 import math
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,8 @@ from gsbake.splat.surfels import Surfels, create
 
 Floats = NDArray[np.float64]
 SPHERE_RADIUS = 1.1
+#: SDF sample of surfels on stereo points: how far they may be off (unit frame).
+STEREO_SDF = 0.002
 
 
 def fibonacci_sphere(count: int) -> Floats:
@@ -67,19 +70,23 @@ def _unit(v: Floats) -> Floats:
     return np.asarray(v / np.maximum(np.linalg.norm(v, axis=-1, keepdims=True), 1e-12))
 
 
-def begin(posed: PosedPhotos, train: Any, splat: Any, seed: int) -> tuple[Surfels, str, str]:
-    """Surfels to start from, the source taken ("hull", "points", "sphere") and the evidence for it.
+def begin(posed: PosedPhotos, train: Any, splat: Any, seed: int, stereo: Path | None = None) -> tuple[Surfels, str, str]:
+    """Surfels to start from, the source taken ("stereo", "hull", "points", "sphere") and the evidence for it.
 
-    `train` and `splat` are the profile's sections. With "auto" the hull wins when every photo has a mask, then SfM points (200 or
-    more), then the sphere.
+    `train` and `splat` are the profile's sections, `stereo` is the folder of the stereo stage. With "auto" stereo wins where it found
+    enough points, then the hull when every photo has a mask, then SfM points (200 or more), then the sphere.
     """
+    if train.init in ("auto", "stereo") and stereo is not None:
+        begun = _from_stereo(posed, train, splat, seed, stereo)
+        if begun is not None:
+            return begun
     cloud = posed.points()
     n_points = 0 if cloud is None else len(cloud[0])
     kind = train.init
     why = "asked for by the profile"
-    if kind == "auto":
+    if kind in ("auto", "stereo"):
         kind = "hull" if posed.has_masks else "points" if n_points >= 200 else "sphere"
-        why = f"{'all' if posed.has_masks else 'not all'} photos have masks, {n_points} SfM points"
+        why = f"no stereo points; {'all' if posed.has_masks else 'not all'} photos have masks, {n_points} SfM points"
     if kind == "hull" and not posed.has_masks:
         kind, why = "sphere", "a hull was asked for, but not every photo has a mask"
     if kind == "points" and n_points < 10:
@@ -104,4 +111,23 @@ def begin(posed: PosedPhotos, train: Any, splat: Any, seed: int) -> tuple[Surfel
         points = SPHERE_RADIUS * fibonacci_sphere(train.init_surfels)
         normals, colours, sdf = points / SPHERE_RADIUS, None, 0.2
     gap = np.minimum(spacing(points), 0.3)
-    return create(points, normals, gap, colours, splat.shading, splat.sh_degree, sdf, 1.0), kind, why
+    return create(points, normals, gap, colours, splat.shading, splat.sh_degree, sdf, 1.0, splat.transfer), kind, why
+
+
+def _from_stereo(posed: PosedPhotos, train: Any, splat: Any, seed: int, folder: Path) -> tuple[Surfels, str, str] | None:
+    """Surfels on the stereo points and on the hull in their holes, or None when stereo found too few."""
+    from gsbake.capture.hull import visual_hull
+    from gsbake.stereo.start import start_points
+
+    hull = visual_hull(posed) if posed.has_masks else None
+    begun = start_points(posed, folder, hull, min(train.init_surfels, splat.max_surfels), seed)
+    if begun is None:
+        return None
+    points, normals, colours = begun.points, begun.normals, begun.colours
+    filled = len(points) - begun.stereo
+    if filled:
+        colours[begun.stereo :] = _sample_colours(posed, points[begun.stereo :], normals[begun.stereo :])
+    gap = np.minimum(spacing(points), 0.3)
+    why = f"{begun.stereo} evenly spread stereo points, {filled} hull points in their holes"
+    # One sample for all: at the starting sharpness of 1 every one of them is opaque.
+    return create(points, normals, gap, colours, splat.shading, splat.sh_degree, STEREO_SDF, 1.0, splat.transfer), "stereo", why

@@ -17,11 +17,12 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from gsbake.splat.reference import rotation_matrix
-from gsbake.splat.transfer import opacity
+from gsbake.splat.transfer import DEFAULT, Transfer, named
 
 #: Start values of roughness (.27) and metallic (.05) before the sigmoid. A smooth start lets reflections teach the light at once; from the
 #: paper's .646 the light stays a blur and the surfaces stay rough (docs/decisions/0003-smooth-start.md).
 ROUGHNESS_START, METALLIC_START = -1.0, -3.0
+FORMAT = "gsbake surfels 1"
 SH0 = 0.28209479177387814  # Y_00
 SH1 = 0.4886025119029199  # Y_1m
 
@@ -31,7 +32,7 @@ class Surfels:
     """All surfels of a scene; tensors have the surfel count n as first dimension, in the unit frame.
 
     `position` (n, 3), `quaternion` (n, 4) as (w, x, y, z), `log_scale` (n, 2), `sdf` (n,), `attributes`: "sh" (n, (degree+1)², 3) or
-    "albedo" (n, 3), "roughness" (n,), "metallic" (n,) before the sigmoid; `gamma` (1,).
+    "albedo" (n, 3), "roughness" (n,), "metallic" (n,) before the sigmoid; `gamma` (1,); `transfer` turns sdf and gamma into opacity.
     """
 
     position: Tensor
@@ -40,6 +41,7 @@ class Surfels:
     sdf: Tensor
     gamma: Tensor
     attributes: dict[str, Tensor]
+    transfer: Transfer
 
     def __len__(self) -> int:
         return self.position.shape[0]
@@ -51,7 +53,7 @@ class Surfels:
 
     def opacity(self) -> Tensor:
         """Opacity (n,) from the SDF samples."""
-        return opacity(self.sdf, self.gamma)
+        return self.transfer.opacity(self.sdf, self.gamma)
 
     def normal(self) -> Tensor:
         """Oriented unit normals (n, 3)."""
@@ -68,15 +70,15 @@ class Surfels:
         return own | {f"attributes.{k}": v for k, v in self.attributes.items()}
 
     @staticmethod
-    def of(tensors: dict[str, Tensor]) -> Surfels:
-        """The surfels whose `tensors()` these are."""
+    def of(tensors: dict[str, Tensor], transfer: Transfer) -> Surfels:
+        """The surfels whose `tensors()` and transfer these are."""
         attributes = {k.removeprefix("attributes."): v for k, v in tensors.items() if k.startswith("attributes.")}
-        return Surfels(attributes=attributes, **{k: v for k, v in tensors.items() if "." not in k})
+        return Surfels(attributes=attributes, transfer=transfer, **{k: v for k, v in tensors.items() if "." not in k})
 
     def joined(self, more: Surfels) -> Surfels:
-        """These surfels, then `more`; the sharpness stays this one's."""
+        """These surfels, then `more`; sharpness and transfer stay this one's."""
         other = more.tensors()
-        return Surfels.of({k: v if k == "gamma" else torch.cat([v, other[k]]) for k, v in self.tensors().items()})
+        return Surfels.of({k: v if k == "gamma" else torch.cat([v, other[k]]) for k, v in self.tensors().items()}, self.transfer)
 
     def features(self, camera_centre: Tensor) -> Tensor:
         """What is blended per surfel: rgb (n, 3) seen from `camera_centre` (3,), or base colour, roughness, metallic (n, 5)."""
@@ -101,19 +103,26 @@ class Surfels:
         """The surfels at `index` (indices or a mask)."""
         return Surfels(
             self.position[index], self.quaternion[index], self.log_scale[index], self.sdf[index], self.gamma,
-            {k: v[index] for k, v in self.attributes.items()},
+            {k: v[index] for k, v in self.attributes.items()}, self.transfer,
         )  # fmt: skip
 
+    def to(self, device: str | torch.device) -> Surfels:
+        """The surfels with all tensors on `device`."""
+        return Surfels.of({k: v.to(device) for k, v in self.tensors().items()}, self.transfer)
+
     def save(self, path: Path) -> None:
-        """Write as safetensors."""
-        save_file({k: v.detach().contiguous().cpu() for k, v in self.tensors().items()}, str(path), {"format": "gsbake surfels 1"})
+        """Write as safetensors; the transfer is named in the metadata unless it is the default."""
+        # one key for both: with several their order in the file is by chance, and its digest with it
+        kind = FORMAT if self.transfer.name == DEFAULT else f"{FORMAT}, {self.transfer.name}"
+        save_file({k: v.detach().contiguous().cpu() for k, v in self.tensors().items()}, str(path), {"format": kind})
 
     @staticmethod
     def load(path: Path) -> Surfels:
-        """Read what `save` wrote."""
+        """Read what `save` wrote; BadInputError for a transfer this version does not know."""
         with safe_open(str(path), "pt") as file:
             all_ = {k: file.get_tensor(k) for k in file.keys()}  # noqa: SIM118 (safetensors has no iterator)
-        return Surfels.of(all_)
+            kind = (file.metadata() or {}).get("format", FORMAT)
+        return Surfels.of(all_, named(kind.removeprefix(FORMAT).removeprefix(", ") or DEFAULT))
 
 
 def quaternion_to(normals: Tensor) -> Tensor:
@@ -134,6 +143,7 @@ def create(
     sh_degree: int,
     sdf: float,
     gamma: float,
+    transfer: str = DEFAULT,
 ) -> Surfels:
     """New surfels at points (n, 3) with unit normals (n, 3), neighbour distance `spacing` (n,) and sRGB colours (n, 3) in 0..1 or
     None (grey)."""
@@ -155,4 +165,4 @@ def create(
         attributes = {"sh": sh}
     # σ of .6 neighbour distances: discs overlap without smearing
     log_scale = torch.from_numpy(np.log(0.6 * np.maximum(spacing, 1e-5)).astype(np.float32))[:, None].repeat(1, 2)
-    return Surfels(position, quaternion_to(normal), log_scale, torch.full((n,), sdf), torch.tensor([gamma]), attributes)
+    return Surfels(position, quaternion_to(normal), log_scale, torch.full((n,), sdf), torch.tensor([gamma]), attributes, named(transfer))

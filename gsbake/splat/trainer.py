@@ -17,6 +17,7 @@ from torch import Tensor
 from gsbake.splat import image_loss, losses
 from gsbake.splat.adam import Adam
 from gsbake.splat.adapt import Statistics, densify, prune
+from gsbake.splat.finite import broken
 from gsbake.splat.gbuffer import picture, rasterise
 from gsbake.splat.raster import Rendered
 from gsbake.splat.surfels import Surfels
@@ -57,7 +58,7 @@ class Trainer:
         self.used = [i for i in range(len(views)) if i not in set(held)]
         self.adam = Adam()
         self.generator = torch.Generator().manual_seed(plan.seed)
-        self.stats = Statistics.zeros(len(surfels))
+        self.stats = Statistics.zeros(len(surfels), surfels.position.device)
         self.start_count = len(surfels)
         self.done = 0
         self.end = plan.iterations
@@ -84,7 +85,7 @@ class Trainer:
         photo, mask = view.colour(), view.cover()
         if mask is None or not self.masked:
             return photo, None, self.background[:, None, None]
-        background = torch.rand(3, generator=self.generator)[:, None, None]
+        background = torch.rand(3, generator=self.generator).to(photo.device)[:, None, None]
         return photo * mask + background * (1 - mask), mask, background
 
     def _loss(self, out: Rendered, view: TrainView, tables: Any) -> tuple[Tensor, Tensor]:
@@ -111,7 +112,7 @@ class Trainer:
             if w.distortion:
                 total = total + w.distortion * out.distortion.mean()
             if w.median:
-                total = total + w.median * losses.median_sharpness(s.sdf, s.gamma)
+                total = total + w.median * losses.median_sharpness(s.sdf, s.gamma, s.transfer)
             if w.projection:
                 total = total + w.projection * losses.projection(
                     s.position, out.normal, s.sdf, out.visible, depth, view.R, view.t, view.pinhole
@@ -149,7 +150,10 @@ class Trainer:
         loss.backward()
         value = float(loss.detach())
         if not math.isfinite(value):
-            raise FloatingPointError(f"the loss became {value} at step {self.done} on photo {view.name}")
+            lights = {} if self.light is None else {f"light.{k}": p for k, p in self.light.named_parameters()}
+            what = broken(leaves | lights)
+            blame = "" if what is None else f": {what} is not finite"
+            raise FloatingPointError(f"the loss became {value} at step {self.done} on photo {view.name}{blame}")
         rates = self.rates()
         with torch.no_grad():
             grad = out.screen.grad
@@ -158,7 +162,7 @@ class Trainer:
                 self.stats.add(grad, out.stats["touched"], max(view.pinhole.width, view.pinhole.height))
             for name, x in leaves.items():
                 if x.grad is not None:
-                    self.adam.step(name, x, torch.nan_to_num_(x.grad, 0.0, 0.0, 0.0), rates[name])
+                    self._update(name, x, rates[name], leaves)
                 x.requires_grad_(False)
             self.surfels.gamma.clamp_min_(1e-3)
             if self.light is not None:
@@ -168,6 +172,18 @@ class Trainer:
         self.done += 1
         self._adapt()
         return {"loss": value, "colour": float(colour.detach()), "surfels": float(len(self.surfels))}
+
+    def _update(self, name: str, x: Tensor, rate: float, leaves: dict[str, Tensor]) -> None:
+        """One optimiser update; what is not finite is named, the cause (a tensor still to come, as it was in the picture) before its
+        effect."""
+        assert x.grad is not None
+        try:
+            self.adam.step(name, x, x.grad, rate)
+        except FloatingPointError as effect:
+            names = list(leaves)
+            cause = broken({k: leaves[k] for k in names[names.index(name) + 1 :]})
+            blame = f"{cause} is not finite: " if cause else ""
+            raise FloatingPointError(f"{blame}{effect} (step {self.done})") from effect
 
     # -- adding and dropping ------------------------------------------------------------------------------------------------------
 
@@ -184,7 +200,7 @@ class Trainer:
         kept = Statistics(self.stats.gradient[keep], self.stats.views[keep], self.stats.weight[keep])
         large = float(self.surfels.scale.max(1).values.median()) if len(self.surfels) else 0.01
         self.surfels = densify(self.surfels, self.adam, kept, budget, large, self.generator)
-        self.stats = Statistics.zeros(len(self.surfels))
+        self.stats = Statistics.zeros(len(self.surfels), self.surfels.position.device)
 
     # -- quality ------------------------------------------------------------------------------------------------------------------
 
@@ -236,7 +252,7 @@ class Trainer:
 
     def restore(self, state: dict[str, Any]) -> None:
         """Go on from what `state` returned."""
-        self.surfels = Surfels.of(state["surfels"])
+        self.surfels = Surfels.of(state["surfels"], self.surfels.transfer)
         self.adam.load(state["adam"])
         self.generator.set_state(state["generator"])
         if self.light is not None:

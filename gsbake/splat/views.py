@@ -33,6 +33,12 @@ class TrainView:
     centre: Tensor
     pinhole: Pinhole
 
+    def to(self, device: str | torch.device) -> TrainView:
+        """The view with all tensors on `device`."""
+        mask = None if self.mask is None else self.mask.to(device)
+        rgb, r, t, c = (x.to(device) for x in (self.rgb, self.R, self.t, self.centre))
+        return TrainView(self.name, rgb, mask, r, t, c, self.pinhole)
+
     def colour(self) -> Tensor:
         """Photo as sRGB floats (3, h, w) in 0..1."""
         return self.rgb.float() / 255

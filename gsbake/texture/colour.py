@@ -20,6 +20,18 @@ def decode_bytes(coded: NDArray[np.uint8]) -> NDArray[np.float32]:
     return np.asarray(LINEAR[coded], np.float32)
 
 
+def decode(coded: NDArray[Any]) -> NDArray[np.float32]:
+    """Linear float32 values of sRGB `coded` in 0..1."""
+    value = np.asarray(coded, np.float32)
+    return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4).astype(np.float32)
+
+
+def encode(linear: NDArray[Any]) -> NDArray[np.float32]:
+    """sRGB values in 0..1 of linear values (clipped to 0..1)."""
+    value = np.clip(np.asarray(linear, np.float32), 0, 1)
+    return np.where(value <= 0.0031308, 12.92 * value, 1.055 * value ** (1 / 2.4) - 0.055).astype(np.float32)
+
+
 def encode_bytes(linear: NDArray[Any]) -> NDArray[np.uint8]:
     """8-bit sRGB codes of linear values (clipped to 0..1), rounded to nearest."""
     value = np.clip(np.asarray(linear, np.float64), 0, 1)

@@ -1,0 +1,89 @@
+"""How far the float32 kernels are from the float64 twin, over scales and fields of view; writes the table into docs/numerics.md.
+
+python -m benchmarks.numerics [--doc docs/numerics.md]
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import sys
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from gsbake.splat.projection import Pinhole
+from gsbake.splat.raster import render
+from gsbake.splat.reference import render_reference
+
+SCALES = (1e-8, 1e-4, 1e-2, 1e-1, 1.0, 1e4)
+FIELDS = (1.0, 20.0, 50.0, 90.0, 150.0, 170.0)
+SURFELS, WIDTH, HEIGHT, SEEDS = 60, 61, 47, 3
+PLANES = ("features", "depth", "alpha", "distortion")
+BEGIN, END = "<!-- table: begin -->", "<!-- table: end -->"
+
+
+def scene(scale: float, field: float, seed: int) -> tuple[list[Tensor], Pinhole]:
+    """Surfels that fill the frame whatever the field of view, float64; scale is against a unit frame at distance 3."""
+    g = torch.Generator().manual_seed(seed)
+    depth = 2.5 + torch.rand(SURFELS, generator=g, dtype=torch.float64)
+    half = math.tan(math.radians(field) / 2)
+    across = (2 * torch.rand(SURFELS, 2, generator=g, dtype=torch.float64) - 1) * half * depth[:, None]
+    position = torch.cat([across, depth[:, None]], 1)
+    quaternion = torch.tensor([1.0, 0, 0, 0], dtype=torch.float64) + 0.4 * torch.randn(SURFELS, 4, generator=g, dtype=torch.float64)
+    log_scale = math.log(scale) + 0.3 * torch.randn(SURFELS, 2, generator=g, dtype=torch.float64)
+    opacity = 0.1 + 0.85 * torch.rand(SURFELS, generator=g, dtype=torch.float64)
+    features = torch.rand(SURFELS, 3, generator=g, dtype=torch.float64)
+    focal = WIDTH / 2 / half
+    inputs = [position, quaternion, log_scale, opacity, features, torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64)]
+    # what float32 can say is the scene: its rounding is not the kernels' error
+    return [x.float().double() for x in inputs], Pinhole(WIDTH, HEIGHT, focal, 1.1 * focal, 0.45 * WIDTH, 0.6 * HEIGHT)
+
+
+def errors(scale: float, field: float) -> tuple[float, float, float]:
+    """Relative RMS error of the colours, share of pixels off by more than 1e-4 of the brightest, worst RMS of the other planes."""
+    colour, off, other = [], [], []
+    for seed in range(SEEDS):
+        inputs, view = scene(scale, field, seed)
+        with torch.no_grad():
+            fast = render(*(x.float() for x in inputs), view, normals_as_features=False)
+            slow = render_reference(*inputs, view)
+        for k in PLANES:
+            a, b = getattr(fast, k).double(), slow[k]
+            if not float(b.abs().max()):
+                continue
+            relative = float((a - b).norm() / b.norm())
+            (colour if k == "features" else other).append(relative)
+            if k == "features":
+                off.append(float(((a - b).abs() > 1e-4 * b.abs().max()).any(0).double().mean()))
+    return max(colour, default=0.0), max(off, default=0.0), max(other, default=0.0)
+
+
+def table() -> str:
+    """The markdown table over the grid."""
+    lines = ["| scale | " + " | ".join(f"{f:g}°" for f in FIELDS) + " |", "|---" * (len(FIELDS) + 1) + "|"]
+    for scale in SCALES:
+        cells = []
+        for field in FIELDS:
+            colour, off, other = errors(scale, field)
+            cells.append(f"{colour:.0e} · {other:.0e} · {100 * off:.2g} %")
+        lines.append(f"| {scale:g} | " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
+def main() -> None:
+    """Measure and write the table between its markers."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--doc", type=Path, default=Path(__file__).parent.parent / "docs" / "numerics.md")
+    args = parser.parse_args()
+    made = table()
+    sys.stdout.write(made + "\n")
+    text = args.doc.read_text(encoding="utf-8")
+    head, _, rest = text.partition(BEGIN)
+    tail = rest.partition(END)[2]
+    args.doc.write_text(f"{head}{BEGIN}\n{made}\n{END}{tail}", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

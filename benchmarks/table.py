@@ -1,0 +1,162 @@
+"""One table of what a training step costs: forward, backward and the whole step over sizes, and ratios that carry over between machines.
+
+python -m benchmarks.table [--surfels 10000,50000,200000] [--sizes 256,512,800] [--channels 3,10] [--csv benchmarks/results/raster.csv]
+
+Every time is the median of a few rounds, in milliseconds. `x copy` is its ratio to a plain numpy copy of the bytes that the pass reads
+and writes at the least (surfels, planes, gradients; the optimiser's state in a step). The PyTorch twin blends one surfel after the other
+over whole images, so it is only asked for a small scene of its own, the first rows (`x twin`: the twin's time over ours).
+
+The step is the trainer's own on one photo, in the middle of a run (full resolution, all losses on): with the smallest channel count it
+trains colours (3 channels and the normal), with a larger one materials under an environment light (5 and the normal).
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import statistics
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from benchmarks.raster import sphere
+from gsbake.light.environment import EnvironmentLight
+from gsbake.profile.schema import Profile
+from gsbake.splat.raster import render
+from gsbake.splat.reference import render_reference
+from gsbake.splat.surfels import create
+from gsbake.splat.threads import configure, thread_count
+from gsbake.splat.trainer import Plan, Trainer
+from gsbake.splat.views import TrainView
+
+RESULTS = Path(__file__).parent / "results" / "raster.csv"
+COLUMNS = ("surfels", "size", "channels", "pass", "ms", "x_copy", "x_twin", "threads")
+SMALL = (500, 64, 3)
+
+
+def median_ms(call: Callable[[], float], repeats: int) -> float:
+    """Median of what `call` measured, in milliseconds, after two rounds to warm up."""
+    return statistics.median([1e3 * call() for _ in range(repeats + 2)][2:])
+
+
+def copy_ms(size: int, repeats: int) -> float:
+    """Milliseconds of a numpy copy of this many bytes."""
+    source, target = np.ones(size // 4, np.float32), np.zeros(size // 4, np.float32)
+
+    def once() -> float:
+        start = time.perf_counter()
+        np.copyto(target, source)
+        return time.perf_counter() - start
+
+    return median_ms(once, max(9, repeats))
+
+
+def passes(surfels: int, size: int, channels: int, repeats: int, twin: bool = False) -> tuple[float, float]:
+    """Milliseconds of forward and of backward on the sphere of `benchmarks.raster`, of the kernels or of the twin."""
+    inputs, pinhole, rotation, translation = sphere(surfels, channels, size)
+    inputs = [x.requires_grad_() for x in inputs]
+    forward, backward = [], []
+    for _ in range(repeats + 1):
+        start = time.perf_counter()
+        if twin:
+            planes = render_reference(*inputs, rotation, translation, pinhole)
+        else:
+            out = render(*inputs, rotation, translation, pinhole, normals_as_features=False)
+            planes = {k: getattr(out, k) for k in ("features", "depth", "distortion", "alpha")}
+        forward.append(1e3 * (time.perf_counter() - start))
+        loss = planes["features"].sum() + planes["depth"].sum() + planes["distortion"].sum() + planes["alpha"].sum()
+        start = time.perf_counter()
+        loss.backward()
+        backward.append(1e3 * (time.perf_counter() - start))
+        for x in inputs:
+            x.grad = None
+    return statistics.median(forward[1:]), statistics.median(backward[1:])
+
+
+def step_ms(surfels: int, size: int, materials: bool, repeats: int) -> tuple[float, int]:
+    """Milliseconds of the trainer's step on a photo of noise, and the number of floats it optimises."""
+    inputs, pinhole, rotation, translation = sphere(surfels, 3, size)
+    points = inputs[0].numpy()
+    spacing = np.full(surfels, float(inputs[2][0, 0].exp()))
+    iterations = 1_000_000
+    profile = Profile.model_validate({"train": {"iterations": iterations, "max_size": size}, "splat": {"max_surfels": surfels}})
+    photo = torch.randint(0, 256, (3, size, size), generator=torch.Generator().manual_seed(0), dtype=torch.uint8)
+    mask = torch.full((size, size), 255, dtype=torch.uint8)
+    view = TrainView("noise", photo, mask, rotation, translation, -rotation.T @ translation, pinhole)
+    state = create(points, points, spacing, None, "pbr" if materials else "colour", 1, 0.01, 20.0)
+    plan = Plan(profile.train, profile.splat, profile.loss, iterations, 0.0, False, 0)
+    trainer = Trainer(plan, state, EnvironmentLight(profile.splat.env_size) if materials else None, [view], [view], [])
+    trainer.done = iterations // 2
+
+    def once() -> float:
+        start = time.perf_counter()
+        trainer.step()
+        return time.perf_counter() - start
+
+    return median_ms(once, repeats), sum(x.numel() for x in state.tensors().values())
+
+
+def least_bytes(surfels: int, size: int, channels: int) -> tuple[int, int]:
+    """Bytes that forward and backward read or write at the least: surfels, output planes, their gradients."""
+    surfel, pixels = 4 * surfels * (10 + channels), 4 * size * size
+    return surfel + pixels * (channels + 6), 2 * surfel + pixels * (2 * channels + 9)
+
+
+def rows(surfels: int, size: int, channels: int, materials: bool, repeats: int) -> list[dict[str, object]]:
+    """The three rows of one cell of the table."""
+    forward, backward = passes(surfels, size, channels, repeats)
+    step, state = step_ms(surfels, size, materials, repeats)
+    read, back = least_bytes(surfels, size, channels)
+    cell = {"surfels": surfels, "size": size, "channels": channels, "x_twin": "", "threads": thread_count()}
+    figures = (("forward", forward, read), ("backward", backward, back), ("step", step, read + back + 16 * state))
+    return [cell | {"pass": k, "ms": round(ms, 2), "x_copy": round(ms / copy_ms(b, repeats), 1)} for k, ms, b in figures]
+
+
+def small_rows() -> list[dict[str, object]]:
+    """The small scene with the twin's time beside ours."""
+    ours, twin = passes(*SMALL, repeats=9), passes(*SMALL, repeats=2, twin=True)
+    cell = {"surfels": SMALL[0], "size": SMALL[1], "channels": SMALL[2], "threads": thread_count()}
+    made = []
+    for name, ms, slow, size in zip(("forward", "backward"), ours, twin, least_bytes(*SMALL), strict=True):
+        made.append(cell | {"pass": name, "ms": round(ms, 2), "x_copy": round(ms / copy_ms(size, 9), 1), "x_twin": round(slow / ms, 1)})
+    return made
+
+
+def line(row: dict[str, object]) -> str:
+    """One row of the printed table."""
+    return "".join(str(row[c]).rjust(max(9, len(c) + 2)) for c in COLUMNS) + "\n"
+
+
+def main() -> None:
+    """Measure, print as it goes, write the CSV."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    for name, values in (("surfels", "10000,50000,200000"), ("sizes", "256,512,800"), ("channels", "3,10")):
+        parser.add_argument(f"--{name}", type=lambda s: [int(v) for v in s.split(",")], default=[int(v) for v in values.split(",")])
+    parser.add_argument("--repeats", type=int, default=9)
+    parser.add_argument("--threads", type=int, default=thread_count(), help="kernel threads (default: as many as torch would use)")
+    parser.add_argument("--csv", type=Path, default=RESULTS)
+    args = parser.parse_args()
+    configure(args.threads)
+    sys.stdout.write(line({c: c.replace("_", " ") for c in COLUMNS}))
+    table = small_rows()
+    sys.stdout.writelines(line(row) for row in table)
+    for surfels in args.surfels:
+        for size in args.sizes:
+            for channels in args.channels:
+                made = rows(surfels, size, channels, channels > min(args.channels), args.repeats)
+                sys.stdout.writelines(line(row) for row in made)
+                sys.stdout.flush()
+                table += made
+    args.csv.parent.mkdir(parents=True, exist_ok=True)
+    with args.csv.open("w", newline="") as file:
+        writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(table)
+
+
+if __name__ == "__main__":
+    main()

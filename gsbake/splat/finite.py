@@ -1,0 +1,19 @@
+"""Naming what is not finite: a NaN is found where it costs nothing (the optimiser's own pass) and then looked for by name."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+
+def broken(tensors: Mapping[str, Tensor | None]) -> str | None:
+    """The first of the named tensors that holds a NaN or an infinity, as "name (row 17)"; None when all are finite."""
+    for name, x in tensors.items():
+        if x is None or not x.numel():
+            continue
+        bad = ~torch.isfinite(x.detach()).reshape(x.shape[0] if x.ndim else 1, -1).all(1)
+        if bool(bad.any()):
+            return f"{name} (row {int(bad.nonzero()[0, 0])})"
+    return None

@@ -1,0 +1,21 @@
+"""The kernels' error against the float64 twin stays small over the corners of the grid of docs/numerics.md."""
+
+from __future__ import annotations
+
+import pytest
+
+from benchmarks.numerics import FIELDS, SCALES, errors
+
+
+@pytest.mark.parametrize("field", [FIELDS[0], FIELDS[2], FIELDS[-1]])
+@pytest.mark.parametrize("scale", [SCALES[0], SCALES[3], SCALES[-1]])
+def test_corners(scale: float, field: float) -> None:
+    colour, off, other = errors(scale, field)
+    assert 0 < colour < 1e-4 and off < 1e-3 and other < 2e-3
+
+
+@pytest.mark.stress
+@pytest.mark.parametrize("field", FIELDS)
+@pytest.mark.parametrize("scale", SCALES)
+def test_whole_grid(scale: float, field: float) -> None:
+    assert 0 < errors(scale, field)[0] < 1e-4

@@ -1,0 +1,143 @@
+"""Training that has no answer: it ends all the same, finite and within its memory; the same seed gives the same bits."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+
+import numpy as np
+import psutil
+import pytest
+import torch
+
+from gsbake.light.environment import EnvironmentLight
+from gsbake.profile.schema import Profile
+from gsbake.splat import threads
+from gsbake.splat.finite import broken
+from gsbake.splat.projection import Pinhole
+from gsbake.splat.start import fibonacci_sphere, spacing
+from gsbake.splat.surfels import create
+from gsbake.splat.trainer import Plan, Trainer
+from gsbake.splat.views import TrainView
+
+SIZE = 24
+STEPS = int(os.environ.get("GSBAKE_SOAK_STEPS", "20000"))
+KINDS = ("random photos", "contradictory poses", "all black", "all white", "one view", "empty masks")
+MOST_SURFELS = 400
+
+
+@pytest.fixture
+def one_thread_after() -> Iterator[None]:
+    before, configured = torch.get_num_threads(), threads._configured
+    yield
+    torch.set_num_threads(before)
+    threads._configured = configured
+
+
+def pose(eye: np.ndarray) -> tuple[torch.Tensor, torch.Tensor]:
+    z = -eye / np.linalg.norm(eye)
+    x = np.cross(z, [0.1, 0.2, 1.0])
+    x /= np.linalg.norm(x)
+    rotation = np.stack([x, np.cross(z, x), z])
+    return torch.tensor(rotation, dtype=torch.float32), torch.tensor(-rotation @ eye, dtype=torch.float32)
+
+
+def views(kind: str, size: int) -> list[TrainView]:
+    """Eight photos of nothing that a scene could explain."""
+    g = torch.Generator().manual_seed(1)
+    made = []
+    eyes = fibonacci_sphere(8) * 2.5
+    photo = torch.randint(0, 256, (3, size, size), generator=g, dtype=torch.uint8)
+    for i, eye in enumerate(eyes[:1] if kind == "one view" else eyes):
+        if kind == "random photos":
+            photo = torch.randint(0, 256, (3, size, size), generator=g, dtype=torch.uint8)
+        value = {"all black": 0, "all white": 255}.get(kind)
+        rgb = photo if value is None else torch.full_like(photo, value)
+        mask = torch.full((size, size), 0 if kind == "empty masks" else 255, dtype=torch.uint8)
+        # contradictory: the same photo is said to be taken from everywhere, from inside the object too
+        r, t = pose(eye * (0.2 if kind == "contradictory poses" and i % 2 else 1.0))
+        f = 1.1 * size
+        made.append(TrainView(f"{i}", rgb, mask, r, t, -r.T @ t, Pinhole(size, size, f, f, size / 2, size / 2)))
+    return made
+
+
+def trainer(kind: str, steps: int, shading: str = "colour", seed: int = 0) -> Trainer:
+    p = Profile.model_validate(
+        {
+            "train": {"iterations": steps, "max_size": SIZE, "holdout": 0, "early_stop": False, "lr_position": 5e-3},
+            "splat": {"max_surfels": MOST_SURFELS, "env_size": 4},
+        }
+    )
+    points = fibonacci_sphere(200)
+    surfels = create(0.7 * points, points, 0.7 * spacing(points), None, shading, 1, 0.1, 5.0)
+    light = EnvironmentLight(4) if shading == "pbr" else None
+    plan = Plan(p.train, p.splat, p.loss, steps, 0.3, True, seed)
+    return Trainer(plan, surfels, light, views(kind, SIZE), views(kind, SIZE // 2), [])
+
+
+def soak(kind: str, shading: str, steps: int) -> None:
+    t = trainer(kind, steps, shading)
+    process, base = psutil.Process(), 0
+    while t.done < t.end:
+        t.step()
+        assert len(t.surfels) <= MOST_SURFELS
+        if t.done == steps // 10:
+            base = process.memory_info().rss
+    assert t.done == steps
+    assert broken(t.surfels.tensors()) is None
+    assert broken({"image": torch.tensor(t.evaluate())}) is None
+    assert process.memory_info().rss - base < 200e6
+
+
+@pytest.mark.parametrize("shading", ["colour", "pbr"])
+@pytest.mark.parametrize("kind", KINDS)
+def test_short_soak(kind: str, shading: str) -> None:
+    soak(kind, shading, 60)
+
+
+@pytest.mark.stress
+@pytest.mark.timeout(0)
+@pytest.mark.parametrize("shading", ["colour", "pbr"])
+@pytest.mark.parametrize("kind", KINDS)
+def test_long_soak(kind: str, shading: str) -> None:
+    """GSBAKE_SOAK_STEPS steps of each kind (20 000 when unset)."""
+    soak(kind, shading, STEPS)
+
+
+def final(count: int, shading: str, steps: int) -> dict[str, torch.Tensor]:
+    threads.configure(count)
+    t = trainer("random photos", steps, shading)
+    while t.done < t.end:
+        t.step()
+    return t.surfels.tensors() | ({} if t.light is None else dict(t.light.state_dict()))
+
+
+@pytest.mark.usefixtures("one_thread_after")
+@pytest.mark.parametrize("shading", ["colour", "pbr"])
+def test_same_seed_same_bits(shading: str) -> None:
+    first, again, other = (final(n, shading, 120) for n in (2, 2, 1))
+    assert all(torch.equal(v, again[k]) for k, v in first.items())
+    # one thread or two: agreement to rounding is what is promised
+    assert all(torch.allclose(v, other[k], rtol=1e-4, atol=1e-5) for k, v in first.items())
+
+
+@pytest.mark.parametrize("bad", [float("nan"), float("inf")])
+@pytest.mark.parametrize("name", ["position", "quaternion", "log_scale", "sdf", "gamma", "attributes.sh"])
+def test_training_names_what_is_not_finite(name: str, bad: float) -> None:
+    t = trainer("random photos", 50)
+    t.step()
+    x = t.surfels.tensors()[name]
+    x.view(-1)[x.numel() // 2] = bad
+    with pytest.raises(FloatingPointError, match=name.replace(".", r"\.")):
+        for _ in range(8):
+            t.step()
+
+
+def test_training_names_a_bad_light() -> None:
+    t = trainer("random photos", 50, "pbr")
+    t.step()
+    with torch.no_grad():
+        next(iter(t.light.parameters())).view(-1)[3] = float("nan")
+    with pytest.raises(FloatingPointError, match="raw"):
+        for _ in range(8):
+            t.step()
