@@ -80,7 +80,7 @@ def test_second_run_is_cached(baked: tuple[Path, Path]) -> None:
     capture, out = baked
     before = (out / "asset.glb").read_bytes()
     said = json.loads(gsbake("run", capture, "--profile", "smoke", "--out", out, "--json").stdout)
-    assert len(said["stages"]) == 8 and {s["status"] for s in said["stages"]} == {"cached"}
+    assert len(said["stages"]) == 9 and {s["status"] for s in said["stages"]} == {"cached"}
     assert (out / "asset.glb").read_bytes() == before
 
 
