@@ -66,6 +66,10 @@ def run(ctx: Context) -> dict[str, Any]:
     from gsbake.texture.normals import normal_map
 
     settings = ctx.settings.bake
+    if settings.materials == "surfels" and not (ctx.inputs["refine"] / "light.safetensors").exists():
+        raise BadInputError(
+            'bake: bake.materials is "surfels", but the surfels learnt none; set splat.shading to "pbr" or bake.materials to "fit".'
+        )
     vertices, faces = _mesh(ctx, "mesh.ply")
     surface = _unwrap(ctx, vertices, faces)
     texels = surface.texels
@@ -80,11 +84,10 @@ def run(ctx: Context) -> dict[str, Any]:
     with ctx.part("occlusion"):
         open_share = _occlusion(ctx, surface, dense, detail)
     with ctx.part("projection"):
-        fits = ctx.settings.splat.shading == "pbr" and settings.fit_steps > 0
-        own = ctx.settings.splat.shading == "pbr" and not fits
+        own = settings.materials == "surfels"
         blended = _project_materials(ctx, surface) if own else _project_photos(ctx, surface)
     fit: dict[str, Any] = {}
-    if fits:
+    if settings.materials == "fit":
         with ctx.part("fit"):
             blended, fit = _fit_materials(ctx, surface, blended, detail, open_share)
     with ctx.part("flood"):
@@ -356,7 +359,7 @@ STAGE = Stage(
     title="Textures",
     run=run,
     needs=("poses", "refine", "mesh"),
-    settings=("bake.*", "splat.shading", "splat.env_size", "train.max_size", "train.holdout"),
+    settings=("bake.*", "splat.env_size", "train.max_size", "train.holdout"),
     uses_device=True,
     seeded=True,
 )

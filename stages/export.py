@@ -51,7 +51,7 @@ def run(ctx: Context) -> dict[str, Any]:
         data = build_glb(mesh, images, "asset", f"gsbake {gsbake.__version__}", settings.copyright, extras)
         (ctx.out / "asset.glb").write_bytes(data)
         (ctx.out / "cameras.json").write_text(json.dumps(transforms_json(cameras, frame, _sources(ctx)), indent=1))
-        if ctx.settings.splat.shading == "pbr":
+        if ctx.settings.bake.materials != "none":
             _write_light(ctx, frame)
     with ctx.part("previews"):
         _write_previews(ctx, sheets, mesh)
@@ -129,7 +129,7 @@ def _extras(ctx: Context, cameras: CameraSet, mesh: GltfMesh, sheets: Sheets) ->
 
     chosen = ctx.settings
     return {
-        "profile": {"shading": chosen.splat.shading, "texture_size": chosen.bake.size, "normal_map": chosen.bake.normal_map},
+        "profile": {"materials": chosen.bake.materials, "texture_size": chosen.bake.size, "normal_map": chosen.bake.normal_map},
         "scale": "metres" if cameras.metric else "unknown",
         "poses": cameras.poses,
         "digests": {
@@ -185,5 +185,5 @@ STAGE = Stage(
     title="Asset",
     run=run,
     needs=("ingest", "poses", "refine", "bake"),
-    settings=("export.*", "splat.shading", "bake.size", "bake.normal_map"),
+    settings=("export.*", "bake.materials", "bake.size", "bake.normal_map"),
 )

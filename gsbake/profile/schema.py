@@ -126,13 +126,16 @@ class Bake(Section):
     normal_map: bool = Field(True, description="Bake a tangent-space normal map from the undecimated surface.")
     occlusion_rays: int = Field(64, ge=0, description="Rays per texel for ambient occlusion; 0 leaves it out.")
     equalise: bool = Field(True, description="Solve for one exposure gain per photo and channel before photos are fused into the base colour.")
-    fit_steps: int = Field(400, ge=0, description="Steps of fitting materials and light to the photos in texture space; 0 takes the surfels' own (splat.shading = pbr).")
+    materials: Literal["none", "fit", "surfels"] = Field(
+        "none", description="none: colours only; fit: materials and light fitted to the photos in texture space; surfels: those the surfels learnt (splat.shading = pbr)."
+    )
+    fit_steps: int = Field(400, ge=1, description="Steps of fitting materials and light in texture space.")
     fit_size: int = Field(800, ge=16, description="Longer side in pixels of the photos that materials are fitted to.")
     smooth_prior: float = Field(0.03, ge=0, description="Neighbouring texels have the same material.")
     dark_prior: float = Field(0.02, ge=0, description="What a reflection explains is not paint; also settles how bright the light is.")
     metal_prior: float = Field(0.003, ge=0, description="Most things are not metal.")
     white_prior: float = Field(0.005, ge=0, description="Most light is white.")
-    roughness: Fraction = Field(0.8, description="Roughness of the whole asset when only colours were trained (splat.shading = colour).")
+    roughness: Fraction = Field(0.8, description="Roughness of the whole asset without materials (bake.materials = none).")
 
 
 class Export(Section):
