@@ -76,10 +76,6 @@ def run(ctx: Context) -> dict[str, Any]:
     ctx.check_stop()
     with ctx.part("normals"):
         dense, detail = _detail(ctx, surface)
-        tangent = texels.interpolate(surface.tangent, surface.atlas.faces)
-        coded = normal_map(detail, texels.interpolate(surface.normal, surface.atlas.faces), tangent)
-        if not settings.normal_map:
-            coded[:] = (0.5, 0.5, 1.0)
     ctx.check_stop()
     with ctx.part("occlusion"):
         open_share = _occlusion(ctx, surface, dense, detail)
@@ -89,7 +85,11 @@ def run(ctx: Context) -> dict[str, Any]:
     fit: dict[str, Any] = {}
     if settings.materials == "fit":
         with ctx.part("fit"):
-            blended, fit = _fit_materials(ctx, surface, blended, detail, open_share)
+            blended, detail, fit = _fit_materials(ctx, surface, blended, detail, open_share)
+    tangent = texels.interpolate(surface.tangent, surface.atlas.faces)
+    coded = normal_map(detail, texels.interpolate(surface.normal, surface.atlas.faces), tangent)
+    if not settings.normal_map:
+        coded[:] = (0.5, 0.5, 1.0)
     with ctx.part("flood"):
         if not blended.seen.any():
             raise BadInputError("bake: no photo sees the mesh; poses and mesh do not belong together, run from the poses stage again.")
@@ -255,8 +255,8 @@ def _project_photos(ctx: Context, surface: Surface) -> Blended:
 
 def _fit_materials(
     ctx: Context, surface: Surface, shown: Blended, detail: Detail, open_share: NDArray[np.float32]
-) -> tuple[Blended, dict[str, Any]]:
-    """Base colour, roughness, metallic (n, 5) fitted to the photos together with the light, which is written beside the textures.
+) -> tuple[Blended, Detail, dict[str, Any]]:
+    """Base colour, roughness, metallic (n, 5) and normals fitted to the photos with the light, which is written beside the textures.
 
     `shown` is what the photos show (n, 3): the fit starts from it, and where the fit works on a coarser texture it gives the fine detail.
     """
@@ -306,7 +306,9 @@ def _fit_materials(
     values[:, :3] *= coarse.detail(shown.values)
     known = coarse.up(fitted.weight[:, None])[:, 0] > LEAST_SEEN * (coarse.edge / footprint) ** 2
     figures: dict[str, Any] = {"fit_psnr": fitted.held_out, "fit_pixels": sum(map(len, photos)), "fit_texels": len(coarse.texels)}
-    return replace(shown, values=values, views=np.where(known, shown.views, 0)), figures
+    turned = detail.normal + np.where(known[:, None], coarse.up(fitted.bend), 0)
+    turned /= np.linalg.norm(turned, axis=1, keepdims=True)
+    return replace(shown, values=values, views=np.where(known, shown.views, 0)), replace(detail, normal=turned), figures
 
 
 def _project_materials(ctx: Context, surface: Surface) -> Blended:

@@ -13,6 +13,8 @@ How rough the object is at the start decides which light is found: a surface tak
 reflections end as paint; one taken for smooth blurs the light instead. So short trials from a few values compete on photos they were not
 fitted to, and the best goes on; from there every texel finds its own.
 
+Normals bend a little where reflections ask for it: meshes are smoother than the light is sharp.
+
 Munkberg et al., *Extracting triangular 3D models, materials, and lighting from images*, CVPR 2022, fit textures and a split-sum light
 together in this way; occlusion per texel and the view-wise weights are what a fixed mesh adds.
 """
@@ -42,8 +44,10 @@ Floats = NDArray[np.float32]
 TRIALS, TRIAL_STEPS, TRIAL_PIXELS, TRIAL_PHOTO = (0.2, 0.45, 0.8), 100, 15_000, 5
 #: Metallic that every texel starts from.
 METALLIC = 0.05
-#: Adam's rates of the texels' logits and of the light; both decay to a tenth.
-RATE, RATE_LIGHT = 0.15, 0.1
+#: Adam's rates of the texels' logits, of the light and of the normals' bends; all decay to a tenth.
+RATE, RATE_LIGHT, RATE_BEND = 0.15, 0.1, 0.01
+#: Prices on the square of a normal's bend and of its change between neighbouring texels of a texture of 512.
+FLAT, EVEN = 0.1, 60.0
 #: Adam's memory, and the gradient (of the loss per texel) below which it takes smaller steps: texels that one photo hardly sees.
 BETAS, STILL = (0.9, 0.99), 2e-3
 #: Logits start within this range of base colour.
@@ -64,10 +68,12 @@ class Priors:
 
 @dataclass(frozen=True)
 class Fitted:
-    """`values` (n, 5): linear base colour, roughness, metallic of each texel; `weight` (n,): what all photos together say about it (in
-    pixels); the `light` in the mesh's frame; PSNR in dB over the pixels of held-out photos (None without any)."""
+    """`values` (n, 5): linear base colour, roughness, metallic of each texel; `bend` (n, 3) to be added to its unit normal; `weight` (n,):
+    what all photos together say about it (in pixels); the `light` in the mesh's frame; PSNR in dB over the pixels of held-out photos (None
+    without any)."""
 
     values: Floats
+    bend: Floats
     weight: Floats
     light: EnvironmentLight
     held_out: float | None
@@ -94,11 +100,14 @@ class MaterialFit:
         logits[:, 3], logits[:, 4] = math.log(roughness / (1 - roughness)), math.log(METALLIC / (1 - METALLIC))
         self._logits = logits
         self._normal = torch.as_tensor(np.ascontiguousarray(normal, np.float32))
+        self._bend = torch.zeros(n, 3, requires_grad=True)
+        self._even = EVEN * (texels.size / 512) ** 2  # a slope per texel is steeper where texels are larger
         self._open = torch.as_tensor(np.ascontiguousarray(occlusion, np.float32))
         self._light = EnvironmentLight(light_size)
         self._priors = priors
         self._pairs = torch.as_tensor(_neighbours(texels))
         self._adam = torch.optim.Adam([self._logits.requires_grad_()], lr=RATE, betas=BETAS, eps=STILL)
+        self._adam_bend = torch.optim.Adam([self._bend], lr=RATE_BEND, betas=BETAS, eps=STILL)
         self._adam_light = torch.optim.Adam([self._light.raw], lr=RATE_LIGHT, betas=BETAS)
 
     def run(
@@ -119,11 +128,14 @@ class MaterialFit:
                 weight.index_add_(0, batch.texel[:, k], batch.share[:, k] * batch.weight)
         with torch.no_grad():
             values = torch.sigmoid(self._logits).numpy()
-        return Fitted(values, weight.numpy(), self._light, self._score([_Batch.of(p, self._normal, self._open) for p in held if len(p)]))
+        bend = self._bend.detach().numpy()
+        score = self._score([_Batch.of(p, self._normal, self._open) for p in held if len(p)])
+        return Fitted(values, bend, weight.numpy(), self._light, score)
 
     def _step(self, batch: _Batch, decay: float, generator: torch.Generator) -> None:
         values = torch.sigmoid(self._logits)
-        error = (linear_to_srgb(batch.shade(values, self._light.prefilter()).clamp_min(0)) - batch.colour).abs().mean(1)
+        shaded = batch.shade(values, self._bend, self._light.prefilter())
+        error = (linear_to_srgb(shaded.clamp_min(0)) - batch.colour).abs().mean(1)
         priors = self._priors
         loss = (error * batch.weight).mean()
         loss = loss + priors.dark * values[:, :3].mean() + priors.metal * values[:, 4].mean()
@@ -134,11 +146,14 @@ class MaterialFit:
             start = int(torch.randint(len(self._pairs) - count + 1, (1,), generator=generator))
             pair = self._pairs[start : start + count]
             loss = loss + priors.smooth * (values[pair[:, 0]] - values[pair[:, 1]]).abs().sum(1).mean()
-        for adam, rate in ((self._adam, RATE), (self._adam_light, RATE_LIGHT)):
+            loss = loss + self._even * ((self._bend[pair[:, 0]] - self._bend[pair[:, 1]]) ** 2).sum(1).mean()
+        loss = loss + FLAT * (self._bend**2).sum(1).mean()
+        for adam, rate in ((self._adam, RATE), (self._adam_bend, RATE_BEND), (self._adam_light, RATE_LIGHT)):
             adam.zero_grad()
             adam.param_groups[0]["lr"] = rate * decay
         (loss * len(values)).backward()
         self._adam.step()
+        self._adam_bend.step()
         self._adam_light.step()
 
     @torch.no_grad()
@@ -147,7 +162,7 @@ class MaterialFit:
         if not batches:
             return None
         values, tables = torch.sigmoid(self._logits), self._light.prefilter()
-        squares = torch.cat([((linear_to_srgb(b.shade(values, tables).clamp_min(0)) - b.colour) ** 2).mean(1) for b in batches])
+        squares = torch.cat([((linear_to_srgb(b.shade(values, self._bend, tables).clamp_min(0)) - b.colour) ** 2).mean(1) for b in batches])
         return -10 * math.log10(max(float(squares.mean()), 1e-10))
 
 
@@ -193,11 +208,12 @@ class _Batch:
         towards, colour, weight = (torch.as_tensor(x) for x in (pixels.towards, pixels.colour, pixels.weight))
         return cls(texel, share, towards, colour, weight, turned, shut)
 
-    def shade(self, values: Tensor, tables: LightTables) -> Tensor:
+    def shade(self, values: Tensor, bend: Tensor, tables: LightTables) -> Tensor:
         """Linear colours (n, 3) of the pixels when the texels have `values` (texels, 5)."""
         g = sum(values[self.texel[:, k]] * self.share[:, k, None] for k in range(4))
         assert isinstance(g, Tensor)
-        return shade(self.normal, self.towards, g[:, :3], g[:, 3], g[:, 4], tables, self.open)
+        turned = self.normal + sum(bend[self.texel[:, k]] * self.share[:, k, None] for k in range(4))
+        return shade(turned, self.towards, g[:, :3], g[:, 3], g[:, 4], tables, self.open)
 
 
 def _neighbours(texels: Texels) -> NDArray[np.int64]:

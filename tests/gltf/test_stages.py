@@ -266,9 +266,9 @@ def test_materials_and_light_of_a_relightable_asset(run: Path, tmp_path: Path, m
     towards = TO_WORLD.rotation.T @ np.array([0.8, 0, 0.6])  # world +x, a little above
     light = EnvironmentLight.from_function(lambda d: np.tile(np.maximum(d @ towards, 0)[:, None] ** 40, (1, 3)) + 0.01, 32)
     light.save(folder / "refine/light.safetensors")
-    pbr = Splat(shading="pbr")
-    bake.run(desk(bake.STAGE, folder, folder / "bake", splat=pbr, bake=Bake(size=SIZE, occlusion_rays=8, materials="surfels")))
-    result = export.run(desk(export.STAGE, folder, folder / "export", splat=pbr))
+    pbr = {"splat": Splat(shading="pbr"), "bake": Bake(size=SIZE, occlusion_rays=8, materials="surfels")}
+    bake.run(desk(bake.STAGE, folder, folder / "bake", **pbr))
+    result = export.run(desk(export.STAGE, folder, folder / "export", **pbr))
     assert result["audit_passed"] > 30
     asset = read_glb(folder / "export/asset.glb")
     p, texels, _ = unit_points(asset)

@@ -99,6 +99,19 @@ def test_paint_and_roughness_come_back(glossy: Scene) -> None:
     assert fitted.held_out is not None and fitted.held_out > 22
 
 
+def test_wrong_normals_bend_towards_what_reflections_show(glossy: Scene) -> None:
+    n, truth = len(glossy.texels), glossy.normal
+    lean = 0.15 * np.sin(3 * truth[:, 2:]) * np.array([0.3, -0.5, 0.8])
+    wrong = (truth + lean) / np.linalg.norm(truth + lean, axis=1, keepdims=True)
+    fit = MaterialFit(glossy.texels, wrong, np.ones(n), np.full((n, 3), 0.3), 16, FREE, 0.2)
+    fitted = fit.run(glossy.photos, [], 300, 0)
+    known = fitted.weight > 0.3
+    bent = wrong + fitted.bend
+    bent /= np.linalg.norm(bent, axis=1, keepdims=True)
+    error = [np.arccos(np.clip((x * truth).sum(1), -1, 1))[known].mean() for x in (wrong, bent)]
+    assert error[1] < 0.97 * error[0]  # coarse photos of a rather rough ball tell little; without bends the error would stay
+
+
 def test_trials_tell_smooth_from_rough(glossy: Scene) -> None:
     smooth = trial_roughness(glossy.fit, glossy.photos, 0)
     scene = Scene(0.85)
