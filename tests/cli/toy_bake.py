@@ -32,7 +32,7 @@ def _export(ctx: Context) -> dict[str, Any]:
     mesh = (ctx.inputs["mesh"] / "mesh.ply").read_text()
     (ctx.out / "asset.glb").write_text("glb " + mesh)
     (ctx.out / "cameras.json").write_text("{}")
-    if ctx.settings.splat.shading == "pbr":
+    if ctx.settings.bake.materials != "none":
         (ctx.out / "light.hdr").write_text("light")
     return {"megabytes": 1.5}
 
@@ -46,7 +46,7 @@ INGEST = Stage(
     "ingest", 1, "Reading photos", _ingest, sources=("photos", "masks", "poses"), settings=("ingest.min_photos", "ingest.invert_masks")
 )
 MESH = Stage("mesh", 1, "Meshing", _mesh, needs=("ingest",), settings=("mesh.faces",))
-EXPORT = Stage("export", 1, "Exporting", _export, needs=("mesh",), settings=("splat.shading",))
+EXPORT = Stage("export", 1, "Exporting", _export, needs=("mesh",), settings=("bake.materials",))
 REPORT = Stage("report", 1, "Reporting", _report, needs=("export",))
 
 REGISTRY = Registry({name: f"tests.cli.toy_bake:{name.upper()}" for name in ("ingest", "mesh", "export", "report")})
