@@ -271,8 +271,7 @@ def _fit_materials(
 
     settings = ctx.settings.bake
     posed = PosedPhotos.open(ctx.inputs["poses"])
-    sizes = [(c, min(1.0, settings.fit_size / max(c.width, c.height))) for c in posed.cameras.cameras]
-    cameras = [c.scaled(max(1, round(c.width * k)), max(1, round(c.height * k))) for c, k in sizes]
+    cameras = [camera.within(settings.fit_size) for camera in posed.cameras.cameras]
     footprint = pixel_footprint(cameras, surface.position.mean(0))
     coarse = Coarse.of(surface.atlas.uv, surface.atlas.faces, surface.texels, surface.texel, footprint)
     ctx.decide("materials fitted at", f"{coarse.texels.size} texels", f"a texel is {coarse.edge / footprint:.2f} pixels of the photos")
@@ -327,8 +326,7 @@ def _project_materials(ctx: Context, surface: Surface) -> Blended:
     size = ctx.settings.train.max_size
     for index, full in enumerate(posed.cameras.cameras):
         ctx.check_stop()
-        shrink = min(1.0, size / max(full.width, full.height))
-        camera = full.scaled(max(1, round(full.width * shrink)), max(1, round(full.height * shrink)))
+        camera = full.within(size)
         buffers = renderer.gbuffer(camera)
         image = np.dstack([buffers["albedo"], buffers["roughness"], buffers["metallic"]])
         solid = (buffers["alpha"] > SOLID).astype(np.uint8) * 255

@@ -88,11 +88,7 @@ def _choose(ctx: Context, posed: PosedPhotos, points: NDArray[np.float64]) -> tu
     from gsbake.surface.resolution import choose, pixel_footprint, surfel_spacing
 
     lower, upper = points.min(0), points.max(0)
-    size = ctx.settings.train.max_size
-    cameras = []
-    for camera in posed.cameras.cameras:
-        shrink = min(1.0, size / max(camera.width, camera.height))
-        cameras.append(camera.scaled(max(1, round(camera.width * shrink)), max(1, round(camera.height * shrink))))
+    cameras = [camera.within(ctx.settings.train.max_size) for camera in posed.cameras.cameras]
     settings = ctx.settings.mesh
     resolution = choose(
         float((upper - lower).max()),

@@ -85,6 +85,13 @@ class Camera:
             self, width=width, height=height, fx=self.fx * sx, fy=self.fy * sy, cx=self.cx * sx, cy=self.cy * sy
         )
 
+    def within(self, size: int) -> Camera:
+        """The same camera for the photo reduced so that its longer side has at most `size` pixels."""
+        longer = max(self.width, self.height)
+        if longer <= size:
+            return self
+        return self.scaled(max(1, round(self.width * size / longer)), max(1, round(self.height * size / longer)))
+
     def project(self, points: Array) -> tuple[Array, Array]:
         """Pixels (n, 2) and depths (n,) of points (n, 3), distortion ignored; depth ≤ 0 lies behind the camera."""
         cam = points @ self.R.T + self.t

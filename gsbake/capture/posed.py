@@ -56,14 +56,12 @@ class PosedPhotos:
         rgb = bgr[..., ::-1]
         mask_file = self.folder / "masks" / f"{camera.name}.png"
         mask = cv2.imread(str(mask_file), cv2.IMREAD_GRAYSCALE) if mask_file.exists() else None
-        longer = max(camera.width, camera.height)
-        if max_size is not None and longer > max_size:
-            width = max(1, round(camera.width * max_size / longer))
-            height = max(1, round(camera.height * max_size / longer))
-            rgb = cv2.resize(rgb, (width, height), interpolation=cv2.INTER_AREA)
+        reduced = camera if max_size is None else camera.within(max_size)
+        if reduced is not camera:
+            camera, size = reduced, (reduced.width, reduced.height)
+            rgb = cv2.resize(rgb, size, interpolation=cv2.INTER_AREA)
             if mask is not None:
-                mask = cv2.resize(mask, (width, height), interpolation=cv2.INTER_AREA)
-            camera = camera.scaled(width, height)
+                mask = cv2.resize(mask, size, interpolation=cv2.INTER_AREA)
         return View(
             camera, np.ascontiguousarray(rgb, np.uint8), None if mask is None else np.ascontiguousarray(mask, np.uint8)
         )

@@ -58,6 +58,12 @@ def vertex_normals(vertices: Vertices, faces: Faces) -> NDArray[np.float64]:
     return np.asarray(out / np.maximum(np.linalg.norm(out, axis=1, keepdims=True), 1e-20))
 
 
+def edges_of(faces: NDArray[Any]) -> NDArray[np.int64]:
+    """Each edge once, (e, 2), the smaller vertex first."""
+    pairs = np.sort(np.asarray(faces)[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1).astype(np.int64)
+    return np.unique(pairs[:, 0] << 32 | pairs[:, 1])[:, None] >> np.array([32, 0]) & 0xFFFFFFFF
+
+
 def follow_normals(
     vertices: Vertices, faces: Faces, target: NDArray[np.float64], trust: NDArray[np.float64], reach: float, limit: float
 ) -> Vertices:
@@ -71,9 +77,7 @@ def follow_normals(
     agree = (own * target).sum(1)
     trust = np.where(agree > 0.3, trust, 0.0)  # a normal that contradicts the surface belongs to another one
     normal = np.where((trust > 0)[:, None], target, own)
-    edges = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
-    keys = np.unique(edges[:, 0].astype(np.int64) * len(vertices) + edges[:, 1])
-    a, b = keys // len(vertices), keys % len(vertices)
+    a, b = edges_of(faces).T
     middle = normal[a] + normal[b]
     middle /= np.maximum(np.linalg.norm(middle, axis=1, keepdims=True), 1e-12)
     span = vertices[a] - vertices[b]
@@ -85,9 +89,9 @@ def follow_normals(
     strength = 1.5 * (reach / (2 * np.pi * np.maximum(length, 0.3 * typical))) ** 2 * np.minimum(trust[a], trust[b])
     tilt = (span * middle).sum(1)
     along_a, along_b = (normal[a] * middle).sum(1), (normal[b] * middle).sum(1)
-    n, rows = len(vertices), np.arange(len(keys))
+    n, rows = len(vertices), np.arange(len(a))
     slope = sparse.csr_matrix(
-        (np.concatenate([along_a, -along_b]), (np.concatenate([rows, rows]), np.concatenate([a, b]))), shape=(len(keys), n)
+        (np.concatenate([along_a, -along_b]), (np.concatenate([rows, rows]), np.concatenate([a, b]))), shape=(len(a), n)
     )
     weighted = sparse.diags(strength) @ slope
     system = (sparse.identity(n) + slope.T @ weighted).tocsr()

@@ -14,7 +14,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import Any
 
 import cv2
 import numpy as np
@@ -23,7 +22,7 @@ from numpy.typing import NDArray
 from scipy.sparse.linalg import LinearOperator, cg
 
 from gsbake.capture.cameras import Camera
-from gsbake.surface.normals import vertex_normals
+from gsbake.surface.normals import edges_of, vertex_normals
 from gsbake.surface.raycast import RayCaster
 
 Vertices = NDArray[np.float64]
@@ -64,12 +63,6 @@ class Polished:
     before: float
     after: float
     rims: int
-
-
-def edges_of(faces: NDArray[Any]) -> NDArray[np.int64]:
-    """Each edge once, (e, 2), the smaller vertex first."""
-    pairs = np.sort(np.asarray(faces)[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1).astype(np.int64)
-    return np.unique(pairs[:, 0] << 32 | pairs[:, 1])[:, None] >> np.array([32, 0]) & 0xFFFFFFFF
 
 
 def find_rims(caster: RayCaster, normals: Vertices, edges: NDArray[np.int64], camera: Camera, mask: NDArray[np.uint8]) -> Rims:

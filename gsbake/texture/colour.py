@@ -10,9 +10,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-_CODED = np.arange(256) / 255
+
+def _decoded(value: NDArray[Any]) -> NDArray[Any]:
+    return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
+
+
+def _encoded(value: NDArray[Any]) -> NDArray[Any]:
+    return np.where(value <= 0.0031308, 12.92 * value, 1.055 * value ** (1 / 2.4) - 0.055)
+
+
 #: Linear value of each 8-bit sRGB code.
-LINEAR = np.where(_CODED <= 0.04045, _CODED / 12.92, ((_CODED + 0.055) / 1.055) ** 2.4).astype(np.float32)
+LINEAR = _decoded(np.arange(256) / 255).astype(np.float32)
 
 
 def decode_bytes(coded: NDArray[np.uint8]) -> NDArray[np.float32]:
@@ -22,18 +30,14 @@ def decode_bytes(coded: NDArray[np.uint8]) -> NDArray[np.float32]:
 
 def decode(coded: NDArray[Any]) -> NDArray[np.float32]:
     """Linear float32 values of sRGB `coded` in 0..1."""
-    value = np.asarray(coded, np.float32)
-    return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4).astype(np.float32)
+    return np.asarray(_decoded(np.asarray(coded, np.float32)), np.float32)
 
 
 def encode(linear: NDArray[Any]) -> NDArray[np.float32]:
     """sRGB values in 0..1 of linear values (clipped to 0..1)."""
-    value = np.clip(np.asarray(linear, np.float32), 0, 1)
-    return np.where(value <= 0.0031308, 12.92 * value, 1.055 * value ** (1 / 2.4) - 0.055).astype(np.float32)
+    return np.asarray(_encoded(np.clip(np.asarray(linear, np.float32), 0, 1)), np.float32)
 
 
 def encode_bytes(linear: NDArray[Any]) -> NDArray[np.uint8]:
     """8-bit sRGB codes of linear values (clipped to 0..1), rounded to nearest."""
-    value = np.clip(np.asarray(linear, np.float64), 0, 1)
-    coded = np.where(value <= 0.0031308, 12.92 * value, 1.055 * value ** (1 / 2.4) - 0.055)
-    return np.asarray(np.rint(255 * coded), np.uint8)
+    return np.asarray(np.rint(255 * _encoded(np.clip(np.asarray(linear, np.float64), 0, 1))), np.uint8)

@@ -202,18 +202,20 @@ class _Batch:
     @classmethod
     def of(cls, pixels: Pixels, normal: Tensor, occlusion: Tensor) -> _Batch:
         texel, share = torch.as_tensor(pixels.texel), torch.as_tensor(pixels.share)
-        turned = sum(normal[texel[:, k]] * share[:, k, None] for k in range(4))
-        shut = sum(occlusion[texel[:, k]] * share[:, k] for k in range(4))
-        assert isinstance(turned, Tensor) and isinstance(shut, Tensor)
         towards, colour, weight = (torch.as_tensor(x) for x in (pixels.towards, pixels.colour, pixels.weight))
-        return cls(texel, share, towards, colour, weight, turned, shut)
+        return cls(texel, share, towards, colour, weight, _read(normal, texel, share), _read(occlusion[:, None], texel, share)[:, 0])
 
     def shade(self, values: Tensor, bend: Tensor, tables: LightTables) -> Tensor:
         """Linear colours (n, 3) of the pixels when the texels have `values` (texels, 5)."""
-        g = sum(values[self.texel[:, k]] * self.share[:, k, None] for k in range(4))
-        assert isinstance(g, Tensor)
-        turned = self.normal + sum(bend[self.texel[:, k]] * self.share[:, k, None] for k in range(4))
+        g = _read(values, self.texel, self.share)
+        turned = self.normal + _read(bend, self.texel, self.share)
         return shade(turned, self.towards, g[:, :3], g[:, 3], g[:, 4], tables, self.open)
+
+
+def _read(values: Tensor, texel: Tensor, share: Tensor) -> Tensor:
+    """`values` (texels, c) read bilinearly at the four texels and shares (n, 4) of each pixel: (n, c)."""
+    first, *others = (values[texel[:, k]] * share[:, k, None] for k in range(4))
+    return sum(others, first)
 
 
 def _neighbours(texels: Texels) -> NDArray[np.int64]:

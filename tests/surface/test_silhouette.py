@@ -10,9 +10,9 @@ import trimesh
 from numpy.typing import NDArray
 
 from gsbake.capture.cameras import Camera
-from gsbake.surface.normals import vertex_normals
+from gsbake.surface.normals import edges_of, vertex_normals
 from gsbake.surface.raycast import RayCaster
-from gsbake.surface.silhouette import REACH, Rims, edges_of, find_rims, polish, solve
+from gsbake.surface.silhouette import REACH, Rims, find_rims, polish, solve
 
 Masked = tuple[Camera, NDArray[np.uint8]]
 
