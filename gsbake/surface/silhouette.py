@@ -19,11 +19,11 @@ import cv2
 import numpy as np
 import scipy.sparse as sparse
 from numpy.typing import NDArray
-from scipy.sparse.linalg import LinearOperator, cg
 
 from gsbake.capture.cameras import Camera
 from gsbake.surface.normals import edges_of, vertex_normals
 from gsbake.surface.raycast import RayCaster
+from gsbake.surface.spread import spread
 
 Vertices = NDArray[np.float64]
 Faces = NDArray[np.int32]
@@ -136,16 +136,9 @@ def solve(rims: Rims, edges: NDArray[np.int64], count: int, reach: float) -> NDA
         (np.concatenate([1 - rims.share, rims.share]), (np.concatenate([rows, rows]), np.concatenate([rims.start, rims.end]))),
         shape=(len(rims), count),
     )
-    ones = np.ones(len(edges))
-    link = sparse.csr_matrix((ones, (edges[:, 0], edges[:, 1])), shape=(count, count))
-    link = link + link.T
-    umbrella = sparse.diags(np.asarray(link.sum(1)).ravel()) - link
     density = max(len(rims) / count, 1e-6)
-    system = (measure.T @ sparse.diags(weight) @ measure + density * reach**2 * umbrella + 1e-6 * sparse.identity(count)).tocsr()
-    right = measure.T @ (weight * rims.offset * rims.pixel)
-    inverse = 1.0 / system.diagonal()
-    found, _ = cg(system, right, rtol=1e-4, maxiter=400, M=LinearOperator(system.shape, matvec=lambda x: inverse * x.ravel()))
-    return np.asarray(found, np.float64)
+    data = measure.T @ sparse.diags(weight) @ measure + 1e-6 * sparse.identity(count)
+    return spread(data, measure.T @ (weight * rims.offset * rims.pixel), edges, density * reach**2)
 
 
 def polish(
