@@ -18,6 +18,10 @@ SCORE_GT ?= ../shared/captures/boombox/gt
 SCORE_ASSET ?= out/boombox/asset.glb
 SCORE_ARGS ?=
 
+# What `make bench` measures; ARGS go to every part (make bench PARTS=growth ARGS=--help).
+PARTS ?= table timeline growth
+ARGS ?=
+
 .PHONY: help setup demo test check bench stress score clean
 
 help: ## Show this
@@ -48,8 +52,8 @@ test: check ## Lint, types and the quick tests
 stress: setup ## The slow tests: hostile input at length, kills at random moments, whole bakes of development captures where present
 	$(BIN)/pytest -m "slow or stress"
 
-bench: setup ## Time rasteriser and training step, beside the PyTorch twin and a plain copy; writes benchmarks/results/raster.csv
-	$(BIN)/python -m benchmarks.table
+bench: setup ## Measure kernels, error against time (beside other tools) and growth, about two idle hours: PARTS="table timeline growth" ARGS=…
+	@for part in $(PARTS); do $(BIN)/python -m benchmarks.$$part $(ARGS) || exit 1; done
 
 score: .score/.stamp ## Score an asset against its truth: SCORE_GT=capture/gt SCORE_ASSET=asset.glb SCORE_ARGS=--no-render
 	.score/bin/python $(SCORE_DIR)/score.py $(SCORE_GT) $(SCORE_ASSET) $(SCORE_ARGS)

@@ -2,12 +2,14 @@
 
 python -m benchmarks.table [--surfels 10000,50000,200000] [--sizes 256,512,800] [--channels 3,10] [--csv benchmarks/results/raster.csv]
 
-Every time is the median of a few rounds, in milliseconds. `x copy` is its ratio to a plain numpy copy of the bytes that the pass reads
-and writes at the least (surfels, planes, gradients; the optimiser's state in a step). The PyTorch twin blends one surfel after the other
-over whole images, so it is only asked for a small scene of its own, the first rows (`x twin`: the twin's time over ours).
+Every time is the median of a few rounds, in milliseconds: CPU time with one thread, wall time with more. `x copy` is its ratio to a plain
+numpy copy of the bytes that the pass reads and writes at the least (surfels, planes, gradients; the optimiser's state in a step). The
+PyTorch twin blends one surfel after the other over whole images, so it is only asked for a small scene of its own, the first rows
+(`x twin`: the twin's time over ours).
 
-The step is the trainer's own on one photo, in the middle of a run (full resolution, all losses on): with the smallest channel count it
-trains colours (3 channels and the normal), with a larger one materials under an environment light (5 and the normal).
+The step is the trainer's own on one photo, in the middle of a run (full resolution, all losses on; see `benchmarks.step`): with the
+smallest channel count it trains colours (3 channels and the normal), with a larger one materials under an environment light (5 and the
+normal). `rest` is what of it is neither blending nor shading.
 """
 
 from __future__ import annotations
@@ -21,21 +23,21 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-import torch
 
 from benchmarks.raster import sphere
-from gsbake.light.environment import EnvironmentLight
-from gsbake.profile.schema import Profile
+from benchmarks.step import profile
 from gsbake.splat.raster import render
 from gsbake.splat.reference import render_reference
-from gsbake.splat.surfels import create
 from gsbake.splat.threads import configure, thread_count
-from gsbake.splat.trainer import Plan, Trainer
-from gsbake.splat.views import TrainView
 
 RESULTS = Path(__file__).parent / "results" / "raster.csv"
 COLUMNS = ("surfels", "size", "channels", "pass", "ms", "x_copy", "x_twin", "threads")
 SMALL = (500, 64, 3)
+
+
+def now() -> float:
+    """Seconds: of this process with one thread (others may share the processor), of the wall with more."""
+    return time.process_time() if thread_count() == 1 else time.perf_counter()
 
 
 def median_ms(call: Callable[[], float], repeats: int) -> float:
@@ -48,9 +50,9 @@ def copy_ms(size: int, repeats: int) -> float:
     source, target = np.ones(size // 4, np.float32), np.zeros(size // 4, np.float32)
 
     def once() -> float:
-        start = time.perf_counter()
+        start = now()
         np.copyto(target, source)
-        return time.perf_counter() - start
+        return now() - start
 
     return median_ms(once, max(9, repeats))
 
@@ -61,43 +63,25 @@ def passes(surfels: int, size: int, channels: int, repeats: int, twin: bool = Fa
     inputs = [x.requires_grad_() for x in inputs]
     forward, backward = [], []
     for _ in range(repeats + 1):
-        start = time.perf_counter()
+        start = now()
         if twin:
             planes = render_reference(*inputs, rotation, translation, pinhole)
         else:
             out = render(*inputs, rotation, translation, pinhole, normals_as_features=False)
             planes = {k: getattr(out, k) for k in ("features", "depth", "distortion", "alpha")}
-        forward.append(1e3 * (time.perf_counter() - start))
+        forward.append(1e3 * (now() - start))
         loss = planes["features"].sum() + planes["depth"].sum() + planes["distortion"].sum() + planes["alpha"].sum()
-        start = time.perf_counter()
+        start = now()
         loss.backward()
-        backward.append(1e3 * (time.perf_counter() - start))
+        backward.append(1e3 * (now() - start))
         for x in inputs:
             x.grad = None
     return statistics.median(forward[1:]), statistics.median(backward[1:])
 
 
-def step_ms(surfels: int, size: int, materials: bool, repeats: int) -> tuple[float, int]:
-    """Milliseconds of the trainer's step on a photo of noise, and the number of floats it optimises."""
-    inputs, pinhole, rotation, translation = sphere(surfels, 3, size)
-    points = inputs[0].numpy()
-    spacing = np.full(surfels, float(inputs[2][0, 0].exp()))
-    iterations = 1_000_000
-    profile = Profile.model_validate({"train": {"iterations": iterations, "max_size": size}, "splat": {"max_surfels": surfels}})
-    photo = torch.randint(0, 256, (3, size, size), generator=torch.Generator().manual_seed(0), dtype=torch.uint8)
-    mask = torch.full((size, size), 255, dtype=torch.uint8)
-    view = TrainView("noise", photo, mask, rotation, translation, -rotation.T @ translation, pinhole)
-    state = create(points, points, spacing, None, "pbr" if materials else "colour", 1, 0.01, 20.0)
-    plan = Plan(profile.train, profile.splat, profile.loss, iterations, 0.0, False, 0)
-    trainer = Trainer(plan, state, EnvironmentLight(profile.splat.env_size) if materials else None, [view], [view], [])
-    trainer.done = iterations // 2
-
-    def once() -> float:
-        start = time.perf_counter()
-        trainer.step()
-        return time.perf_counter() - start
-
-    return median_ms(once, repeats), sum(x.numel() for x in state.tensors().values())
+def state_floats(surfels: int, materials: bool) -> int:
+    """Floats that a training step optimises: position, quaternion, two scales, SDF, and 4 harmonics of 3 colours or 5 of a material."""
+    return surfels * (10 + (5 if materials else 12)) + 1
 
 
 def least_bytes(surfels: int, size: int, channels: int) -> tuple[int, int]:
@@ -107,13 +91,15 @@ def least_bytes(surfels: int, size: int, channels: int) -> tuple[int, int]:
 
 
 def rows(surfels: int, size: int, channels: int, materials: bool, repeats: int) -> list[dict[str, object]]:
-    """The three rows of one cell of the table."""
+    """The rows of one cell of the table."""
     forward, backward = passes(surfels, size, channels, repeats)
-    step, state = step_ms(surfels, size, materials, repeats)
+    step = profile(surfels, size, materials, repeats)
     read, back = least_bytes(surfels, size, channels)
     cell = {"surfels": surfels, "size": size, "channels": channels, "x_twin": "", "threads": thread_count()}
-    figures = (("forward", forward, read), ("backward", backward, back), ("step", step, read + back + 16 * state))
-    return [cell | {"pass": k, "ms": round(ms, 2), "x_copy": round(ms / copy_ms(b, repeats), 1)} for k, ms, b in figures]
+    all_ = read + back + 16 * state_floats(surfels, materials)
+    figures = (("forward", forward, read), ("backward", backward, back), ("step", step["step"], all_))
+    made = [cell | {"pass": k, "ms": round(ms, 2), "x_copy": round(ms / copy_ms(b, repeats), 1)} for k, ms, b in figures]
+    return [*made, cell | {"pass": "rest", "ms": round(step["rest"], 2), "x_copy": ""}]
 
 
 def small_rows() -> list[dict[str, object]]:

@@ -1,0 +1,61 @@
+"""Checkpoints of error against time: which bake each is, and what becomes of those that cannot be had."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from benchmarks import timeline
+from benchmarks.rows import Row, read_csv, write_csv
+from gsbake.pipeline.errors import UsageError
+
+OLD = Row("elsewhere", "gsbake", "preview", "hull", 10, 5.0, 1.0, 0.9, 9.0)
+
+
+@pytest.mark.parametrize(("start", "stereo"), [("stereo", "auto"), ("sphere", "never")])
+def test_a_checkpoint_is_a_share_of_the_profile(tmp_path: Path, start: str, stereo: str) -> None:
+    (tmp_path / "images").mkdir()
+    (tmp_path / "images" / "a.png").touch()
+    session = timeline.Checkpoint("thing", tmp_path, "preview", start, 0.5).open(tmp_path / "out", 1)
+    settings = session.profile.profile
+    assert (settings.train.iterations, settings.refine.iterations) == (175, 20)
+    assert (settings.train.init, settings.stereo.enabled) == (start, stereo)
+    assert session.out == tmp_path / "out" / "thing"  # all starts share one store
+
+
+def test_captures_that_are_not_here_are_left_out_with_a_sentence(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(timeline, "CAPTURES", tmp_path)
+    (tmp_path / "blind").mkdir()
+    write_csv(tmp_path / "t.csv", [OLD])
+    timeline.main(["--captures", "gone,blind", "--csv", str(tmp_path / "t.csv"), "--charts", str(tmp_path), "--out", str(tmp_path / "out")])
+    said = capsys.readouterr().out
+    assert "gone: left out; " in said and "GSBAKE_CAPTURES" in said and "blind: left out; " in said and "no truth" in said
+    assert "| elsewhere | preview, from hull |" in said  # the front of what was measured before
+    assert read_csv(tmp_path / "t.csv") == [OLD]
+
+
+def test_a_start_that_cannot_be_had_leaves_no_row(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    def refuse(*_: object) -> Row:
+        raise UsageError("they start from hull instead (few points).")
+
+    monkeypatch.setattr(timeline, "run_checkpoint", refuse)
+    assert timeline.run_series("thing", tmp_path, "preview", "points", [0.0, 1.0], tmp_path, 1) == []
+    assert capsys.readouterr().out.count("left out; they start from hull instead") == 1
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+def test_the_built_in_capture_is_measured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    places = ["--csv", str(tmp_path / "t.csv"), "--charts", str(tmp_path), "--out", str(tmp_path / "out")]
+    timeline.main(["--captures", "built-in", "--profiles", "smoke", "--starts", "hull,sphere", "--shares", "0", "--no-peers", *places])
+    rows = read_csv(tmp_path / "t.csv")
+    assert [(r.start, r.steps) for r in rows] == [("hull", 0), ("sphere", 0)]
+    hull, sphere = rows
+    assert hull.chamfer_pct is not None and hull.chamfer_pct < 2 and hull.seconds > 0 and hull.peak_mb
+    assert sphere.chamfer_pct is None  # no step has moved it: it lies around the object
+    assert "smoke, from hull" in (tmp_path / "error-time-built-in.svg").read_text()
