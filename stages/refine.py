@@ -24,7 +24,7 @@ def run(ctx: Context) -> dict[str, Any]:
         light = EnvironmentLight.load(ctx.inputs["train"] / "light.safetensors")
     with ctx.part("prune and densify"):
         surfels, counts = prune_and_densify(surfels, posed, settings.refine, settings.train.max_size, ctx.seed)
-    session = Session(ctx, posed, surfels, light, settings.refine.iterations, 0.0, densify=False)
+    session = Session(ctx, posed, surfels, light, settings.refine.iterations, 0.0, None)
     return session.run() | {"counts": counts}
 
 
@@ -34,7 +34,7 @@ STAGE = Stage(
     title="refine surfels",
     run=run,
     needs=("poses", "train"),
-    settings=("refine.*", "train.max_size", "train.holdout", "train.early_stop", "train.lr_*", "splat.*", "loss.*"),
+    settings=("refine.*", "train.max_size", "train.holdout", "train.lr_*", "splat.*", "loss.*", "skip.converged"),
     uses_device=True,
     seeded=True,
 )

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 from typing import Any
 
+from gsbake.pipeline.skip import leave_out, wanted
 from gsbake.pipeline.stage import Context, Stage
 
 
 def run(ctx: Context) -> dict[str, Any]:
     """Start surfels, train them, and write `surfels.safetensors`, `light.safetensors` (materials only) and `log.csv`."""
     from gsbake.capture.posed import PosedPhotos
+    from gsbake.splat.policies import growth
     from gsbake.splat.session import Session
+    from gsbake.splat.settled import settled_share, settles, spared_steps
     from gsbake.splat.start import begin
 
     settings = ctx.settings
@@ -18,6 +21,8 @@ def run(ctx: Context) -> dict[str, Any]:
     with ctx.part("start"):
         surfels, kind, why = begin(posed, settings.train, settings.splat, ctx.seed, ctx.inputs["stereo"])
         ctx.decide("surfels start from", kind, why)
+    rule, reason = growth(settings.train.densify, kind)
+    ctx.decide("surfels multiply by", rule, reason)
     light = None
     if settings.splat.shading == "pbr":
         from gsbake.light.environment import EnvironmentLight
@@ -25,17 +30,25 @@ def run(ctx: Context) -> dict[str, Any]:
         light = EnvironmentLight(settings.splat.env_size)
     else:
         ctx.decide("environment light", "skipped", "the profile asks for plain colours")
-    session = Session(ctx, posed, surfels, light, settings.train.iterations, settings.train.coarse_share, densify=True)
-    return session.run()
+    share = settled_share(posed, ctx.inputs["stereo"])
+    holds, evidence = settles(share, kind, light is not None)
+    steps = settings.train.iterations
+    trusted = 1.0 if settings.skip.settled == "always" else share
+    spared = spared_steps(steps, trusted) if wanted(ctx, "settled", holds) else 0
+    session = Session(ctx, posed, surfels, light, steps - spared, settings.train.coarse_share, rule)
+    results = session.run()
+    choice = f"{spared} of {steps} steps left out"
+    leave_out(ctx, "settled", holds, evidence, choice, "no steps left out", spared * session.step_seconds)
+    return results
 
 
 STAGE = Stage(
     name="train",
-    version=1,
+    version=2,
     title="train surfels",
     run=run,
     needs=("poses", "stereo"),
-    settings=("train.*", "splat.*", "loss.*"),
+    settings=("train.*", "splat.*", "loss.*", "skip.converged", "skip.settled"),
     uses_device=True,
     seeded=True,
 )

@@ -1,7 +1,8 @@
-"""Adding and dropping surfels: gradient-driven clone and split under a budget, and pruning by opacity, size, visibility and SDF.
+"""Adding and dropping surfels: clone and split under a budget, and pruning by opacity, size, visibility and distance from the surface.
 
-Clone/split after 3DGS (Kerbl et al. 2023); children inherit s (Zhu et al. 2025). Instead of a fixed gradient threshold the surfels with the
-largest mean screen gradient are taken, as many as a budget that grows to `max_surfels` allows: no scene-dependent constant to guess.
+Clone/split after 3DGS (Kerbl et al. 2023); children inherit s (Zhu et al. 2025). Instead of a fixed threshold the surfels with the
+largest score (`policies.py`: the mean screen gradient, or that and the SDF sample) are taken, as many as a budget that grows to
+`max_surfels` allows: no scene-dependent constant to guess.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import torch
 from torch import Tensor
 
 from gsbake.splat.adam import Adam
+from gsbake.splat.policies import Placement
 from gsbake.splat.reference import rotation_matrix
 from gsbake.splat.surfels import Surfels
 
@@ -20,6 +22,10 @@ from gsbake.splat.surfels import Surfels
 OPACITY_FLOOR = 0.005
 #: Mean weight per view (in pixels) below which a surfel counts as hidden: it lies behind others and costs time without being seen.
 HIDDEN_WEIGHT = 0.05
+#: Discs start with a σ of this share of the distance to their neighbours (`surfels.create`), and keep near it while they cover the surface.
+DISC_SHARE = 0.6
+#: Spacings from the surface beyond which a surfel counts as off it in training; refine has a setting for it.
+FAR_SPACINGS = 3.0
 
 
 @dataclass
@@ -39,13 +45,19 @@ class Statistics:
         """Collect one backward pass: gradients (n, ≥2) w.r.t. the screen centre in pixels, weights (n,); `size` makes them
         resolution-free."""
         seen = touched > 0
-        self.gradient += torch.where(seen, screen_grad[:, :2].norm(dim=1) * (size / 2), 0.0)
+        self.gradient += torch.where(seen, torch.hypot(screen_grad[:, 0], screen_grad[:, 1]) * (size / 2), 0.0)
         self.views += seen
         self.weight += touched
 
     def mean_gradient(self) -> Tensor:
         """Mean screen gradient (n,) over the views that touched each surfel."""
         return self.gradient / self.views.clamp_min(1)
+
+
+def placement(surfels: Surfels) -> Placement:
+    """Where the surfels stand by their own SDF samples, the spacing read off the median disc."""
+    spacing = float(surfels.scale.max(1).values.median()) / DISC_SHARE if len(surfels) else 1.0
+    return Placement(surfels.sdf.abs(), surfels.opacity() / surfels.transfer.peak, spacing, FAR_SPACINGS * spacing)
 
 
 def replace_rows(surfels: Surfels, adam: Adam, keep: Tensor, children: Surfels | None) -> Surfels:
@@ -59,17 +71,14 @@ def replace_rows(surfels: Surfels, adam: Adam, keep: Tensor, children: Surfels |
 
 
 @torch.no_grad()
-def densify(
-    surfels: Surfels, adam: Adam, stats: Statistics, budget: int, large: float, generator: torch.Generator, floor: float = 0.0
-) -> Surfels:
-    """Split (scale above `large`) or clone the surfels with the largest mean gradient until `budget` surfels exist.
+def densify(surfels: Surfels, adam: Adam, score: Tensor, budget: int, large: float, generator: torch.Generator) -> Surfels:
+    """Split (scale above `large`) or clone the surfels with the largest `score` (n,) until `budget` surfels exist; a score of 0 never does.
 
-    A split surfel becomes two of 1/1.6 its size at random places of its disc; a clone is a copy. Only gradients above `floor` count.
+    A split surfel becomes two of 1/1.6 its size at random places of its disc; a clone is a copy.
     """
     room = budget - len(surfels)
-    score = stats.mean_gradient()
     chosen = torch.argsort(score, descending=True, stable=True)[: max(0, room)]
-    chosen = chosen[score[chosen] > floor]
+    chosen = chosen[score[chosen] > 0]
     if not len(chosen):
         return surfels
     parents = surfels.select(chosen)
@@ -90,9 +99,11 @@ def densify(
 
 
 @torch.no_grad()
-def prune(surfels: Surfels, adam: Adam, stats: Statistics | None, largest: float) -> tuple[Surfels, Tensor, dict[str, int]]:
-    """Drop surfels that are transparent, larger than `largest`, not finite, or (given statistics) hidden in all views; returns also
-    the kept index."""
+def prune(
+    surfels: Surfels, adam: Adam, stats: Statistics | None, largest: float, off: Tensor | None = None
+) -> tuple[Surfels, Tensor, dict[str, int]]:
+    """Drop surfels that are transparent, larger than `largest`, not finite, (given statistics) hidden in all views, or `off` (n,) the
+    surface by a rule of `policies.py`; returns also the kept index and how many fell to each reason."""
     dropped = {
         "transparent": surfels.opacity() < OPACITY_FLOOR * surfels.transfer.peak,
         "too large": surfels.scale.max(1).values > largest,
@@ -100,6 +111,8 @@ def prune(surfels: Surfels, adam: Adam, stats: Statistics | None, largest: float
     }
     if stats is not None:
         dropped["unseen"] = (stats.weight <= HIDDEN_WEIGHT * stats.views) & ~dropped["transparent"]
+    if off is not None:
+        dropped["off the surface"] = off
     bad = torch.stack(list(dropped.values())).any(0)
     keep = (~bad).nonzero()[:, 0]
     counts = {k: int(v.sum()) for k, v in dropped.items()}

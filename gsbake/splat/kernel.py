@@ -40,7 +40,7 @@ from gsbake.splat.lanes import (
 
 GEO = 9  # xc, yc, ux, uy, vx, vy, wx, wy, zc
 EXTRA = 6  # planes behind the features: depth, distortion, first and second moment, alpha, median depth
-GRADS = 3  # gradient planes behind the features': depth, distortion, alpha
+GRADS = 3  # of their gradients these count: depth, distortion, alpha
 SLOT = 11  # gradient slot before the features: 9 coefficients, opacity, accumulated weight
 NEAR, FAR = 0.2, 100.0
 NDC = FAR * NEAR / (FAR - NEAR)
@@ -183,6 +183,13 @@ def forward_kernel(channels: int) -> Any:
     return call
 
 
+@njit(**JIT)
+def add(a, at, value):  # type: ignore[no-untyped-def]
+    """Add lanes to the `at`-th of an array. Not a closure of the kernel: a compiled function in a closure is another one in every process,
+    and the kernel would never be found in the cache."""
+    store(a, np.uint64(at * LANES), load(a, np.uint64(at * LANES)) + value)
+
+
 @lru_cache(maxsize=16)
 def backward_kernel(channels: int) -> Any:
     """Compiled backward: fills one gradient slot per (tile, surfel) pair, see the module's notes."""
@@ -198,10 +205,6 @@ def backward_kernel(channels: int) -> Any:
     acc_f = np.uint64(SLOT * LANES)
     acc_size = (SLOT + channels) * LANES
     zero, half, one, two = np.float32(0.0), np.float32(0.5), np.float32(1.0), np.float32(2.0)
-
-    @njit(**JIT)
-    def add(a, at, value):  # type: ignore[no-untyped-def]
-        store(a, np.uint64(at * LANES), load(a, np.uint64(at * LANES)) + value)
 
     @njit(**JIT)
     def backward(  # type: ignore[no-untyped-def]
@@ -232,7 +235,7 @@ def backward_kernel(channels: int) -> Any:
                 # what lies behind: Σ gradient · output over all planes; distortion is of second order in the weights
                 source = c if c < channels + 2 else channels + 4
                 at_g = o_g + np.uint64(c * LANES)
-                pack(slope, corner + np.uint64(c) * size, u_w, s, at_g, block_size, u_cols, u_rows)
+                pack(slope, corner + np.uint64(source) * size, u_w, s, at_g, block_size, u_cols, u_rows)
                 pack(image, corner + np.uint64(source) * size, u_w, s, o_t, block_size, u_cols, u_rows)
                 factor = two if c == channels + 1 else one
                 for b in range(ACROSS * DOWN):

@@ -12,6 +12,7 @@ Numba's file cache looks at the file of the compiled function only: whoever chan
 
 from __future__ import annotations
 
+import math
 import operator
 from typing import Any
 
@@ -238,6 +239,45 @@ def power_of_two(typing: Any, value: Any, one: Any, c1: Any, c2: Any, c3: Any, c
         return builder.bitcast(builder.add(builder.bitcast(result, _INTS), shift), _VECTOR)
 
     return LANES_TYPE(*[LANES_TYPE] * 7), lower
+
+
+@intrinsic
+def root(typing: Any, value: Any) -> Any:
+    """Square root of lanes."""
+
+    def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        sqrt = cgutils.get_or_insert_function(builder.module, ir.FunctionType(_VECTOR, [_VECTOR]), f"llvm.sqrt.v{LANES}f32")
+        return builder.call(sqrt, [args[0]])
+
+    return LANES_TYPE(LANES_TYPE), lower
+
+
+#: Bits of √½: at this mantissa a float passes from one power of two to the next.
+_HALF_ROOT = 0x3F3504F3
+
+
+@intrinsic
+def logarithm(typing: Any, value: Any) -> Any:
+    """Natural logarithm of lanes that are positive and normal (other lanes hold rubbish), relative error below 3e-7.
+
+    x = 2^e m with m in √½..√2, and ln m = 2 artanh s with s = (m − 1)/(m + 1): five terms of its series, the sixth is below 3e-9 of it.
+    """
+
+    def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        bits = builder.bitcast(args[0], _INTS)
+        shift = ir.Constant(_INTS, [23] * LANES)
+        whole = builder.ashr(builder.sub(bits, ir.Constant(_INTS, [_HALF_ROOT] * LANES)), shift)
+        m = builder.bitcast(builder.sub(bits, builder.shl(whole, shift)), _VECTOR)
+        one = _constant([1.0] * LANES)
+        s = builder.fdiv(builder.fsub(m, one), builder.fadd(m, one), flags=("contract",))
+        square = builder.fmul(s, s)
+        series = _constant([2 / 9] * LANES)
+        for n in (7, 5, 3, 1):
+            series = builder.fadd(builder.fmul(series, square, flags=("contract",)), _constant([2 / n] * LANES), flags=("contract",))
+        powers = builder.fmul(builder.sitofp(whole, _VECTOR), _constant([math.log(2)] * LANES), flags=("contract",))
+        return builder.fadd(powers, builder.fmul(s, series, flags=("contract",)), flags=("contract",))
+
+    return LANES_TYPE(LANES_TYPE), lower
 
 
 @intrinsic(prefer_literal=True)

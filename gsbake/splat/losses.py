@@ -6,17 +6,31 @@ Colour as 3DGS (L1 and SSIM); median sharpness and projection as Zhu et al. 2025
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import lru_cache
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from gsbake.splat.kernel import EXTRA
 from gsbake.splat.projection import Pinhole
 from gsbake.splat.transfer import Transfer
+from gsbake.splat.views import TrainView
 
 #: Projection errors above this (unit frame) are other surfaces, not error.
 PROJECTION_RANGE = 0.1
+
+
+@dataclass(frozen=True)
+class ImageWeights:
+    """Weights of the losses of one photo; `ssim` is the share of 1 − SSIM in the colour loss, whose weight is 1."""
+
+    ssim: float
+    normal: float = 0.0
+    mask: float = 0.0
+    distortion: float = 0.0
+    smoothness: float = 0.0
 
 
 @lru_cache(maxsize=4)
@@ -55,12 +69,13 @@ def median_sharpness(sdf: Tensor, gamma: Tensor, transfer: Transfer) -> Tensor:
 
 
 def projection(
-    position: Tensor, normal: Tensor, sdf: Tensor, visible: Tensor, depth: Tensor, R: Tensor, t: Tensor, view: Pinhole
+    position: Tensor, normal: Tensor, sdf: Tensor, visible: Tensor, depth: Tensor, alpha: Tensor, R: Tensor, t: Tensor, view: Pinhole
 ) -> Tensor:
     """Mean |D(uv(μ')) − z(μ')| over visible surfels with μ' = μ − s n inside the frame and errors below `PROJECTION_RANGE`.
 
-    `depth` (h, w) is the alpha-normalised expected depth, detached here; 0 marks pixels without a surface.
+    D is the expected depth of the blended planes `depth` and `alpha` (h, w); these and the pose (R, t) get no gradient.
     """
+    R, t, surface = R.detach(), t.detach(), expected_depth(depth, alpha).detach()
     index = visible.nonzero()[:, 0]
     if not len(index):
         return sdf.sum() * 0
@@ -70,12 +85,17 @@ def projection(
     x = (view.fx * cam[:, 0] / z + view.cx) / view.width * 2 - 1
     y = (view.fy * cam[:, 1] / z + view.cy) / view.height * 2 - 1
     grid = torch.stack([x, y], 1).detach()[None, None]
-    planes = torch.stack([depth.detach(), (depth.detach() > 0).to(depth)])[None]
+    planes = torch.stack([surface, (surface > 0).to(surface)])[None]
     seen = F.grid_sample(planes, grid, mode="bilinear", padding_mode="zeros", align_corners=False)[0, :, 0]
     # along the pixel's ray only z moves: the gradient through uv is left out, it chases depth edges
     error = (seen[0] - z).abs()
     ok = (seen[1] > 0.999) & (error < PROJECTION_RANGE)
     return (error * ok).sum() / ok.sum().clamp_min(1)
+
+
+def expected_depth(depth: Tensor, alpha: Tensor) -> Tensor:
+    """Alpha-normalised z-depth of Σ w z and Σ w (h, w); 0 where nothing is."""
+    return torch.where(alpha > 1e-3, depth / alpha.clamp_min(1e-3), torch.zeros_like(depth))
 
 
 def depth_normals(depth: Tensor, R: Tensor, view: Pinhole) -> Tensor:
@@ -110,3 +130,32 @@ def smoothness(planes: Tensor, guide: Tensor, mask: Tensor) -> Tensor:
         m = mask[1:] * mask[:-1] if axis == 1 else mask[:, 1:] * mask[:, :-1]
         loss = loss + (d * torch.exp(-10 * g) * m).sum() / m.sum().clamp_min(1)
     return loss
+
+
+def image(
+    planes: Tensor, picture: Tensor, view: TrainView, masked: bool, background: Tensor, weights: ImageWeights, materials: bool
+) -> tuple[Tensor, Tensor]:
+    """Weighted sum of what one photo asks of its render, and the colour loss alone (both scalars).
+
+    `planes` (c + 6, h, w) as blended, the world normals the last of the c features; `picture` (3, h, w) the premultiplied sRGB picture. It
+    is composited over `background` (3,), like the photo where `masked`; else the photo is taken as it is, there is no mask loss, and
+    pixels with alpha above ½ count as inside. With `materials` the features before the normals are smoothed.
+    """
+    channels = planes.shape[0] - EXTRA
+    depth, alpha = planes[channels], planes[channels + 4]
+    photo, cover, back = view.colour().to(planes.dtype), view.cover() if masked else None, background[:, None, None]
+    cover = None if cover is None else cover.to(planes.dtype)
+    target = photo if cover is None else photo * cover + back * (1 - cover)
+    first = colour(picture + back * (1 - alpha), target, weights.ssim)
+    total = first
+    inside = ((alpha.detach() if cover is None else cover) > 0.5).to(planes.dtype)
+    if weights.normal:
+        normals = depth_normals(expected_depth(depth, alpha), view.R.to(planes.dtype), view.pinhole)
+        total = total + weights.normal * normal_consistency(planes[channels - 3 : channels], alpha, normals, inside)
+    if cover is not None and weights.mask:
+        total = total + weights.mask * mask_entropy(alpha, cover)
+    if weights.distortion:
+        total = total + weights.distortion * planes[channels + 1].mean()
+    if materials and weights.smoothness:
+        total = total + weights.smoothness * smoothness(planes[: channels - 3], photo.mean(0), inside)
+    return total, first

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from gsbake.splat.binning import bin_surfels
 from gsbake.splat.kernel import EXTRA, SLOT, backward_kernel, forward_kernel, sum_slots
+from gsbake.splat.losses import expected_depth
 from gsbake.splat.projection import Pinhole, Project
 from gsbake.splat.threads import run_chunks
 
@@ -26,9 +27,10 @@ class Rendered:
     `features` (c, h, w); `depth` Σ w z; `distortion` Σ_{i<j} w_i w_j (m_i − m_j)² on NDC depth; `alpha` Σ w; `median` depth where T
     crosses ½ (0 if it never does; no gradient); `normal` (n, 3) world normals of the surfels; `visible` (n,) bool;
     `screen` (n, 9), whose `.grad` after backward holds the screen-space gradients (columns 0, 1: the centre, in pixels);
-    `touched` holds Σ w per surfel after backward.
+    `touched` holds Σ w per surfel after backward. `planes` (c + 6, h, w) is what all of them are cut from.
     """
 
+    planes: Tensor
     features: Tensor
     depth: Tensor
     distortion: Tensor
@@ -41,7 +43,7 @@ class Rendered:
 
     def expected_depth(self) -> Tensor:
         """Alpha-normalised expected z-depth (h, w); 0 where nothing is."""
-        return torch.where(self.alpha > 1e-3, self.depth / self.alpha.clamp_min(1e-3), torch.zeros_like(self.depth))
+        return expected_depth(self.depth, self.alpha)
 
 
 class _Blend(torch.autograd.Function):
@@ -78,7 +80,7 @@ class _Blend(torch.autograd.Function):
         bins, used, (width, height) = ctx.bins, ctx.used, ctx.size
         channels, n = features.shape[1], features.shape[0]
         g, o, f = (x.detach().contiguous().numpy() for x in (geo, opacity, features))
-        planes = torch.cat([grad[: channels + 2], grad[channels + 4 : channels + 5]]).contiguous().numpy()
+        planes = grad.contiguous().numpy()
         result = np.empty((len(bins.ids), SLOT + channels), np.float32)
         kernel, image, b = backward_kernel(channels), out.numpy(), box.numpy()
         run_chunks(
@@ -131,4 +133,4 @@ def render(
     c = features.shape[1]
     # One split: taking the planes out one by one costs autograd a zero-filled copy of all of them each.
     blended, depth, distortion, _, alpha, median = out.split([c, 1, 1, 2, 1, 1])
-    return Rendered(blended, depth[0], distortion[0], alpha[0], median[0].detach(), normal, visible, geo, stats)
+    return Rendered(out, blended, depth[0], distortion[0], alpha[0], median[0].detach(), normal, visible, geo, stats)

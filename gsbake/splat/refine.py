@@ -1,9 +1,8 @@
 """Refinement between training and meshing: drop what the SDF, the silhouettes and visibility disown, and fill where the surface is
 under-sampled.
 
-Pruning by distance from the zero set follows GS-ROR² (prune |f(μ)| above a bound); seeding near the zero set where surfels are sparse
-follows
-GaussianRoom. The bound is in surfel spacings, so that it has no scene-dependent constant.
+Pruning by distance from the zero set takes the rule that `refine.prune` names (`policies.py`; by default none, see
+docs/decisions/0008-densify-policies.md), seeding near the zero set where surfels are sparse follows GaussianRoom.
 """
 
 from __future__ import annotations
@@ -18,6 +17,7 @@ from scipy.spatial import cKDTree
 from gsbake.capture.posed import PosedPhotos
 from gsbake.splat.adapt import OPACITY_FLOOR
 from gsbake.splat.gbuffer import rasterise
+from gsbake.splat.policies import PRUNING, Placement
 from gsbake.splat.start import spacing
 from gsbake.splat.surfels import Surfels
 from gsbake.splat.views import TrainView, pose_of
@@ -70,11 +70,14 @@ def prune_and_densify(surfels: Surfels, posed: PosedPhotos, refine: Any, max_siz
     best, outside, distance = _visibility(surfels, posed, max_size)
     gap = torch.from_numpy(spacing(surfels.position.numpy().astype(float)).astype(np.float32))
     median_gap = float(gap.median())
+    opacity = surfels.opacity() / surfels.transfer.peak
+    measured = (best >= SEEN_WEIGHT) & (distance < 1.0)
+    at = Placement(torch.where(measured, distance, 0.0), opacity, median_gap, refine.prune_distance * median_gap)
     rules = {
-        "transparent": surfels.opacity() < OPACITY_FLOOR * surfels.transfer.peak,
+        "transparent": opacity < OPACITY_FLOOR,
         "unseen": best < SEEN_WEIGHT,
         "outside the silhouettes": outside >= 2,
-        "far from the zero set": (distance > refine.prune_distance * median_gap) & (best >= SEEN_WEIGHT) & (distance < 1.0),
+        "far from the zero set": PRUNING[refine.prune](at) & measured,
         "floaters": gap > 8 * median_gap,
     }
     keep = ~torch.stack(list(rules.values())).any(0)

@@ -60,7 +60,7 @@ class SurfelRenderer:
         view = _view(camera, self.surfels.position.device)
         out = rasterise(self.surfels, view)
         tables = None if self.light is None else self.light.prefilter()  # type: ignore[attr-defined]
-        return picture(out, view, tables).permute(1, 2, 0).cpu().numpy(), out.alpha.cpu().numpy()
+        return picture(out.planes, view, tables).permute(1, 2, 0).cpu().numpy(), out.alpha.cpu().numpy()
 
 
 def _view(camera: Camera, device: torch.device) -> TrainView:

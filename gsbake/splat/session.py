@@ -10,13 +10,14 @@ from typing import Any
 import torch
 
 from gsbake.capture.posed import PosedPhotos
+from gsbake.pipeline.skip import leave_out
 from gsbake.pipeline.stage import Context
 from gsbake.splat.surfels import Surfels
 from gsbake.splat.threads import configure
 from gsbake.splat.trainer import Plan, Trainer
 from gsbake.splat.views import held_out, load_views
 
-CHECKPOINT_VERSION = 1
+CHECKPOINT_VERSION = 2
 CHECKPOINT_SECONDS = 30.0
 
 
@@ -24,18 +25,23 @@ class Session:
     """Runs a `Trainer` to its end inside a stage's context."""
 
     def __init__(
-        self, ctx: Context, posed: PosedPhotos, surfels: Surfels, light: Any, iterations: int, coarse_share: float, densify: bool
+        self, ctx: Context, posed: PosedPhotos, surfels: Surfels, light: Any, iterations: int, coarse_share: float, growth: str | None
     ) -> None:
-        """Load the photos at `train.max_size`; go on from the newest checkpoint if this stage was interrupted."""
+        """Load the photos at `train.max_size`; go on from the newest checkpoint if this stage was interrupted.
+
+        Surfels multiply by the rule `growth` of `policies.GROWING`; with None they neither come nor go.
+        """
         self.ctx = ctx
         configure(ctx.threads)
         settings = ctx.settings
         with ctx.part("load photos"):
             full, half = ([view.to(ctx.device) for view in views] for views in load_views(posed, settings.train.max_size))
         held = held_out(len(full), settings.train.holdout)
-        plan = Plan(settings.train, settings.splat, settings.loss, iterations, coarse_share, densify, ctx.seed)
+        sections = settings.train, settings.splat, settings.loss
+        plan = Plan(*sections, iterations, coarse_share, growth is not None, ctx.seed, settings.skip.converged, growth or "none")
         self.trainer = Trainer(plan, surfels.to(ctx.device), None if light is None else light.to(ctx.device), full, half, held)
         self.before = len(surfels)
+        self.step_seconds = 0.0  # measured by `run`, evaluations included
         self._resume()
 
     def _resume(self) -> None:
@@ -59,7 +65,8 @@ class Session:
     def run(self) -> dict[str, Any]:
         """Train to the end (or to a requested stop, which leaves a checkpoint) and write the results."""
         trainer, ctx = self.trainer, self.ctx
-        saved = time.monotonic()
+        begun = saved = time.monotonic()
+        first = trainer.done  # not 0 in a resumed run
         live: dict[str, float] = {}
         every = max(20, min(250, trainer.plan.iterations // 12))  # a curve to look at, at little cost
         with ctx.part("train"):
@@ -74,8 +81,17 @@ class Session:
                 if time.monotonic() - saved > CHECKPOINT_SECONDS:
                     self._save_checkpoint()
                     saved = time.monotonic()
-        if trainer.cooling_from is not None:
-            ctx.decide("early stop", f"step {trainer.end} of {trainer.plan.iterations}", "held-out PSNR and SDF median stood still")
+        self.step_seconds = (time.monotonic() - begun) / max(1, trainer.done - first)
+        spared = trainer.plan.iterations - trainer.end
+        leave_out(
+            ctx,
+            "converged",
+            spared > 0,
+            trainer.standing,
+            f"stopped at step {trainer.end} of {trainer.plan.iterations}",
+            f"all {trainer.plan.iterations} steps",
+            spared * self.step_seconds,
+        )
         return self._write()
 
     def _write(self) -> dict[str, Any]:

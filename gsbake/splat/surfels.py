@@ -16,6 +16,7 @@ from safetensors import safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
+from gsbake.splat import harmonics
 from gsbake.splat.reference import rotation_matrix
 from gsbake.splat.transfer import DEFAULT, Transfer, named
 
@@ -23,8 +24,6 @@ from gsbake.splat.transfer import DEFAULT, Transfer, named
 #: paper's .646 the light stays a blur and the surfaces stay rough (docs/decisions/0003-smooth-start.md).
 ROUGHNESS_START, METALLIC_START = -1.0, -3.0
 FORMAT = "gsbake surfels 1"
-SH0 = 0.28209479177387814  # Y_00
-SH1 = 0.4886025119029199  # Y_1m
 
 
 @dataclass
@@ -85,19 +84,7 @@ class Surfels:
         a = self.attributes
         if self.pbr:
             return torch.sigmoid(torch.cat([a["albedo"], a["roughness"][:, None], a["metallic"][:, None]], 1))
-        sh = a["sh"]
-        colour = 0.5 + SH0 * sh[:, 0]
-        if sh.shape[1] > 1:
-            d = torch.nn.functional.normalize(self.position.detach() - camera_centre, dim=1)
-            x, y, z = d[:, :1], d[:, 1:2], d[:, 2:]
-            colour = colour + SH1 * (z * sh[:, 2] - y * sh[:, 1] - x * sh[:, 3])
-            if sh.shape[1] > 4:
-                colour = colour + (
-                    1.0925484305920792 * (x * y * sh[:, 4] - y * z * sh[:, 5] - x * z * sh[:, 7])
-                    + 0.31539156525252005 * (2 * z * z - x * x - y * y) * sh[:, 6]
-                    + 0.5462742152960396 * (x * x - y * y) * sh[:, 8]
-                )
-        return colour
+        return harmonics.colours(a["sh"], self.position, camera_centre)
 
     def select(self, index: Tensor) -> Surfels:
         """The surfels at `index` (indices or a mask)."""
@@ -161,7 +148,7 @@ def create(
         }
     else:
         sh = torch.zeros(n, (sh_degree + 1) ** 2, 3)
-        sh[:, 0] = (rgb - 0.5) / SH0
+        sh[:, 0] = (rgb - 0.5) / harmonics.SH0
         attributes = {"sh": sh}
     # σ of .6 neighbour distances: discs overlap without smearing
     log_scale = torch.from_numpy(np.log(0.6 * np.maximum(spacing, 1e-5)).astype(np.float32))[:, None].repeat(1, 2)

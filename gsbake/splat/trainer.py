@@ -14,11 +14,14 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gsbake.splat import image_loss, losses
+from gsbake.splat import image_loss, losses, projection_loss
 from gsbake.splat.adam import Adam
-from gsbake.splat.adapt import Statistics, densify, prune
+from gsbake.splat.adapt import Statistics, densify, placement, prune
+from gsbake.splat.converged import stands_still
 from gsbake.splat.finite import broken
 from gsbake.splat.gbuffer import picture, rasterise
+from gsbake.splat.losses import ImageWeights
+from gsbake.splat.policies import GROWING, PRUNING
 from gsbake.splat.raster import Rendered
 from gsbake.splat.surfels import Surfels
 from gsbake.splat.views import TrainView
@@ -26,8 +29,7 @@ from gsbake.splat.views import TrainView
 #: Shares of the run: SDF losses start, densifying starts and ends.
 SDF_FROM, DENSIFY_FROM, DENSIFY_TO = 1 / 30, 1 / 60, 0.6
 DENSIFY_EVERY = 100
-#: Early stop: gain of held-out PSNR (dB) and change of the SDF median over three evaluations that count as standing still.
-STILL_DB, STILL_SDF = 0.05, 0.02
+#: Share of the steps that a run which stops early cools down in.
 COOL_DOWN = 0.1
 #: A surfel larger than this (unit frame) is dropped; larger than LARGE it is split rather than cloned.
 LARGEST = 0.25
@@ -35,7 +37,11 @@ LARGEST = 0.25
 
 @dataclass(frozen=True)
 class Plan:
-    """What a run of the trainer needs to know: the profile's sections and which kind of run it is."""
+    """What a run of the trainer needs to know: the profile's sections and which kind of run it is.
+
+    `densify`: whether surfels come and go at all; `growth`: the rule of `policies.GROWING` by which they multiply.
+    `converged` is `skip.converged`: "auto" stops early when nothing moves any more, "always" as soon as the run may, "never" does not.
+    """
 
     train: Any
     splat: Any
@@ -44,6 +50,8 @@ class Plan:
     coarse_share: float
     densify: bool
     seed: int
+    converged: str = "never"
+    growth: str = "gradient"
 
 
 class Trainer:
@@ -63,6 +71,7 @@ class Trainer:
         self.done = 0
         self.end = plan.iterations
         self.cooling_from: int | None = None
+        self.standing = "not looked at"  # how far from converged it is, in words
         self.queue: list[int] = []
         self.log: list[dict[str, float]] = []
         self.masked = all(v.mask is not None for v in views)
@@ -80,43 +89,28 @@ class Trainer:
         """Whether the run is still at half resolution."""
         return self.done < self.plan.coarse_share * self.plan.iterations
 
-    def _target(self, view: TrainView) -> tuple[Tensor, Tensor | None, Tensor]:
-        """Photo on a background (3, h, w), its mask (h, w) or None, and that background colour (3, 1, 1)."""
-        photo, mask = view.colour(), view.cover()
-        if mask is None or not self.masked:
-            return photo, None, self.background[:, None, None]
-        background = torch.rand(3, generator=self.generator).to(photo.device)[:, None, None]
-        return photo * mask + background * (1 - mask), mask, background
+    def _background(self, view: TrainView) -> Tensor:
+        """Colour (3,) behind picture and photo: a new one for every step where masks tell the object from what is behind it."""
+        if not self.masked:
+            return self.background
+        return torch.rand(3, generator=self.generator).to(view.rgb.device)
 
     def _loss(self, out: Rendered, view: TrainView, tables: Any) -> tuple[Tensor, Tensor]:
         """Weighted sum of all losses, and the colour loss alone."""
         w, s = self.plan.loss, self.surfels
-        target, mask, background = self._target(view)
-        image = picture(out, view, tables) + background * (1 - out.alpha)
-        colour = image_loss.colour(image, target, w.ssim)
-        total = colour
-        inside = (out.alpha.detach() > 0.5).float() if mask is None else (mask > 0.5).float()
-        depth = out.expected_depth()
-        if w.normal:
-            total = total + w.normal * image_loss.normal_consistency(depth, out.alpha, out.features[-3:], inside, view.R, view.pinhole)
-        if mask is not None and w.mask:
-            total = total + w.mask * losses.mask_entropy(out.alpha, mask)
-        if tables is not None:
-            if w.smoothness:
-                total = total + w.smoothness * losses.smoothness(out.features[:5], view.colour().mean(0), inside)
-            if w.white_light:
-                from gsbake.light.colour import colourfulness
+        late = self.done >= SDF_FROM * self.plan.iterations
+        weights = ImageWeights(w.ssim, w.normal, w.mask, w.distortion if late else 0.0, w.smoothness)
+        total, colour = image_loss.image(out.planes, tables, view, self.masked, self._background(view), weights)
+        if tables is not None and w.white_light:
+            from gsbake.light.colour import colourfulness
 
-                total = total + w.white_light * colourfulness(self.light.radiance())
-        if self.done >= SDF_FROM * self.plan.iterations:
-            if w.distortion:
-                total = total + w.distortion * out.distortion.mean()
-            if w.median:
-                total = total + w.median * losses.median_sharpness(s.sdf, s.gamma, s.transfer)
-            if w.projection:
-                total = total + w.projection * losses.projection(
-                    s.position, out.normal, s.sdf, out.visible, depth, view.R, view.t, view.pinhole
-                )
+            total = total + w.white_light * colourfulness(self.light.radiance())
+        if late and w.median:
+            total = total + w.median * losses.median_sharpness(s.sdf, s.gamma, s.transfer)
+        if late and w.projection:
+            total = total + w.projection * projection_loss.projection(
+                s.position, out.normal, s.sdf, out.visible, out.depth, out.alpha, view.R, view.t, view.pinhole
+            )
         return total, colour
 
     def rates(self) -> dict[str, float]:
@@ -196,10 +190,12 @@ class Trainer:
             return
         share = (self.done / n - DENSIFY_FROM) / (DENSIFY_TO - DENSIFY_FROM)
         budget = int(self.start_count + (self.plan.splat.max_surfels - self.start_count) * min(1.0, share))
-        self.surfels, keep, _ = prune(self.surfels, self.adam, self.stats, LARGEST)
+        off = PRUNING[self.plan.train.prune](placement(self.surfels))
+        self.surfels, keep, _ = prune(self.surfels, self.adam, self.stats, LARGEST, off)
         kept = Statistics(self.stats.gradient[keep], self.stats.views[keep], self.stats.weight[keep])
         large = float(self.surfels.scale.max(1).values.median()) if len(self.surfels) else 0.01
-        self.surfels = densify(self.surfels, self.adam, kept, budget, large, self.generator)
+        score = GROWING[self.plan.growth](kept.mean_gradient(), placement(self.surfels))
+        self.surfels = densify(self.surfels, self.adam, score, budget, large, self.generator)
         self.stats = Statistics.zeros(len(self.surfels), self.surfels.position.device)
 
     # -- quality ------------------------------------------------------------------------------------------------------------------
@@ -217,7 +213,7 @@ class Trainer:
             photo, mask = view.colour(), view.cover()
             cover = torch.ones_like(out.alpha) if mask is None or not self.masked else mask
             background = self.background[:, None, None]
-            error = (picture(out, view, tables) + background * (1 - out.alpha) - photo * cover - background * (1 - cover)) ** 2
+            error = (picture(out.planes, view, tables) + background * (1 - out.alpha) - photo * cover - background * (1 - cover)) ** 2
             inside = (cover > 0.5) | (out.alpha > 0.5)
             total.append(-10 * math.log10(max(float(error.mean(0)[inside].mean()), 1e-10)))
         return sum(total) / len(total)
@@ -229,12 +225,10 @@ class Trainer:
             "sdf_median": float(self.surfels.sdf.abs().median()) if len(self.surfels) else 0.0, "gamma": float(self.surfels.gamma),
         }  # fmt: skip
         self.log.append(row)
-        last = self.log[-4:]
         adapting = self.plan.densify and self.done < DENSIFY_TO * self.plan.iterations
-        if self.plan.train.early_stop and self.cooling_from is None and not self.coarse() and not adapting and len(last) == 4:
-            gain = last[-1]["psnr"] - max(r["psnr"] for r in last[:-1])
-            drift = abs(last[-1]["sdf_median"] - last[0]["sdf_median"]) / max(last[0]["sdf_median"], 1e-9)
-            if gain < STILL_DB and drift < STILL_SDF:
+        if self.plan.converged != "never" and self.cooling_from is None and self.done < self.end and not self.coarse() and not adapting:
+            still, self.standing = stands_still(self.log)
+            if still or self.plan.converged == "always":
                 self.cooling_from = self.done
                 self.end = min(self.end, self.done + int(COOL_DOWN * self.plan.iterations))
         return row
@@ -246,7 +240,7 @@ class Trainer:
         return {
             "surfels": self.surfels.tensors(), "adam": self.adam.state(), "generator": self.generator.get_state(),
             "light": None if self.light is None else self.light.state_dict(), "queue": self.queue, "log": self.log, "done": self.done,
-            "end": self.end, "cooling_from": self.cooling_from, "start_count": self.start_count,
+            "end": self.end, "cooling_from": self.cooling_from, "standing": self.standing, "start_count": self.start_count,
             "stats": (self.stats.gradient, self.stats.views, self.stats.weight),
         }  # fmt: skip
 
@@ -258,5 +252,5 @@ class Trainer:
         if self.light is not None:
             self.light.load_state_dict(state["light"])
         self.queue, self.log, self.done, self.end = state["queue"], state["log"], state["done"], state["end"]
-        self.cooling_from, self.start_count = state["cooling_from"], state["start_count"]
+        self.cooling_from, self.standing, self.start_count = state["cooling_from"], state["standing"], state["start_count"]
         self.stats = Statistics(*state["stats"])

@@ -5,10 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import pytest
 import torch
 
 from gsbake.splat.adam import Adam
-from gsbake.splat.adapt import Statistics, densify, prune
+from gsbake.splat.adapt import Statistics, densify, placement, prune
 from gsbake.splat.start import fibonacci_sphere, spacing
 from gsbake.splat.surfels import Surfels, create, quaternion_to
 
@@ -42,17 +43,17 @@ def test_densify_keeps_the_budget_and_the_moments() -> None:
     s, adam = ball(), Adam()
     for name, x in s.tensors().items():
         adam.step(name, x, torch.ones_like(x), 1e-3)
-    stats = Statistics.zeros(200)
-    stats.gradient[:30], stats.views[:] = 5.0, 1
+    score = torch.zeros(200)
+    score[:30] = 5.0
     s.sdf = torch.arange(200) / 1000.0
     before = s.scale.clone()
-    big = densify(s, adam, stats, 220, large=0.0, generator=torch.Generator().manual_seed(0))
+    big = densify(s, adam, score, 220, large=0.0, generator=torch.Generator().manual_seed(0))
     assert len(big) == 220
-    assert torch.all(big.sdf[200:] < 0.03)  # children inherit s, and only surfels with a gradient were chosen
+    assert torch.all(big.sdf[200:] < 0.03)  # children inherit s, and only surfels with a score were chosen
     assert adam.first["position"].shape == (220, 3) and torch.all(adam.first["position"][200:] == 0)
     parents = torch.round(big.sdf[200:] * 1000).long()
     assert torch.allclose(big.scale[200:], before[parents] / 1.6) and torch.allclose(big.scale[parents], before[parents] / 1.6)
-    assert densify(big, adam, Statistics.zeros(220), 300, 0.0, torch.Generator()) is big  # no gradient, no growth
+    assert densify(big, adam, torch.zeros(220), 300, 0.0, torch.Generator()) is big  # no score, no growth
 
 
 def test_prune_reasons() -> None:
@@ -67,6 +68,26 @@ def test_prune_reasons() -> None:
     kept, index, counts = prune(s, adam, stats, 0.25)
     assert len(kept) == 195 and set(range(200)) - set(index.tolist()) == {3, 5, 7, 9, 11}
     assert counts == {"transparent": 1, "too large": 1, "not finite": 1, "unseen": 2}
+
+
+def test_prune_takes_what_a_rule_says() -> None:
+    s, adam = ball(), Adam()
+    s.sdf[3] = 50.0  # transparent, and off the surface
+    off = torch.zeros(200, dtype=torch.bool)
+    off[[3, 8]] = True
+    kept, index, counts = prune(s, adam, None, 0.25, off)
+    assert len(kept) == 198 and set(range(200)) - set(index.tolist()) == {3, 8}
+    assert counts == {"transparent": 1, "too large": 0, "not finite": 0, "off the surface": 2}
+
+
+def test_standing_reads_the_spacing_off_the_discs() -> None:
+    s = ball()
+    s.sdf[0], s.sdf[1] = -0.2, 0.1
+    at = placement(s)
+    assert at.spacing == pytest.approx(float(np.median(spacing(s.position.numpy().astype(float)))), rel=1e-3)
+    assert torch.allclose(at.distance[:3], torch.tensor([0.2, 0.1, 0.01])) and at.far == pytest.approx(3 * at.spacing)
+    assert float(at.opacity[0]) == pytest.approx(1 / np.cosh(0.1) ** 2, rel=1e-5)  # sech²(γs/2), γ = 1
+    assert placement(s.select(torch.zeros(0, dtype=torch.long))).distance.shape == (0,)
 
 
 def test_adam_follows_the_published_rule() -> None:

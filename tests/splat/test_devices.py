@@ -14,7 +14,7 @@ from gsbake.light.prefilter import operator
 from gsbake.light.shade import shade
 from gsbake.light.tables import LightTables
 from gsbake.pipeline.machine import cuda_lacks
-from gsbake.splat import losses
+from gsbake.splat import harmonics, losses
 from gsbake.splat.adapt import Statistics
 from gsbake.splat.cuda.projection import project
 from gsbake.splat.gbuffer import view_directions
@@ -33,11 +33,20 @@ def view() -> TrainView:
     return TrainView("a", torch.zeros(3, 29, 37), torch.zeros(29, 37), torch.eye(3), torch.zeros(3), torch.zeros(3), PINHOLE)
 
 
+def image(materials: bool) -> Tensor:
+    planes, weights = meta(14 if materials else 12, 29, 37), losses.ImageWeights(0.2, 0.1, 0.1, 0.1, 0.1)
+    # an index of pixels has no size on "meta": the picture of materials is the test "shade"
+    return losses.image(planes, planes[:3], view().to("meta"), True, meta(3), weights, materials)[0]
+
+
 PARTS: dict[str, Callable[[], Tensor]] = {
     "colour": lambda: losses.colour(meta(3, 29, 37), meta(3, 29, 37), 0.2),
     "normal": lambda: losses.normal_consistency(
         meta(3, 29, 37), meta(29, 37), losses.depth_normals(meta(29, 37), meta(3, 3), PINHOLE), meta(29, 37)
     ),
+    "image": lambda: image(False),
+    "image of materials": lambda: image(True),
+    "harmonics": lambda: harmonics.colours(meta(9, 4, 3), meta(9, 3), meta(3)),
     "mask": lambda: losses.mask_entropy(meta(29, 37), meta(29, 37).detach()),
     "smoothness": lambda: losses.smoothness(meta(5, 29, 37), meta(29, 37), meta(29, 37)),
     "white light": lambda: colourfulness(meta(6, 8, 8, 3)),

@@ -6,7 +6,22 @@ import numpy as np
 from numba import njit
 
 from gsbake.splat.blocks import ACROSS, DOWN, TILE, pack, unpack
-from gsbake.splat.lanes import LANES, POWER, lane_column, lane_row, lanes, load, power_of_two, prefetch, select, some, store, total
+from gsbake.splat.lanes import (
+    LANES,
+    POWER,
+    lane_column,
+    lane_row,
+    lanes,
+    load,
+    logarithm,
+    power_of_two,
+    prefetch,
+    root,
+    select,
+    some,
+    store,
+    total,
+)
 
 
 @njit(error_model="numpy")
@@ -15,6 +30,14 @@ def _power(x, c, out):  # type: ignore[no-untyped-def]
         at = np.uint64(i)
         y = power_of_two(load(x, at), lanes(c[0]), lanes(c[1]), lanes(c[2]), lanes(c[3]), lanes(c[4]), lanes(c[5]))
         store(out, at, y)
+
+
+@njit(error_model="numpy")
+def _logarithm_and_root(x, log, square_root):  # type: ignore[no-untyped-def]
+    for i in range(0, x.shape[0], LANES):
+        at = np.uint64(i)
+        store(log, at, logarithm(load(x, at)))
+        store(square_root, at, root(load(x, at)))
 
 
 @njit(error_model="numpy")
@@ -27,6 +50,16 @@ def _operations(a, b, f, out):  # type: ignore[no-untyped-def]
     store(out, n * np.uint64(2), select((x < y) & (x > f), x, f))
     store(out, n * np.uint64(3), select((x <= y) & (y >= x), lane_column(), lane_row()))
     return total(x), some(x > y), some(x > np.float32(1e9))
+
+
+def test_logarithm_and_root() -> None:
+    near = 1 + np.linspace(-1e-3, 1e-3, 800)
+    x = np.concatenate([np.geomspace(1.2e-38, 3e38, 8000), near, [1.0, 2.0, 0.5, 0.7071, 0.7072, 1.4142, 1.4143, 4.0]]).astype(np.float32)
+    log, square_root = np.empty_like(x), np.empty_like(x)
+    _logarithm_and_root(x, log, square_root)
+    exact = np.log(x.astype(np.float64))
+    assert (np.abs(log - exact) <= np.maximum(3e-7 * np.abs(exact), 1e-8)).all()
+    assert np.array_equal(square_root, np.sqrt(x)) and log[x == 1].tolist() == [0.0] * int((x == 1).sum())
 
 
 def test_power_of_two() -> None:

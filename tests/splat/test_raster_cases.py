@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import Any
 
 import pytest
 import torch
+from numba.core.dispatcher import Dispatcher
 from torch import Tensor
 
+from gsbake.splat.kernel import backward_kernel, forward_kernel
 from gsbake.splat.projection import Pinhole
 from gsbake.splat.raster import render
 from gsbake.splat.reference import render_reference
@@ -157,3 +160,11 @@ def test_kernel_gradients_by_finite_differences(name: str) -> None:
         slope = (ends[0] - ends[1]) / 2e-5
         bound = 2e-3 * float(gradient.double().norm() * step.norm())
         assert float((gradient.double() * step).sum()) == pytest.approx(slope, abs=bound + 1e-4)
+
+
+@pytest.mark.parametrize("made", [forward_kernel, backward_kernel])
+def test_kernels_can_be_found_in_the_cache(made: Callable[[int], Any]) -> None:
+    """A compiled function among a kernel's closure variables would make it a new kernel, to compile for seconds, in every process."""
+    (kernel,) = (cell.cell_contents for cell in made(3).__closure__)  # type: ignore[attr-defined]
+    closure = [cell.cell_contents for cell in kernel.py_func.__closure__]
+    assert len(closure) > 5 and not any(isinstance(x, Dispatcher) for x in closure)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 import psutil
@@ -64,7 +64,7 @@ def views(kind: str, size: int) -> list[TrainView]:
 def trainer(kind: str, steps: int, shading: str = "colour", seed: int = 0) -> Trainer:
     p = Profile.model_validate(
         {
-            "train": {"iterations": steps, "max_size": SIZE, "holdout": 0, "early_stop": False, "lr_position": 5e-3},
+            "train": {"iterations": steps, "max_size": SIZE, "holdout": 0, "lr_position": 5e-3},
             "splat": {"max_surfels": MOST_SURFELS, "env_size": 4},
         }
     )
@@ -75,10 +75,19 @@ def trainer(kind: str, steps: int, shading: str = "colour", seed: int = 0) -> Tr
     return Trainer(plan, surfels, light, views(kind, SIZE), views(kind, SIZE // 2), [])
 
 
-def soak(kind: str, shading: str, steps: int) -> None:
-    t = trainer(kind, steps, shading)
+def show(t: Trainer, kind: str) -> None:
+    """Put other photos before a trainer in the middle of its run."""
+    t.views, t.half, t.queue = views(kind, SIZE), views(kind, SIZE // 2), []
+    t.used = list(range(len(t.views)))
+
+
+def soak(kinds: Sequence[str], shading: str, steps: int, turn: int) -> None:
+    """`steps` steps; after every `turn` of them the next kind of photos."""
+    t = trainer(kinds[0], steps, shading)
     process, base = psutil.Process(), 0
     while t.done < t.end:
+        if t.done and t.done % turn == 0:
+            show(t, kinds[t.done // turn % len(kinds)])
         t.step()
         assert len(t.surfels) <= MOST_SURFELS
         if t.done == steps // 10:
@@ -92,16 +101,23 @@ def soak(kind: str, shading: str, steps: int) -> None:
 @pytest.mark.parametrize("shading", ["colour", "pbr"])
 @pytest.mark.parametrize("kind", KINDS)
 def test_short_soak(kind: str, shading: str) -> None:
-    soak(kind, shading, 60)
+    soak([kind], shading, 60, 60)
 
 
 @pytest.mark.stress
 @pytest.mark.timeout(0)
 @pytest.mark.parametrize("shading", ["colour", "pbr"])
 @pytest.mark.parametrize("kind", KINDS)
-def test_long_soak(kind: str, shading: str) -> None:
-    """GSBAKE_SOAK_STEPS steps of each kind (20 000 when unset)."""
-    soak(kind, shading, STEPS)
+def test_soak_of_one_kind(kind: str, shading: str) -> None:
+    soak([kind], shading, STEPS // 20, STEPS)
+
+
+@pytest.mark.stress
+@pytest.mark.timeout(0)
+@pytest.mark.parametrize("shading", ["colour", "pbr"])
+def test_long_soak(shading: str) -> None:
+    """GSBAKE_SOAK_STEPS steps (20 000 when unset) of one run that is shown every kind of photos in turn, eight times over."""
+    soak(KINDS, shading, STEPS, max(1, STEPS // (8 * len(KINDS))))
 
 
 def final(count: int, shading: str, steps: int) -> dict[str, torch.Tensor]:

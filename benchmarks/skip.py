@@ -1,0 +1,129 @@
+"""Time and error with each rule of `[skip]` on and off.
+
+python -m benchmarks.skip CAPTURE [--profile preview] [--rules photos,converged] [--modes auto,never] [--out DIR] [--csv FILE]
+
+CAPTURE is a folder of photos, or `built-in` for `gsbake synth`'s own. The first run leaves every rule at auto; then one rule after the
+other is set to each of the other modes, in the same output folder, so that stages it does not touch come from the cache. Seconds are
+those of the stages' manifests, cached ones included: what the run would take from nothing. Where the capture has its truth the mesh is
+measured against it (`benchmarks.truth`); PSNR and bytes are those of the finished asset, as the report says. A mode that cannot be had
+(poses that are not there, photos without masks) is a line with the reason.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import sys
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+
+from benchmarks.timeline import BUILT_IN, ROOT, find_capture, manifests, names
+from benchmarks.truth import measure_stage, read_truth
+from gsbake.cli.options import Options
+from gsbake.cli.session import open_session
+from gsbake.pipeline.errors import BadInputError, UsageError
+from gsbake.pipeline.skip import PREFIX
+from gsbake.profile.schema import Skip
+
+RESULTS = ROOT / "benchmarks" / "results" / "skip.csv"
+
+
+@dataclass(frozen=True)
+class Row:
+    """One run: the rule that was set, what was decided and why, whole time and quality; None where there is no such figure.
+
+    `said_s` is the time that the run itself claims to have saved by this rule.
+    """
+
+    capture: str
+    profile: str
+    rule: str
+    mode: str
+    choice: str
+    evidence: str
+    said_s: float | None = None
+    seconds: float | None = None
+    chamfer_pct: float | None = None
+    normal_deg: float | None = None
+    psnr: float | None = None
+    megabytes: float | None = None
+
+
+def measure_run(folder: Path, profile: str, rule: str, mode: str, out: Path, threads: int) -> Row:
+    """Run everything with one rule set, or take what is cached, and measure it."""
+    overrides = [f"{PREFIX}{rule}={mode}"] if rule else []
+    options = Options(photos=folder, out=out, profile=profile, overrides=overrides, device="cpu", threads=threads)
+    try:
+        states = open_session(options).engine.run("report")
+    except BadInputError as error:
+        return Row(folder.name, profile, rule, mode, "cannot be had", str(error))
+    done = manifests(states)
+    folders = {s.name: s.artifact.folder for s in states if s.artifact is not None}
+    mine = [d for m in done.values() for d in m["decisions"] if d["what"] == PREFIX + rule]
+    said = [d["saved_s"] for d in mine if "saved_s" in d]
+    figures = None
+    try:
+        read_truth(folder)
+        figures = measure_stage(folders["mesh"] / "mesh.ply", folders["poses"], folder)
+    except UsageError as error:
+        sys.stderr.write(f"{folder.name}: not measured against a truth: {error}\n")
+    return Row(
+        capture=folder.name,
+        profile=profile,
+        rule=rule or "all",
+        mode=mode,
+        choice="; ".join(d["choice"] for d in mine),
+        evidence="; ".join(d["evidence"] for d in mine),
+        said_s=sum(said) if said else None,
+        seconds=sum(m["seconds"] for m in done.values()),
+        chamfer_pct=figures.chamfer_pct if figures else None,
+        normal_deg=figures.normal_deg if figures else None,
+        psnr=done["report"]["results"]["psnr"],
+        megabytes=done["report"]["results"]["bytes"] / 1e6,
+    )
+
+
+def show(row: Row) -> None:
+    """One line on the screen."""
+
+    def text(value: float | None, form: str) -> str:
+        return "–" if value is None else format(value, form)
+
+    sys.stdout.write(
+        f"{row.capture:16} {row.rule:16} {row.mode:6} {text(row.seconds, '7.1f')} s  Chamfer {text(row.chamfer_pct, '.3f')} %  "
+        f"normals {text(row.normal_deg, '.2f')}°  PSNR {text(row.psnr, '.2f')} dB  {text(row.megabytes, '.2f')} MB  {row.choice}\n"
+    )
+    sys.stdout.flush()
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run, print as it goes, and write the CSV after every row."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("capture")
+    parser.add_argument("--profile", default="preview")
+    parser.add_argument("--rules", type=names, default=list(Skip.model_fields))
+    parser.add_argument("--modes", type=names, default=["never"], help="besides auto: never, always")
+    parser.add_argument("--threads", type=int, default=0, help="0: the physical cores")
+    parser.add_argument("--out", type=Path, default=ROOT / "out" / "bench" / "skip", help="where the runs are kept")
+    parser.add_argument("--csv", type=Path, default=RESULTS)
+    args = parser.parse_args(arguments)
+    if unknown := set(args.rules) - set(Skip.model_fields):
+        parser.error(f"there is no rule {', '.join(sorted(unknown))}; there are {', '.join(Skip.model_fields)}")
+    try:
+        folder = find_capture(args.capture, args.out) if args.capture == BUILT_IN else Path(args.capture).resolve()
+    except UsageError as error:
+        parser.error(str(error))
+    rows: list[Row] = []
+    for rule, mode in [("", "auto"), *((rule, mode) for rule in args.rules for mode in args.modes)]:
+        rows.append(measure_run(folder, args.profile, rule, mode, args.out / "runs" / folder.name, args.threads))
+        show(rows[-1])
+        args.csv.parent.mkdir(parents=True, exist_ok=True)
+        with args.csv.open("w", newline="", encoding="utf-8") as file:
+            writer = csv.DictWriter(file, [f.name for f in fields(Row)])
+            writer.writeheader()
+            writer.writerows(asdict(row) for row in rows)
+
+
+if __name__ == "__main__":
+    main()
