@@ -32,6 +32,7 @@ def shade(
     metallic: torch.Tensor,
     tables: LightTables,
     occlusion: torch.Tensor | None = None,
+    diffuse_openness: torch.Tensor | None = None,
 ) -> torch.Tensor:
     """Linear colours (n, 3) of n pixels.
 
@@ -44,6 +45,7 @@ def shade(
     tables: the light, in the same frame.
     occlusion: (n,), the open share of the hemisphere, 1 = open; None leaves everything open. It scales the diffuse part and, by the
     formula of Lagarde & de Rousiers (*Moving Frostbite to PBR*, 2014), the specular part.
+    diffuse_openness: (n,), scales the diffuse part instead, where the share of this very light that gets through is known.
 
     Notes
     -----
@@ -53,7 +55,7 @@ def shade(
     if occlusion is None:
         open_d = open_s = torch.ones_like(roughness)
     else:
-        open_d, open_s = occlusion, _specular_openness(normal, view, roughness, occlusion)
+        open_d, open_s = occlusion if diffuse_openness is None else diffuse_openness, _specular_openness(normal, view, roughness, occlusion)
     inputs = (normal, view, albedo, roughness, metallic, open_d, open_s, tables.table)
     if all(t.device.type == "cpu" and t.dtype == torch.float32 for t in inputs):
         colour: torch.Tensor = _Kernel.apply(tables.layout, *inputs)

@@ -13,7 +13,13 @@ How rough the object is at the start decides which light is found: a surface tak
 reflections end as paint; one taken for smooth blurs the light instead. So short trials from a few values compete on photos they were not
 fitted to, and the best goes on; from there every texel finds its own.
 
+Metals are looked for when the light is known well enough, and again when they have sharpened it (`metal`); those found are set, and the
+steps that follow may take it back.
+
 Normals bend a little where reflections ask for it: meshes are smoother than the light is sharp.
+
+What the object keeps of the light from itself follows the present light (`visibility`), renewed every few steps without gradient: a shadow
+is neither paint nor evenly grey. Light that comes from other texels is added to the diffuse part and so does not end as paint either.
 
 Munkberg et al., *Extracting triangular 3D models, materials, and lighting from images*, CVPR 2022, fit textures and a split-sum light
 together in this way; occlusion per texel and the view-wise weights are what a fixed mesh adds.
@@ -35,8 +41,11 @@ from gsbake.light.colour import colourfulness, linear_to_srgb
 from gsbake.light.environment import EnvironmentLight
 from gsbake.light.shade import shade
 from gsbake.light.tables import LightTables
+from gsbake.texture.colour import decode
+from gsbake.texture.metal import Evidence, find_metals
 from gsbake.texture.pixels import Pixels
 from gsbake.texture.texels import Texels
+from gsbake.texture.visibility import Visibility
 
 Floats = NDArray[np.float32]
 
@@ -45,13 +54,19 @@ TRIALS, TRIAL_STEPS, TRIAL_PIXELS, TRIAL_PHOTO = (0.2, 0.45, 0.8), 100, 15_000, 
 #: Metallic that every texel starts from.
 METALLIC = 0.05
 #: Adam's rates of the texels' logits, of the light and of the normals' bends; all decay to a tenth.
-RATE, RATE_LIGHT, RATE_BEND = 0.15, 0.1, 0.01
+RATE, RATE_LIGHT, RATE_BEND = 0.15, 0.15, 0.01
 #: Prices on the square of a normal's bend and of its change between neighbouring texels of a texture of 512.
 FLAT, EVEN = 0.1, 60.0
 #: Adam's memory, and the gradient (of the loss per texel) below which it takes smaller steps: texels that one photo hardly sees.
 BETAS, STILL = (0.9, 0.99), 2e-3
 #: Logits start within this range of base colour.
 BASE_RANGE = (0.01, 0.95)
+#: Shares of the steps after which metals are looked for, and the metallic that those found go on from.
+METALS_AT, METAL = (0.3, 0.55), 0.8
+#: How much of the smoothness price base colour (three channels), roughness and metallic pay: print changes the colour alone.
+ALIKE = (1.0, 1.0, 1.0, 6.0, 4.0)
+#: Shadows and bounced light are renewed every so many steps.
+RENEWED = 25
 #: Share of the neighbouring pairs of texels that one step compares.
 COMPARED = 0.25
 
@@ -61,22 +76,23 @@ class Priors:
     """Weights of what is believed without evidence; see the module's formula."""
 
     smooth: float = 0.03
-    dark: float = 0.02
+    dark: float = 0.005
     metal: float = 0.003
-    white: float = 0.005
+    white: float = 0.0005
 
 
 @dataclass(frozen=True)
 class Fitted:
     """`values` (n, 5): linear base colour, roughness, metallic of each texel; `bend` (n, 3) to be added to its unit normal; `weight` (n,):
     what all photos together say about it (in pixels); the `light` in the mesh's frame; PSNR in dB over the pixels of held-out photos (None
-    without any)."""
+    without any); texels last set to metal."""
 
     values: Floats
     bend: Floats
     weight: Floats
     light: EnvironmentLight
     held_out: float | None
+    metals: int
 
 
 class MaterialFit:
@@ -91,9 +107,12 @@ class MaterialFit:
         light_size: int,
         priors: Priors,
         roughness: float,
+        visibility: Visibility | None = None,
+        bounce: bool = True,
     ) -> None:
         """`normal` (n, 3) unit normals of the n texels in the mesh's frame, `occlusion` (n,) their open share, `base` (n, 3) linear colours
-        and `roughness` to start from; `light_size` is the edge of the environment cube map."""
+        and `roughness` to start from; `light_size` is the edge of the environment cube map. With `visibility` shadows
+        follow the light, with `bounce` texels light each other as well."""
         n = len(texels)
         logits = torch.zeros(n, 5)
         logits[:, :3] = torch.logit(torch.as_tensor(np.clip(base, *BASE_RANGE), dtype=torch.float32))
@@ -102,22 +121,39 @@ class MaterialFit:
         self._normal = torch.as_tensor(np.ascontiguousarray(normal, np.float32))
         self._bend = torch.zeros(n, 3, requires_grad=True)
         self._even = EVEN * (texels.size / 512) ** 2  # a slope per texel is steeper where texels are larger
-        self._open = torch.as_tensor(np.ascontiguousarray(occlusion, np.float32))
+        open_share = torch.as_tensor(np.ascontiguousarray(occlusion, np.float32))[:, None]
+        self._around = torch.cat([open_share, open_share, torch.zeros(n, 3)], 1)
+        self._visibility, self._bounce = visibility, bounce
         self._light = EnvironmentLight(light_size)
         self._priors = priors
+        self._alike = torch.tensor(ALIKE)
         self._pairs = torch.as_tensor(_neighbours(texels))
         self._adam = torch.optim.Adam([self._logits.requires_grad_()], lr=RATE, betas=BETAS, eps=STILL)
         self._adam_bend = torch.optim.Adam([self._bend], lr=RATE_BEND, betas=BETAS, eps=STILL)
         self._adam_light = torch.optim.Adam([self._light.raw], lr=RATE_LIGHT, betas=BETAS)
 
     def run(
-        self, photos: list[Pixels], held: list[Pixels], steps: int, seed: int, each: Callable[[int, int], None] | None = None
+        self,
+        photos: list[Pixels],
+        held: list[Pixels],
+        steps: int,
+        seed: int,
+        each: Callable[[int, int], None] | None = None,
+        metals: bool = True,
     ) -> Fitted:
-        """Fit to `photos` in `steps` steps of one photo each, in an order drawn from `seed`; `held` only tell how good it got."""
+        """Fit to `photos` in `steps` steps of one photo each, in an order drawn from `seed`; `held` only tell how good it got.
+
+        Without `metals` none are looked for: in trials, and on things that do not shine.
+        """
         generator = torch.Generator().manual_seed(seed)
-        batches = [_Batch.of(p, self._normal, self._open) for p in photos if len(p)]
+        batches = [_Batch.of(p, self._normal) for p in photos if len(p)]
         order: list[int] = []
+        found = 0
         for step in range(steps if batches else 0):
+            if metals and step in {int(share * steps) for share in METALS_AT}:
+                found = self._set_metals(batches)
+            if step % RENEWED == 0:
+                self._renew()
             order = order or torch.randperm(len(batches), generator=generator).tolist()
             self._step(batches[order.pop()], 0.1 ** (step / steps), generator)
             if each is not None:
@@ -129,13 +165,14 @@ class MaterialFit:
         with torch.no_grad():
             values = torch.sigmoid(self._logits).numpy()
         bend = self._bend.detach().numpy()
-        score = self._score([_Batch.of(p, self._normal, self._open) for p in held if len(p)])
-        return Fitted(values, bend, weight.numpy(), self._light, score)
+        score = self._score([_Batch.of(p, self._normal) for p in held if len(p)])
+        return Fitted(values, bend, weight.numpy(), self._light, score, found)
 
     def _step(self, batch: _Batch, decay: float, generator: torch.Generator) -> None:
         values = torch.sigmoid(self._logits)
-        shaded = batch.shade(values, self._bend, self._light.prefilter())
-        error = (linear_to_srgb(shaded.clamp_min(0)) - batch.colour).abs().mean(1)
+        shaded = batch.shade(values, self._bend, self._light.prefilter(), self._around)
+        # Clamped, a reflection brighter than white has no gradient: where the photo shows none, it is misplaced rather than too bright.
+        error = (linear_to_srgb(shaded.clamp(0, 1)) - batch.colour).abs().mean(1)
         priors = self._priors
         loss = (error * batch.weight).mean()
         loss = loss + priors.dark * values[:, :3].mean() + priors.metal * values[:, 4].mean()
@@ -145,7 +182,7 @@ class MaterialFit:
             count = max(1, int(COMPARED * len(self._pairs)))
             start = int(torch.randint(len(self._pairs) - count + 1, (1,), generator=generator))
             pair = self._pairs[start : start + count]
-            loss = loss + priors.smooth * (values[pair[:, 0]] - values[pair[:, 1]]).abs().sum(1).mean()
+            loss = loss + priors.smooth * ((values[pair[:, 0]] - values[pair[:, 1]]).abs() @ self._alike).mean()
             loss = loss + self._even * ((self._bend[pair[:, 0]] - self._bend[pair[:, 1]]) ** 2).sum(1).mean()
         loss = loss + FLAT * (self._bend**2).sum(1).mean()
         for adam, rate in ((self._adam, RATE), (self._adam_bend, RATE_BEND), (self._adam_light, RATE_LIGHT)):
@@ -157,12 +194,41 @@ class MaterialFit:
         self._adam_light.step()
 
     @torch.no_grad()
+    def _renew(self) -> None:
+        """Let shadows and bounced light follow the present light and materials."""
+        if self._visibility is None:
+            return
+        openness = torch.as_tensor(self._visibility.openness(self._light.radiance().numpy()))
+        self._around[:, 0] = openness
+        if self._bounce:
+            values = torch.sigmoid(self._logits)
+            # (1 − m) albedo + F0: whatever the roughness, what is not reflected as paint is reflected as gloss.
+            reflectance = values[:, :3] + 0.04 * (1 - values[:, 4:])
+            irradiance = self._light.prefilter().diffuse(self._normal) * openness[:, None]
+            self._around[:, 2:] = torch.as_tensor(self._visibility.bounced(irradiance.numpy(), reflectance.numpy()))
+
+    @torch.no_grad()
+    def _set_metals(self, batches: list[_Batch]) -> int:
+        """Start texels that metal explains better anew, as that metal; how many they are."""
+        tables = self._light.prefilter()
+        own = torch.sigmoid(self._logits[:, 3]).numpy()
+        found = find_metals([batch.evidence(self._bend, tables, self._around) for batch in batches], own)
+        texel = torch.as_tensor(found.texel)
+        start = np.column_stack([np.clip(found.base, *BASE_RANGE), found.roughness, np.full(len(texel), METAL)])
+        self._logits[texel] = torch.logit(torch.as_tensor(start, dtype=torch.float32))
+        for moment in self._adam.state[self._logits].values():
+            if moment.shape == self._logits.shape:
+                moment[texel] = 0
+        return len(texel)
+
+    @torch.no_grad()
     def _score(self, batches: list[_Batch]) -> float | None:
         """PSNR in dB over all pixels of the batches."""
         if not batches:
             return None
         values, tables = torch.sigmoid(self._logits), self._light.prefilter()
-        squares = torch.cat([((linear_to_srgb(b.shade(values, self._bend, tables).clamp_min(0)) - b.colour) ** 2).mean(1) for b in batches])
+        shaded = (b.shade(values, self._bend, tables, self._around).clamp_min(0) for b in batches)
+        squares = torch.cat([((linear_to_srgb(s) - b.colour) ** 2).mean(1) for s, b in zip(shaded, batches, strict=True)])
         return -10 * math.log10(max(float(squares.mean()), 1e-10))
 
 
@@ -179,7 +245,7 @@ def trial_roughness(
     judges, rest = few[::TRIAL_PHOTO], [p for i, p in enumerate(few) if i % TRIAL_PHOTO]
     found: dict[float, float] = {}
     for turn, roughness in enumerate(TRIALS):
-        score = make(roughness).run(rest, judges, TRIAL_STEPS, seed).held_out
+        score = make(roughness).run(rest, judges, TRIAL_STEPS, seed, metals=False).held_out
         if score is not None:
             found[roughness] = score
         if each is not None:
@@ -187,9 +253,17 @@ def trial_roughness(
     return found
 
 
+def trial_cost(photos: list[Pixels], step: float) -> float:
+    """Seconds that `trial_roughness` would take, from those of one `step` of the fit itself: steps cost by the pixels they shade."""
+    if len(photos) < TRIAL_PHOTO:
+        return 0.0
+    pixels = sum(len(p) for p in photos) / len(photos)
+    return len(TRIALS) * TRIAL_STEPS * step * min(1.0, TRIAL_PIXELS / max(1.0, pixels))
+
+
 @dataclass(frozen=True)
 class _Batch:
-    """One photo's pixels as tensors, with what does not change: their normals and occlusion."""
+    """One photo's pixels as tensors, with what does not change: their normals."""
 
     texel: Tensor
     share: Tensor
@@ -197,19 +271,40 @@ class _Batch:
     colour: Tensor
     weight: Tensor
     normal: Tensor
-    open: Tensor
 
     @classmethod
-    def of(cls, pixels: Pixels, normal: Tensor, occlusion: Tensor) -> _Batch:
+    def of(cls, pixels: Pixels, normal: Tensor) -> _Batch:
         texel, share = torch.as_tensor(pixels.texel), torch.as_tensor(pixels.share)
         towards, colour, weight = (torch.as_tensor(x) for x in (pixels.towards, pixels.colour, pixels.weight))
-        return cls(texel, share, towards, colour, weight, _read(normal, texel, share), _read(occlusion[:, None], texel, share)[:, 0])
+        return cls(texel, share, towards, colour, weight, _read(normal, texel, share))
 
-    def shade(self, values: Tensor, bend: Tensor, tables: LightTables) -> Tensor:
-        """Linear colours (n, 3) of the pixels when the texels have `values` (texels, 5)."""
+    def shade(self, values: Tensor, bend: Tensor, tables: LightTables, around: Tensor) -> Tensor:
+        """Linear colours (n, 3) of the pixels when the texels have `values` (texels, 5) and their surroundings are `around` (texels, 5)."""
         g = _read(values, self.texel, self.share)
-        turned = self.normal + _read(bend, self.texel, self.share)
-        return shade(turned, self.towards, g[:, :3], g[:, 3], g[:, 4], tables, self.open)
+        near = _read(around, self.texel, self.share)
+        return _lit(self._turned(bend), self.towards, g[:, :3], g[:, 3], g[:, 4], tables, near)
+
+    def evidence(self, bend: Tensor, tables: LightTables, around: Tensor) -> Evidence:
+        """The pixels for `find_metals`; each counts for the texel that has most of it."""
+        normal, near = self._turned(bend), _read(around, self.texel, self.share)
+        texel = self.texel.gather(1, self.share.argmax(1, keepdim=True))[:, 0]
+
+        def shaded(base: float, roughness: Floats, metallic: float) -> Floats:
+            n = len(texel)
+            constant = (torch.full((n, 3), base), torch.as_tensor(roughness)[texel], torch.full((n,), metallic))
+            return np.asarray(_lit(normal, self.towards, *constant, tables, near).numpy())
+
+        return Evidence(texel.numpy(), decode(self.colour.numpy()), self.weight.numpy(), shaded)
+
+    def _turned(self, bend: Tensor) -> Tensor:
+        """Normals (n, 3) of the pixels, of any length, when those of the texels have the `bend` (texels, 3)."""
+        return self.normal + _read(bend, self.texel, self.share)
+
+
+def _lit(normal: Tensor, towards: Tensor, albedo: Tensor, roughness: Tensor, metallic: Tensor, tables: LightTables, near: Tensor) -> Tensor:
+    """`shade` with the surroundings `near` (n, 5): openness to this light and to an even one, irradiance / π from the object itself."""
+    direct = shade(normal, towards, albedo, roughness, metallic, tables, near[:, 1], near[:, 0])
+    return direct + (1 - metallic)[:, None] * albedo * near[:, 2:]
 
 
 def _read(values: Tensor, texel: Tensor, share: Tensor) -> Tensor:

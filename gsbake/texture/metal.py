@@ -1,0 +1,102 @@
+"""Is it metal? Texel by texel, both answers are tried against all photos with the light at hand.
+
+Between paint and metal lies a hill that gradient steps do not climb: paint that is slowly turned to metal loses its own colour before
+it gains a reflection. Seen through one light, though, either answer is linear in the base colour b,
+
+    paint: shade = b · E(n) + L(d) · (.04 A + B)        metal: shade = b · L(d) A + L(d) B
+
+(METHOD §6), so for each of a few roughnesses the best b and what it leaves unexplained are sums over the texel's pixels. Errors are
+weighed by the slope of the sRGB curve at the photo's own colour: those of the eye, not of the lamp. Metals reflect a third of every
+colour or more (gold's blue, the darkest of the common ones, is .34: Lagarde & de Rousiers, *Moving Frostbite to PBR*, 2014); without
+that bound black paint passes for a dark metal.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+#: Roughnesses tried beside a texel's own.
+ROUGHNESS = (0.1, 0.2, 0.35, 0.55)
+#: Least base colour of a metal.
+DARKEST_METAL = 0.3
+#: What the metal leaves unexplained must be below this share of what the paint leaves.
+CLEARLY = 0.9
+#: Darkest linear colour that the slope of the sRGB curve is taken at.
+DIM = 0.02
+#: Texels with less weight of pixels than this are left alone.
+LEAST_WEIGHT = 0.3
+
+#: Shades pixels of one photo: (base colour 0 or 1, roughness (texels,), metallic 0 or 1) to linear colours (n, 3).
+Shader = Callable[[float, NDArray[np.float32], float], NDArray[np.float32]]
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """n pixels of one photo: the `texel` (n,) each shows, its linear `colour` (n, 3), `weight` (n,), and how to `shade` them."""
+
+    texel: NDArray[np.int64]
+    colour: NDArray[np.float32]
+    weight: NDArray[np.float32]
+    shade: Shader
+
+
+@dataclass(frozen=True)
+class Metals:
+    """Texels (m,) that metal explains better than paint, with the metal's linear base colour (m, 3) and roughness (m,)."""
+
+    texel: NDArray[np.int64]
+    base: Floats
+    roughness: Floats
+
+
+class _Sums:
+    """What the pixels of each texel say about b in shade = b · slope + offset, least squares."""
+
+    def __init__(self, texels: int) -> None:
+        self.slopes, self.mixed, self.squares = (np.zeros((texels, 3)) for _ in range(3))
+
+    def add(self, evidence: Evidence, weight: NDArray[Any], offset: NDArray[Any], slope: NDArray[Any]) -> None:
+        rest = evidence.colour - offset
+        for k in range(3):
+            w, a, d = weight[:, k], slope[:, k], rest[:, k]
+            for total, value in ((self.slopes, w * a * a), (self.mixed, w * a * d), (self.squares, w * d * d)):
+                total[:, k] += np.bincount(evidence.texel, value, len(total))
+
+    def best(self, darkest: float) -> tuple[Floats, Floats]:
+        """b (texels, 3) within [darkest, 1] and the weighted squares (texels,) it leaves."""
+        b = np.clip(self.mixed / np.maximum(self.slopes, 1e-12), darkest, 1.0)
+        return b, (self.squares - 2 * b * self.mixed + b * b * self.slopes).sum(1)
+
+
+def find_metals(photos: Sequence[Evidence], own: NDArray[np.float32], each: Callable[[], None] | None = None) -> Metals:
+    """The texels that are better explained as metal; `own` (texels,) is their present roughness, `each` is called now and then."""
+    texels = len(own)
+    weights = [e.weight[:, None] * np.maximum(e.colour, DIM) ** (-7 / 6) for e in photos]  # slope² of the curve's power of 1/2.4
+    paint = np.full(texels, np.inf)
+    metal, base, roughness = np.full(texels, np.inf), np.zeros((texels, 3)), np.zeros(texels)
+    for tried in (own, *(np.full(texels, r, np.float32) for r in ROUGHNESS)):
+        for metallic in (0.0, 1.0):
+            sums = _Sums(texels)
+            for evidence, weight in zip(photos, weights, strict=True):
+                offset = evidence.shade(0.0, tried, metallic)
+                sums.add(evidence, weight, offset, evidence.shade(1.0, tried, metallic) - offset)
+            if each is not None:
+                each()
+            if not metallic:
+                paint = np.minimum(paint, sums.best(0.0)[1])
+                continue
+            b, left = sums.best(DARKEST_METAL)
+            better = left < metal
+            metal[better], base[better], roughness[better] = left[better], b[better], tried[better]
+    seen = np.zeros(texels)
+    for evidence in photos:
+        seen += np.bincount(evidence.texel, evidence.weight, texels)
+    chosen = np.flatnonzero((metal < CLEARLY * paint) & (seen > LEAST_WEIGHT))
+    return Metals(chosen, base[chosen], roughness[chosen])
