@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 from gsbake.pipeline.errors import BadInputError
+from gsbake.pipeline.skip import leave_out, wanted
 from gsbake.pipeline.stage import Context, Stage
 
 if TYPE_CHECKING:
@@ -21,10 +22,10 @@ if TYPE_CHECKING:
 
 #: Occlusion is smooth: it is traced on at most this many texels along the edge and enlarged.
 OCCLUSION_SIZE = 1024
+#: Rays for occlusion start this share of the diagonal above the surface; the result is averaged within this many texels.
+OFFSET, REACH = 0.002, 3.0
 #: Held-out photos count this much: they fill only what no other photo saw, so that figures taken on them stay honest.
 HELD_OUT_WEIGHT = 1e-4
-#: Gains between photos below this factor are taken for view dependence, not exposure.
-STEADY = 1.25
 #: Within this share of a photo's longer side from the mask's border, pixels count less.
 MASK_MARGIN = 0.008
 #: Materials are fitted to at most this many pixels of each photo.
@@ -63,6 +64,7 @@ def run(ctx: Context) -> dict[str, Any]:
 
     from gsbake.texture.flood import continue_over_surface, flood
     from gsbake.texture.masters import write_exr
+    from gsbake.texture.needed import normals_agree
     from gsbake.texture.normals import normal_map
 
     settings = ctx.settings.bake
@@ -87,9 +89,9 @@ def run(ctx: Context) -> dict[str, Any]:
         with ctx.part("fit"):
             blended, detail, fit = _fit_materials(ctx, surface, blended, detail, open_share)
     tangent = texels.interpolate(surface.tangent, surface.atlas.faces)
-    coded = normal_map(detail, texels.interpolate(surface.normal, surface.atlas.faces), tangent)
-    if not settings.normal_map:
-        coded[:] = (0.5, 0.5, 1.0)
+    agree, evidence = (False, "materials are fitted, which bends normals") if fit else normals_agree(detail, surface.facing)
+    plain = leave_out(ctx, "normal_map", agree, evidence, "no normal map", "normal map baked")
+    coded = None if plain else normal_map(detail, texels.interpolate(surface.normal, surface.atlas.faces), tangent)
     with ctx.part("flood"):
         if not blended.seen.any():
             raise BadInputError("bake: no photo sees the mesh; poses and mesh do not belong together, run from the poses stage again.")
@@ -99,12 +101,13 @@ def run(ctx: Context) -> dict[str, Any]:
             values = np.concatenate([values, constant], 1)
         values = np.clip(values, 0, 1)
         coverage = np.stack([np.ones(len(texels), np.float32), blended.seen.astype(np.float32), blended.confidence], 1)
-        packed = np.concatenate([values[:, :3], open_share[:, None], values[:, 3:5], coded], 1)
+        packed = np.concatenate([values[:, :3], open_share[:, None], values[:, 3:5]] + ([] if coded is None else [coded]), 1)
         image = flood(texels.image(packed), texels.covered(), rim=max(2, settings.size // 256))
     with ctx.part("write"):
         write_exr(ctx.out / "base_color.exr", image[..., 0:3])
         write_exr(ctx.out / "orm.exr", image[..., 3:6])
-        write_exr(ctx.out / "normal.exr", image[..., 6:9])
+        if coded is not None:
+            write_exr(ctx.out / "normal.exr", image[..., 6:9])
         write_exr(ctx.out / "coverage.exr", texels.image(coverage))
         _save_mesh(ctx, surface)
     unseen = float(1 - blended.seen.mean())
@@ -204,7 +207,6 @@ def _occlusion(ctx: Context, surface: Surface, dense: tuple[RayCaster, NDArray[n
         texels = rasterise(surface.atlas.uv, surface.atlas.faces, OCCLUSION_SIZE)
         facing = texels.interpolate(surface.normal, surface.atlas.faces)
         detail = find_detail(texels.interpolate(surface.position, surface.atlas.faces), facing, *dense, surface.diagonal)
-    offset = 0.002 * surface.diagonal
 
     def each(done: int, total: int) -> None:
         ctx.check_stop()
@@ -213,8 +215,8 @@ def _occlusion(ctx: Context, surface: Surface, dense: tuple[RayCaster, NDArray[n
     value = np.ones(len(texels), np.float32)
     for mine, caster in ((detail.found, dense[0]), (~detail.found, surface.caster)):
         if mine.any():
-            value[mine] = occlusion(detail.position[mine], detail.normal[mine], caster, rays, offset, each)
-    value = smoothed(texels, value, detail.position, detail.normal, reach=3 * surface.texel * size / texels.size)
+            value[mine] = occlusion(detail.position[mine], detail.normal[mine], caster, rays, OFFSET * surface.diagonal, each)
+    value = smoothed(texels, value, detail.position, detail.normal, reach=REACH * surface.texel * size / texels.size)
     if texels is surface.texels:
         return value
     image = flood(texels.image(value), texels.covered(), rim=2)[..., 0]
@@ -224,11 +226,10 @@ def _occlusion(ctx: Context, surface: Surface, dense: tuple[RayCaster, NDArray[n
 
 def _project_photos(ctx: Context, surface: Surface) -> Blended:
     """Base colour (n, 3) from the photos at their stored size."""
-    import numpy as np
-
     from gsbake.capture.posed import PosedPhotos
     from gsbake.splat.views import held_out
     from gsbake.texture.colour import decode_bytes
+    from gsbake.texture.needed import constant_exposure
     from gsbake.texture.project import ProjectionBlender, mask_weights
 
     posed = PosedPhotos.open(ctx.inputs["poses"])
@@ -241,15 +242,13 @@ def _project_photos(ctx: Context, surface: Surface) -> Blended:
         weights = None if view.mask is None else mask_weights(view.mask, margin)
         blender.add(view.camera, decode_bytes(view.rgb), weights, HELD_OUT_WEIGHT if index in aside else 1.0)
         ctx.progress(index + 1, len(posed), "photos onto the texture")
-    blended = blender.result(solve_exposure=ctx.settings.bake.equalise)
-    if ctx.settings.bake.equalise:
-        spread = float(np.exp(np.abs(np.log(blended.gains)).max()))
-        evidence = f"photos compared on the surface differ by up to {spread:.2f}x"
-        if spread < STEADY:  # what view dependence alone would show: dividing it out would wash reflections away
-            ctx.decide("exposure", "constant", evidence)
-            blended = blender.result()
-        else:
-            ctx.decide("exposure", "equalised", evidence)
+    if ctx.settings.skip.exposure == "always":
+        steady, evidence, blended = True, "not measured", blender.result()
+    else:
+        blended = blender.result(solve_exposure=True)
+        steady, evidence = constant_exposure(blended.gains)
+    if leave_out(ctx, "exposure", steady, evidence, "exposure taken as constant", "exposure equalised") and (blended.gains != 1).any():
+        blended = blender.result()
     return blended
 
 
@@ -260,14 +259,19 @@ def _fit_materials(
 
     `shown` is what the photos show (n, 3): the fit starts from it, and where the fit works on a coarser texture it gives the fine detail.
     """
+    import time
+
     import numpy as np
 
     from gsbake.capture.posed import PosedPhotos
+    from gsbake.capture.steadiness import looks_diffuse
     from gsbake.splat.views import held_out
     from gsbake.surface.resolution import pixel_footprint
+    from gsbake.surface.watch import PLACES, watch_mesh
     from gsbake.texture.coarse import Coarse
-    from gsbake.texture.fit import TRIALS, MaterialFit, Priors, trial_roughness
+    from gsbake.texture.fit import TRIALS, MaterialFit, Priors, trial_cost, trial_roughness
     from gsbake.texture.pixels import PixelReader
+    from gsbake.texture.visibility import Visibility
 
     settings = ctx.settings.bake
     posed = PosedPhotos.open(ctx.inputs["poses"])
@@ -292,19 +296,41 @@ def _fit_materials(
     priors = Priors(settings.smooth_prior, settings.dark_prior, settings.metal_prior, settings.white_prior)
     normal, occlusion, base = (coarse.down(x) for x in (detail.normal, open_share[:, None], shown.values))
 
-    def start(roughness: float) -> MaterialFit:
-        return MaterialFit(coarse.texels, normal, occlusion[:, 0], base, ctx.settings.splat.env_size, priors, roughness)
+    seen = None
+    if settings.visibility in ("directional", "bounce") and settings.occlusion_rays:
+        above, near, rays = OFFSET * surface.diagonal, REACH * coarse.edge, 2 * settings.occlusion_rays  # over the whole sphere
+        seen = Visibility.trace(coarse.texels, surface.atlas.uv, surface.whole, normal, rays, above, near, lambda *_: ctx.check_stop())
+    if settings.visibility == "none":
+        occlusion = np.ones_like(occlusion)
 
-    trials = trial_roughness(start, photos, ctx.seed, lambda done, total: ctx.check_stop())
-    best = max(trials, key=lambda roughness: trials[roughness]) if trials else TRIALS[1]
-    evidence = ", ".join(f"{score:.2f} dB from {roughness:g}" for roughness, score in trials.items()) or "too few photos for trials"
-    ctx.decide("roughness starts at", f"{best:g}", evidence)
-    fitted = start(best).run(photos, held, settings.fit_steps, ctx.seed, each)
+    def start(roughness: float) -> MaterialFit:
+        light_size, bounce = ctx.settings.splat.env_size, settings.visibility == "bounce"
+        return MaterialFit(coarse.texels, normal, occlusion[:, 0], base, light_size, priors, roughness, seen, bounce)
+
+    some = slice(None, None, max(1, len(surface.at) // PLACES))
+    views = (posed.view(index, settings.fit_size) for index in range(len(posed)))
+    diffuse, why = looks_diffuse(*watch_mesh(surface.at[some], surface.facing[some], surface.caster, surface.diagonal, views))
+    matte = wanted(ctx, "view_dependence", diffuse)
+    trials = {} if matte else trial_roughness(start, photos, ctx.seed, lambda done, total: ctx.check_stop())
+    best = max(trials, key=lambda roughness: trials[roughness]) if trials else TRIALS[-1] if matte else TRIALS[1]
+    tried = ", ".join(f"{score:.2f} dB from {roughness:g}" for roughness, score in trials.items())
+    ctx.decide("roughness starts at", f"{best:g}", tried or ("the object is matt" if matte else "too few photos for trials"))
+    begun = time.perf_counter()
+    fitted = start(best).run(photos, held, settings.fit_steps, ctx.seed, each, metals=not matte)
+    spent = (time.perf_counter() - begun) / settings.fit_steps
+    leave_out(
+        ctx, "view_dependence", diffuse, why, "reflections taken for broad, none tried", "reflections looked for", trial_cost(photos, spent)
+    )
     fitted.light.save(ctx.out / "light.safetensors")
     values = coarse.up(fitted.values)
     values[:, :3] *= coarse.detail(shown.values)
     known = coarse.up(fitted.weight[:, None])[:, 0] > LEAST_SEEN * (coarse.edge / footprint) ** 2
-    figures: dict[str, Any] = {"fit_psnr": fitted.held_out, "fit_pixels": sum(map(len, photos)), "fit_texels": len(coarse.texels)}
+    figures: dict[str, Any] = {
+        "fit_psnr": fitted.held_out,
+        "fit_pixels": sum(map(len, photos)),
+        "fit_texels": len(coarse.texels),
+        "fit_metal_texels": fitted.metals,
+    }
     turned = detail.normal + np.where(known[:, None], coarse.up(fitted.bend), 0)
     turned /= np.linalg.norm(turned, axis=1, keepdims=True)
     return replace(shown, values=values, views=np.where(known, shown.views, 0)), replace(detail, normal=turned), figures
@@ -355,11 +381,11 @@ def _save_mesh(ctx: Context, surface: Surface) -> None:
 
 STAGE = Stage(
     name="bake",
-    version=2,
+    version=3,
     title="Textures",
     run=run,
     needs=("poses", "refine", "mesh"),
-    settings=("bake.*", "splat.env_size", "train.max_size", "train.holdout"),
+    settings=("bake.*", "splat.env_size", "train.max_size", "train.holdout", "skip.exposure", "skip.normal_map", "skip.view_dependence"),
     uses_device=True,
     seeded=True,
 )

@@ -41,7 +41,7 @@ def run(ctx: Context) -> dict[str, Any]:
     frame = asset_frame(cameras, arrays["position"])
     mesh = _place(arrays, frame)
     with ctx.part("images"):
-        normal = read_exr(baked / "normal.exr") if ctx.settings.bake.normal_map else None
+        normal = read_exr(baked / "normal.exr") if (baked / "normal.exr").exists() else None
         sheets = quantise(read_exr(baked / "base_color.exr"), read_exr(baked / "orm.exr"), normal)
         geometry = sum(a.nbytes for a in (mesh.position, mesh.normal, mesh.tangent, mesh.uv, mesh.faces)) + 4096
         images, saving = encode_within(sheets, int(settings.max_megabytes * 1e6) - geometry)
@@ -127,9 +127,9 @@ def _extras(ctx: Context, cameras: CameraSet, mesh: GltfMesh, sheets: Sheets) ->
                 hasher.update(part.tobytes())
         return hasher.hexdigest(16)
 
-    chosen = ctx.settings
+    chosen = ctx.settings.bake
     return {
-        "profile": {"materials": chosen.bake.materials, "texture_size": chosen.bake.size, "normal_map": chosen.bake.normal_map},
+        "profile": {"materials": chosen.materials, "texture_size": chosen.size, "normal_map": sheets.normal is not None},
         "scale": "metres" if cameras.metric else "unknown",
         "poses": cameras.poses,
         "digests": {
@@ -185,5 +185,5 @@ STAGE = Stage(
     title="Asset",
     run=run,
     needs=("ingest", "poses", "refine", "bake"),
-    settings=("export.*", "bake.materials", "bake.size", "bake.normal_map"),
+    settings=("export.*", "bake.materials", "bake.size"),
 )

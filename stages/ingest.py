@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gsbake.pipeline.errors import BadInputError
+from gsbake.pipeline.skip import leave_out
 from gsbake.pipeline.stage import Context, Stage
 
 if TYPE_CHECKING:
@@ -29,6 +30,14 @@ class _Read:
     quality: Quality
 
 
+@dataclass(frozen=True)
+class _MaskSource:
+    """Where a photo's mask comes from: its mask file, or its own alpha channel when there is none."""
+
+    file: Path | None
+    invert: bool
+
+
 def run(ctx: Context) -> dict[str, Any]:
     """Read, check and reduce all photos; see docs/architecture.md for the files."""
     from gsbake.capture.masks import match_masks
@@ -37,7 +46,8 @@ def run(ctx: Context) -> dict[str, Any]:
     folder = ctx.inputs["photos"]
     paths = {path.relative_to(folder).as_posix(): path for path in list_photos(folder)}
     names = _names(paths)
-    masks = match_masks(ctx.inputs["masks"], paths) if "masks" in ctx.inputs else {}
+    use_masks = ctx.settings.skip.masks != "never"
+    masks = match_masks(ctx.inputs["masks"], paths) if use_masks and "masks" in ctx.inputs else {}
     skipped: list[dict[str, str]] = []
     with ctx.part("duplicates"):
         _drop_copies(paths, skipped, ctx)
@@ -48,7 +58,9 @@ def run(ctx: Context) -> dict[str, Any]:
         lost = f" ({len(skipped)} of {len(names)} were skipped: {skipped[0]['source']}: {skipped[0]['why']})" if skipped else ""
         raise BadInputError(f"{folder} has {len(read)} usable photos{lost}, but at least {least} are needed; take more around the object.")
     _mark_alike(ctx, read)
-    _report_masks(ctx, read, masks)
+    _settle_masks(ctx, read, masks)
+    with ctx.part("resolution"):
+        _settle_resolution(ctx, read)
     results = _poses(ctx, list(names), read)
     entries = [r.entry for r in read.values()]
     (ctx.out / "photos.json").write_text(json.dumps({"photos": entries, "skipped": skipped}, indent=1))
@@ -112,10 +124,12 @@ def _read_all(
     read: dict[str, _Read] = {}
     settings = ctx.settings.ingest
     max_size, invert = int(settings.max_size), bool(settings.invert_masks)
+    use_masks = ctx.settings.skip.masks != "never"
     with ThreadPoolExecutor(max(1, min(ctx.threads, 8))) as pool:
 
         def submit(relative: str) -> Future[_Read]:
-            return pool.submit(_read_one, paths[relative], relative, names[relative], masks.get(relative), ctx.out, max_size, invert)
+            mask_of = _MaskSource(masks.get(relative), invert) if use_masks else None
+            return pool.submit(_read_one, paths[relative], relative, names[relative], mask_of, ctx.out, max_size)
 
         try:
             for done, (relative, future) in enumerate(_in_order(submit, list(paths), 2 * max(1, ctx.threads))):
@@ -144,8 +158,8 @@ def _in_order(submit: Any, items: list[str], ahead: int) -> Iterator[tuple[str, 
     yield from waiting
 
 
-def _read_one(path: Path, relative: str, name: str, mask_file: Path | None, out: Path, max_size: int, invert: bool) -> _Read:
-    """One photo and its mask to working files; runs in a thread."""
+def _read_one(path: Path, relative: str, name: str, source: _MaskSource | None, out: Path, max_size: int) -> _Read:
+    """One photo and its mask (none without a `source`) to working files; runs in a thread."""
     import cv2
 
     from gsbake.capture.exif import camera_key, focal_pixels
@@ -155,7 +169,7 @@ def _read_one(path: Path, relative: str, name: str, mask_file: Path | None, out:
     from gsbake.capture.quality import measure
 
     photo = read_photo(path)
-    mask = mask_of(photo, relative, mask_file, invert)
+    mask = None if source is None else mask_of(photo, relative, source.file, source.invert)
     rgb, mask = to_working(photo, mask, max_size)
     height, width = rgb.shape[:2]
     quality = measure(rgb, mask)
@@ -208,16 +222,53 @@ def _mark_alike(ctx: Context, read: dict[str, _Read]) -> None:
         ctx.warn(f"{len(soft)} photos are much more blurred than the rest ({_some([entries[i]['name'] for i in soft])}).")
 
 
-def _report_masks(ctx: Context, read: dict[str, _Read], masks: dict[str, Path]) -> None:
-    """Say how many photos have masks and where they come from."""
+def _settle_masks(ctx: Context, read: dict[str, _Read], masks: dict[str, Path]) -> None:
+    """Say how many photos have masks, where they come from, and what that spares. Raises BadInputError where masks are a must."""
     without = [r.entry["name"] for r in read.values() if r.entry["mask"] is None]
     count = len(read) - len(without)
-    if not count:
-        return
+    if without and ctx.settings.skip.masks == "always":
+        raise BadInputError(
+            f"{len(without)} of {len(read)} photos have no mask ({_some(without)}), but skip.masks is always; "
+            "give them masks or set it to auto."
+        )
     files = sum(relative in masks for relative in read)
-    ctx.decide("masks", f"{count} of {len(read)} photos have one", f"{files} mask files, {count - files} alpha channels")
-    if without:
+    given = f"{count} of {len(read)} photos have one: {files} mask files, {count - files} alpha channels" if count else "no photo has one"
+    evidence = "masks are not read" if ctx.settings.skip.masks == "never" else given
+    leave_out(ctx, "masks", count > 0 and not without, evidence, "object told apart by the masks", "object told apart without masks")
+    if count and without:
         ctx.warn(f"{len(without)} of {len(read)} photos have no mask ({_some(without)}); masks work best when every photo has one.")
+
+
+def _settle_resolution(ctx: Context, read: dict[str, _Read]) -> None:
+    """Halve the working photos and masks where the photos hold nothing finer."""
+    from gsbake.capture.sharpness import finer_than_sharp
+
+    entries = [r.entry for r in read.values()]
+    longer = max(max(e["width"], e["height"]) for e in entries)
+    holds, evidence = finer_than_sharp([r.quality.loss_at_half for r in read.values()], longer)
+    if not leave_out(ctx, "resolution", holds, evidence, f"photos kept at {longer // 2} pixels", f"photos kept at {longer} pixels"):
+        return
+    for entry in entries:
+        _halve(ctx.out, entry)
+
+
+def _halve(out: Path, entry: dict[str, Any]) -> None:
+    """Write a working photo and its mask again at half the size, and put the size right in `entry`."""
+    import cv2
+
+    from gsbake.capture.photo import RawPhoto, to_working
+
+    bgr: Any = cv2.imread(str(out / entry["file"]), cv2.IMREAD_COLOR)
+    full: Any = cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB)
+    mask: Any = None if entry["mask"] is None else cv2.imread(str(out / entry["mask"]), cv2.IMREAD_GRAYSCALE)
+    before = max(entry["width"], entry["height"])
+    rgb, mask = to_working(RawPhoto(full, None, 1, {}), mask, before // 2)
+    _write_png(out / entry["file"], cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR))
+    if mask is not None:
+        _write_png(out / entry["mask"], mask)
+    entry["height"], entry["width"] = rgb.shape[:2]
+    if entry["focal_px"] is not None:
+        entry["focal_px"] *= max(rgb.shape[:2]) / before
 
 
 def _poses(ctx: Context, listing: list[str], read: dict[str, _Read]) -> dict[str, Any]:
@@ -256,9 +307,9 @@ def _some(names: list[str]) -> str:
 
 STAGE = Stage(
     name="ingest",
-    version=1,
+    version=2,
     title="Read photos",
     run=run,
     sources=("photos", "masks", "poses"),
-    settings=("ingest.*",),
+    settings=("ingest.*", "skip.masks", "skip.resolution"),
 )

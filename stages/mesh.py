@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gsbake.pipeline.errors import BadInputError
+from gsbake.pipeline.skip import leave_out, wanted
 from gsbake.pipeline.stage import Context, Stage
 
 if TYPE_CHECKING:
@@ -26,6 +27,8 @@ BALL = 1.05
 TRUNCATION_CELLS = (4.0, 10.0)
 #: Stereo replaces a rendered depth that it agrees with to this many cells.
 MEASURED_CELLS = 3.0
+#: Photos that are compared with one another are kept in memory up to so many bytes.
+PHOTO_BYTES = 1 << 29
 #: Surfels below this share of the transfer's peak opacity say nothing about where the object is.
 MIN_OPACITY = 0.05
 #: Holes with more border edges than this are openings, not holes, when nothing tells inside from outside.
@@ -157,6 +160,8 @@ def _field(
     samples: tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]],
 ) -> SparseTsdf:
     """The distance field, from depth maps or from the surfels' own samples."""
+    import numpy as np
+
     from gsbake.surface.imls import imls_field
     from gsbake.surface.tsdf import SparseTsdf
 
@@ -167,7 +172,7 @@ def _field(
             field.survey(view)
             ctx.progress(done + 1, 2 * len(spool), "fusing")
     with ctx.part("filling"):
-        field.allocate()
+        field.allocate(everywhere=not wanted(ctx, "far_cells", holds=True))
     with ctx.part("fusion"):
         if ctx.settings.mesh.field == "imls":
             points, normals, weights = samples
@@ -177,6 +182,8 @@ def _field(
                 ctx.check_stop()
                 field.integrate(view)
                 ctx.progress(len(spool) + done + 1, 2 * len(spool), "fusing")
+    cells = f"{100 * field.near_share:.1f} % of the grid's {np.prod(field.lattice.samples) / 1e6:.1f} million cells lie near the surface"
+    leave_out(ctx, "far_cells", True, f"{cells}; those filled take {field.nbytes / 1e6:.0f} MB", "far cells left out", "all cells filled")
     return field
 
 
@@ -207,7 +214,9 @@ def _finish(
             shape = clean.topology(vertices, faces)
     with ctx.part("silhouettes"):
         vertices = _polish(ctx, posed, vertices, faces)
-        write_ply(ctx.out / "dense.ply", vertices, faces)
+    with ctx.part("photos"):
+        vertices, agreed = _agree(ctx, posed, vertices, faces, resolution.cell)
+    write_ply(ctx.out / "dense.ply", vertices, faces)
     ctx.check_stop()
     with ctx.part("decimate"):
         low_vertices, low_faces, error = clean.decimate(vertices, faces, settings.faces)
@@ -234,6 +243,7 @@ def _finish(
         "watertight": low.watertight,
         "border_edges": low.border_edges,
         "decimation_error_cells": error / resolution.cell,
+        **agreed,
     }
 
 
@@ -275,12 +285,51 @@ def _polish(ctx: Context, posed: PosedPhotos, vertices: NDArray[np.float64], fac
     return polished.vertices
 
 
+def _agree(
+    ctx: Context, posed: PosedPhotos, vertices: NDArray[np.float64], faces: NDArray[np.int32], cell: float
+) -> tuple[NDArray[np.float64], dict[str, float]]:
+    """Vertices moved until photos of textured places agree, where stereo confirmed depths; with figures for the manifest."""
+    from functools import lru_cache
+
+    from gsbake.stereo.maps import read_depth
+    from gsbake.stereo.photos import Photo, load_photo
+    from gsbake.surface.photometric import agree
+    from gsbake.surface.photometric_measure import Capture
+
+    rounds, size, folder = ctx.settings.mesh.photometric_rounds, ctx.settings.stereo.max_size, ctx.inputs.get("stereo")
+    files = [] if folder is None else [folder / "depth" / f"{camera.name}.npz" for camera in posed.cameras.cameras]
+    if not rounds or not any(file.exists() for file in files):
+        ctx.decide("photometric polish", "left out", "stereo confirmed no depths" if rounds else "the profile asks for no rounds")
+        return vertices, {}
+    cameras = [camera.within(size) for camera in posed.cameras.cameras]
+
+    @lru_cache(maxsize=max(8, PHOTO_BYTES // (2 * max(c.width * c.height for c in cameras))))
+    def photo(index: int) -> Photo:
+        ctx.check_stop()
+        return load_photo(posed, index, size)
+
+    capture = Capture(cameras, photo, lambda index: read_depth(files[index]) if files[index].exists() else None, MEASURED_CELLS * cell)
+    agreed = agree(vertices, faces, capture, rounds, ctx.threads)
+    evidence = f"{100 * agreed.share:.0f} % of the places look alike in most photos"
+    if agreed.rounds:
+        evidence += f": moved by {agreed.move:.2f} px in the median, their NCC was {agreed.before:.3f} and is {agreed.after:.3f}"
+        ctx.decide("photometric polish", "surface moved to where photos agree", evidence)
+    else:
+        ctx.decide("photometric polish", "left as it is", f"{evidence}, and moving it gains nothing there")
+    return agreed.vertices, {
+        "photometric_share": agreed.share,
+        "photometric_move_pixels": agreed.move,
+        "photometric_ncc_before": agreed.before,
+        "photometric_ncc_after": agreed.after,
+    }
+
+
 STAGE = Stage(
     name="mesh",
-    version=2,
+    version=3,
     title="Mesh",
     run=run,
     needs=("poses", "stereo", "refine"),
-    settings=("mesh.*", "train.max_size"),
+    settings=("mesh.*", "train.max_size", "stereo.max_size", "skip.far_cells"),
     uses_device=True,
 )

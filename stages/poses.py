@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gsbake.pipeline.errors import BadInputError
+from gsbake.pipeline.skip import leave_out
 from gsbake.pipeline.stage import Context, Stage
 
 if TYPE_CHECKING:
@@ -23,6 +24,8 @@ if TYPE_CHECKING:
 _SECONDS_PER_PHOTO, _LEAST_SECONDS = 3.0, 120.0
 #: Fewer points than this say nothing about the shape.
 _FEWEST_POINTS = 30
+#: Places of the surface at which photos are compared.
+_PLACES = 1000
 #: Longer side of the masks that the hull is carved from.
 _HULL_SIZE = 512
 _PNG_LEVEL = 1
@@ -35,9 +38,9 @@ def run(ctx: Context) -> dict[str, Any]:
 
     ingest = ctx.inputs["ingest"]
     entries: list[dict[str, Any]] = json.loads((ingest / "photos.json").read_text())["photos"]
-    known = ingest / "poses" / "cameras.json"
+    given = _settle_poses(ctx, ingest, len(entries))
     solving = ctx.checkpoint / "solve"
-    if known.exists():
+    if given:
         results, cameras, cloud_file = _take_given(ctx, entries, ingest, solving)
     else:
         results = _solve(ctx, entries, ingest, solving)
@@ -49,14 +52,61 @@ def run(ctx: Context) -> dict[str, Any]:
         extent = _extent(ctx, pinholes, points)
     to_world = extent.similarity()
     to_unit = to_world.inverse()
-    origin = "given" if known.exists() else "solved"
-    CameraSet(tuple(c.moved(to_unit) for c in pinholes), to_world, origin).save(ctx.out / "cameras.json")
-    if points is not None and len(points) >= _FEWEST_POINTS:
-        write_cloud(ctx.out / "points.ply", to_unit.apply(points), colours if colours is not None else points * 0)
+    origin = "given" if given else "solved"
+    unit = [c.moved(to_unit) for c in pinholes]
+    cloud = None if points is None or len(points) < _FEWEST_POINTS else to_unit.apply(points)
+    if cloud is not None:
+        write_cloud(ctx.out / "points.ply", cloud, colours if colours is not None else cloud * 0)
+    with ctx.part("photos that add nothing"):
+        unit, dropped = _drop_spare(ctx, entries, unit, cloud)
+    CameraSet(tuple(unit), to_world, origin).save(ctx.out / "cameras.json")
     if (solving / "sparse").exists():
         shutil.copytree(solving / "sparse", ctx.out / "sparse")
     ctx.decide("unit sphere", f"radius {extent.radius:.4g} in world units", extent.evidence)
-    return {"poses": origin, **results, "centre": extent.centre.tolist(), "radius": extent.radius}
+    return {"poses": origin, **results, "dropped_photos": dropped, "centre": extent.centre.tolist(), "radius": extent.radius}
+
+
+def _settle_poses(ctx: Context, ingest: Path, photos: int) -> bool:
+    """Whether the given poses are used. Raises BadInputError when the profile counts on poses that were not given."""
+    from gsbake.capture.cameras import CameraSet
+
+    known = ingest / "poses" / "cameras.json"
+    if not known.exists() and ctx.settings.skip.poses == "always":
+        raise BadInputError("No poses were given, but skip.poses is always; give poses with the photos or set it to auto.")
+    evidence = "no poses were given"
+    if known.exists():
+        evidence = f"poses given for {len(CameraSet.load(known).cameras)} of {photos} photos"
+    return leave_out(ctx, "poses", known.exists(), evidence, "structure from motion left out", "poses solved from the photos")
+
+
+def _drop_spare(ctx: Context, entries: Sequence[dict[str, Any]], cameras: list[Camera], cloud: Any) -> tuple[list[Camera], list[str]]:
+    """The cameras (unit frame) without the photos that add nothing, whose files go too, and the names of those."""
+    import numpy as np
+
+    from gsbake.capture.cameras import CameraSet
+    from gsbake.capture.hull import visual_hull
+    from gsbake.capture.posed import PosedPhotos
+    from gsbake.capture.redundancy import spare_photos
+
+    posed = PosedPhotos(ctx.out, CameraSet(tuple(cameras)))
+
+    def surface() -> tuple[Any, Any]:
+        if posed.has_masks:
+            return visual_hull(posed).surface_points(_PLACES, ctx.seed)
+        points = np.zeros((0, 3)) if cloud is None else cloud[np.linalg.norm(cloud, axis=1) < 1]
+        return points[:: max(1, len(points) // _PLACES)], None
+
+    mode = ctx.settings.skip.photos
+    alike = {e["name"]: e["duplicate_of"] for e in entries if e["duplicate_of"]}
+    spare, evidence = ([], "not looked for") if mode == "never" else spare_photos(cameras, alike, surface, mode == "always")
+    names = [cameras[i].name for i in spare]
+    choice = f"{len(names)} of {len(cameras)} photos left out ({_some(names)})" if names else "nothing to leave out"
+    if not leave_out(ctx, "photos", bool(names), evidence, choice, f"all {len(cameras)} photos used"):
+        return cameras, []
+    for name in names:
+        for sub in ("photos", "masks"):
+            (ctx.out / sub / f"{name}.png").unlink(missing_ok=True)
+    return [c for c in cameras if c.name not in set(names)], names
 
 
 def _lenses(entries: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
@@ -181,7 +231,6 @@ def _take_given(
     from gsbake.capture.solve import SolveFailedError
 
     cameras = list(CameraSet.load(ingest / "poses" / "cameras.json").cameras)
-    ctx.decide("structure from motion", "skipped", "poses given")
     if len(cameras) < 3:
         raise BadInputError(f"Only {len(cameras)} photos have a pose in the file given, but at least 3 are needed.")
     results: dict[str, Any] = {"registered": len(cameras), "registered_share": len(cameras) / len(entries), "points": 0}
@@ -291,10 +340,10 @@ def _some(names: Sequence[str]) -> str:
 
 STAGE = Stage(
     name="poses",
-    version=1,
+    version=2,
     title="Camera poses",
     run=run,
     needs=("ingest",),
-    settings=("poses.*",),
+    settings=("poses.*", "skip.poses", "skip.photos"),
     seeded=True,
 )

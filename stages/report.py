@@ -90,6 +90,7 @@ def run(ctx: Context) -> dict[str, Any]:
             audit=manifests.audit_rows(ctx.inputs["export"] / "audit.json"),
             curves=manifests.training_charts(logs),
             curves_note="",
+            left_out=manifests.left_out(said),
             decisions=manifests.decisions(said),
             stages=manifests.stage_rows(said),
             time_chart=manifests.time_chart(said),

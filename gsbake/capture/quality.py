@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsbake.capture.photo import Bytes, srgb_decode
+from gsbake.capture.sharpness import loss_at_half
 
 #: Thumbnails (32x32 grey) whose root mean square difference is below this (of 255) show the same picture.
 SAME_PICTURE = 1.0
@@ -23,10 +24,12 @@ _LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)
 
 @dataclass(frozen=True)
 class Quality:
-    """Figures of one photo: `blur` 0 (sharp) .. 1, `exposure` mean log2 of linear luminance, `thumbnail` (32, 32) grey levels."""
+    """Figures of one photo: `blur` 0 (sharp) .. 1, `exposure` mean log2 of linear luminance, `loss_at_half` (grey levels, see
+    `gsbake.capture.sharpness`), `thumbnail` (32, 32) grey levels."""
 
     blur: float
     exposure: float
+    loss_at_half: float
     thumbnail: NDArray[np.float32]
 
 
@@ -58,7 +61,8 @@ def measure(rgb: Bytes, mask: Bytes | None) -> Quality:
         share = cv2.resize(inside, (256, 256), interpolation=cv2.INTER_AREA) > 127
         stops = stops[share] if share.any() else stops
     thumbnail = cv2.resize(grey, (_THUMB, _THUMB), interpolation=cv2.INTER_AREA).astype(np.float32)
-    return Quality(blur_effect(grey.astype(np.float32), inside), float(stops.mean(dtype=np.float64)), thumbnail)
+    fine = grey.astype(np.float32)
+    return Quality(blur_effect(fine, inside), float(stops.mean(dtype=np.float64)), loss_at_half(fine, inside), thumbnail)
 
 
 def near_duplicates(thumbnails: list[NDArray[np.float32]]) -> list[int | None]:

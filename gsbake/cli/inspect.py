@@ -59,6 +59,7 @@ def plan_document(session: Session, states: list[StageState]) -> dict[str, Any]:
                 "settings": dict(state.settings),
                 "inputs": dict(state.ingredients.inputs) if state.ingredients is not None else {},
                 "results": state.artifact.manifest.get("results", {}) if state.artifact is not None else {},
+                "decisions": state.artifact.manifest.get("decisions", []) if state.artifact is not None else [],
             }
             for state in states
         ],
@@ -94,6 +95,8 @@ def explain(options: Options, stage: str | None) -> None:
             console.print(Text(f"  because {reason}"))
         if state.artifact is not None:
             console.print(Text(f"  in {state.artifact.folder}"))
+            for d in state.artifact.manifest.get("decisions", ()):
+                console.print(Text(f"  decided {d['what']}: {d['choice']} ({d['evidence']})"))
         if state.ingredients is not None:
             what = state.ingredients
             console.print(Text(f"  key {what.key[:16]} from stage version {what.version}"))

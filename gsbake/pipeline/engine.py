@@ -196,7 +196,7 @@ class Engine:
                 live = {k: v for k, v in message["live"].items() if v is not None}
                 self.observer.progress(name, message["done"], message["total"], message["text"], live)
             case "decision":
-                self.events.write("decision", stage=name, **{k: message[k] for k in ("what", "choice", "evidence")})
+                self.events.write("decision", stage=name, **{k: v for k, v in message.items() if k != "kind"})
                 self.observer.decided(name, message["what"], message["choice"], message["evidence"])
             case "warning":
                 self.events.write("warning", stage=name, text=message["text"])

@@ -36,8 +36,11 @@ class Context(Protocol):
     def check_stop(self) -> None:
         """Raise InterruptedRun if a stop was requested."""
 
-    def decide(self, what: str, choice: str, evidence: str) -> None:
-        """Log a decision taken from evidence ("structure from motion", "skipped", "poses given"); shown in the report."""
+    def decide(self, what: str, choice: str, evidence: str, saved: float | None = None) -> None:
+        """Log a decision taken from evidence ("structure from motion", "skipped", "poses given"); shown in the report.
+
+        `saved` is the time in seconds that it saved, where that was measured or follows from what was.
+        """
 
     def warn(self, text: str) -> None:
         """Warn the person; also kept in the manifest."""

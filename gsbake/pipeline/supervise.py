@@ -72,7 +72,7 @@ class Outcome:
 
     results: dict[str, Any] = field(default_factory=dict)
     parts: dict[str, float] = field(default_factory=dict)
-    decisions: list[dict[str, str]] = field(default_factory=list)
+    decisions: list[dict[str, Any]] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
     seconds: float = 0.0
     peak_bytes: int = 0
@@ -178,7 +178,7 @@ def supervise(job: Job, log: Path, stop: StopSignals, on_message: Callable[[dict
                     case "done" | "failed":
                         last = message
                     case "decision":
-                        outcome.decisions.append({k: message[k] for k in ("what", "choice", "evidence")})
+                        outcome.decisions.append({k: v for k, v in message.items() if k != "kind"})
                     case "warning":
                         outcome.warnings.append(message["text"])
                     case "stopping":

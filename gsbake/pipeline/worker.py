@@ -135,9 +135,10 @@ class WorkerContext:
         if self._stop.is_set():
             raise InterruptedRun("Stopped on request.")
 
-    def decide(self, what: str, choice: str, evidence: str) -> None:
+    def decide(self, what: str, choice: str, evidence: str, saved: float | None = None) -> None:
         """Log a decision."""
-        self._line.send("decision", what=what, choice=choice, evidence=evidence)
+        more = {} if saved is None else {"saved_s": round(saved, 1)}
+        self._line.send("decision", what=what, choice=choice, evidence=evidence, **more)
 
     def warn(self, text: str) -> None:
         """Warn the person."""

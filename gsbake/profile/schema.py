@@ -11,6 +11,8 @@ from typing import Annotated, Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 Fraction = Annotated[float, Field(ge=0, le=1)]
+Rule = Literal["auto", "always", "never"]
+Pruning = Literal["visibility", "sdf", "gsdf", "gaussianroom", "gs-ror2"]
 
 
 class Section(BaseModel):
@@ -73,8 +75,11 @@ class Train(Section):
     coarse_share: Fraction = Field(0.5, description="Share of the run at half resolution.")
     init_surfels: int = Field(20_000, ge=10, description="Surfels to start with.")
     init: Literal["auto", "stereo", "points", "hull", "sphere"] = Field("auto", description="Where surfels start: stereo, SfM points, visual hull, a sphere, or the best available.")
+    densify: Literal["auto", "gradient", "sdf", "gsdf", "gaussianroom", "none"] = Field(
+        "gradient", description="Which surfels multiply: those with the largest screen gradient; sdf: of these, those within a spacing of the surface; the rules of GSDF or GaussianRoom; none. auto: none where they start from stereo, else gradient."
+    )
+    prune: Pruning = Field("visibility", description="Surfels dropped in training for being off the surface by their own SDF samples (the rules of refine.prune).")
     holdout: int = Field(8, ge=0, description="Every n-th photo is held out of training for the quality figure; 0 holds none out.")
-    early_stop: bool = Field(True, description="Stop when held-out PSNR and the SDF median stand still.")
     lr_position: float = Field(8e-4, gt=0, description="Adam rate of positions at the start; decays to 1/100.")
     lr_scale: float = Field(0.02, gt=0, description="Adam rate of log-scales.")
     lr_rotation: float = Field(2e-3, gt=0, description="Adam rate of quaternions.")
@@ -101,7 +106,10 @@ class Refine(Section):
     """SDF-guided pruning, densification and the short fine-tune after training."""
 
     iterations: int = Field(600, ge=0, description="Fine-tuning steps after pruning and densifying.")
-    prune_distance: float = Field(3.0, gt=0, description="Drop surfels farther from the zero set than this many surfel spacings.")
+    prune: Pruning = Field(
+        "visibility", description="Surfels dropped for being off the rendered surface: visibility drops none; sdf by spacings (prune_distance); the rules of GSDF, GaussianRoom or GS-ROR²."
+    )
+    prune_distance: float = Field(3.0, gt=0, description="Drop surfels farther from the zero set than this many surfel spacings (refine.prune = sdf).")
     densify_share: Fraction = Field(0.3, description="At most this share of surfels is added where the surface is under-sampled.")
 
 
@@ -116,6 +124,7 @@ class Mesh(Section):
     smooth: int = Field(2, ge=0, description="Taubin smoothing steps on the dense mesh.")
     normal_reach: float = Field(8.0, ge=0, description="Waves shorter than this many cells follow the rendered normals instead of the depth; 0 leaves them.")
     silhouette_rounds: int = Field(3, ge=0, description="Rounds of moving the surface until its silhouettes meet the masks; 0 leaves it.")
+    photometric_rounds: int = Field(2, ge=0, description="Rounds of moving the surface to where photos of textured places agree; 0 leaves it.")
     min_component: Fraction = Field(0.02, description="Drop loose pieces with less than this share of the largest piece's area.")
 
 
@@ -123,18 +132,19 @@ class Bake(Section):
     """UV atlas and textures."""
 
     size: Literal[128, 256, 512, 1024, 2048, 4096] = Field(1024, description="Edge of the square textures in texels.")
-    normal_map: bool = Field(True, description="Bake a tangent-space normal map from the undecimated surface.")
     occlusion_rays: int = Field(64, ge=0, description="Rays per texel for ambient occlusion; 0 leaves it out.")
-    equalise: bool = Field(True, description="Solve for one exposure gain per photo and channel before photos are fused into the base colour.")
+    visibility: Literal["none", "ambient", "directional", "bounce"] = Field(
+        "bounce", description="What the fit of materials knows of shadow: nothing, an even share, one that follows the light, and light from texel to texel too."
+    )
     materials: Literal["none", "fit", "surfels"] = Field(
         "none", description="none: colours only; fit: materials and light fitted to the photos in texture space; surfels: those the surfels learnt (splat.shading = pbr)."
     )
     fit_steps: int = Field(400, ge=1, description="Steps of fitting materials and light in texture space.")
     fit_size: int = Field(800, ge=16, description="Longer side in pixels of the photos that materials are fitted to.")
     smooth_prior: float = Field(0.03, ge=0, description="Neighbouring texels have the same material.")
-    dark_prior: float = Field(0.02, ge=0, description="What a reflection explains is not paint; also settles how bright the light is.")
+    dark_prior: float = Field(0.005, ge=0, description="What a reflection explains is not paint; also settles how bright the light is.")
     metal_prior: float = Field(0.003, ge=0, description="Most things are not metal.")
-    white_prior: float = Field(0.005, ge=0, description="Most light is white.")
+    white_prior: float = Field(0.0005, ge=0, description="Most light is white.")
     roughness: Fraction = Field(0.8, description="Roughness of the whole asset without materials (bake.materials = none).")
 
 
@@ -153,6 +163,21 @@ class Report(Section):
     view_size: int = Field(512, ge=32, description="Longer side of the renders in pixels.")
 
 
+class Skip(Section):
+    """Work that a scene may not need: auto lets measured evidence decide, always leaves it out, never does it all the same."""
+
+    poses: Rule = Field("auto", description="Structure from motion, where poses were given. always: having none is an error; never: given poses are not used.")
+    masks: Rule = Field("auto", description="Telling the object apart without masks, where photos have masks. always: a photo without one is an error; never: masks are not used.")
+    resolution: Rule = Field("auto", description="Pixels finer than the photos' sharpness: photos that lose nothing at half their size are kept at half of it.")
+    photos: Rule = Field("auto", description="Photos that add nothing: saved twice, or of a place that many others show from the same side. always: in small sets too.")
+    view_dependence: Rule = Field("auto", description="Colours that change with the direction, where the places of the surface look the same in all photos.")
+    settled: Rule = Field("auto", description="Training steps where stereo has settled the surface: up to half of them, by the share of the object that it confirmed. always: half of them.")
+    converged: Rule = Field("auto", description="Training steps after held-out PSNR and SDF median stand still. always: the last steps are left out in any case.")
+    far_cells: Rule = Field("auto", description="Grid cells far from the surface.")
+    normal_map: Rule = Field("auto", description="The normal map, where the decimated mesh has the normals of the dense one.")
+    exposure: Rule = Field("auto", description="Dividing out one exposure gain per photo, where photos compared on the surface are as bright as one another.")
+
+
 class Profile(Section):
     """All settings of a run."""
 
@@ -168,3 +193,4 @@ class Profile(Section):
     bake: Bake = Bake()
     export: Export = Export()
     report: Report = Report()
+    skip: Skip = Skip()

@@ -82,6 +82,17 @@ class Decision:
 
 
 @dataclass(frozen=True)
+class LeftOut:
+    """A rule on work that a scene may not need: the setting's name, who decided what and why, and the time saved where it is known."""
+
+    rule: str
+    stage: str
+    choice: str
+    evidence: str
+    saved: str
+
+
+@dataclass(frozen=True)
 class StageRow:
     """What the manifest of a stage says, as (heading, rows of key and value)."""
 
@@ -110,6 +121,7 @@ class Page:
     audit: tuple[Check, ...]
     curves: tuple[str, ...]
     curves_note: str
+    left_out: tuple[LeftOut, ...]
     decisions: tuple[Decision, ...]
     stages: tuple[StageRow, ...]
     time_chart: str

@@ -7,13 +7,15 @@ from __future__ import annotations
 
 import csv
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from gsbake.pipeline.errors import BadInputError
+from gsbake.pipeline.skip import PREFIX
+from gsbake.profile.schema import Skip
 from gsbake.report.charts import Bar, Curve, bars, duration, lines, size
-from gsbake.report.html import Check, Decision, StageRow, Warned
+from gsbake.report.html import Check, Decision, LeftOut, StageRow, Warned
 
 #: Stages in the order they run in.
 ORDER = ("ingest", "poses", "stereo", "train", "refine", "mesh", "bake", "export")
@@ -65,9 +67,28 @@ def memory_chart(manifests: Manifests) -> str:
 
 
 def decisions(manifests: Manifests) -> tuple[Decision, ...]:
-    """All decisions, in running order."""
-    found = ((stage, d) for stage, m in manifests.items() for d in m.get("decisions") or ())
-    return tuple(Decision(stage, *(str(d.get(k, "")) for k in ("what", "choice", "evidence"))) for stage, d in found)
+    """All decisions but those on work left out, in running order."""
+    return tuple(
+        Decision(stage, *(str(d.get(k, "")) for k in ("what", "choice", "evidence")))
+        for stage, d in _decided(manifests)
+        if not str(d.get("what", "")).startswith(PREFIX)
+    )
+
+
+def left_out(manifests: Manifests) -> tuple[LeftOut, ...]:
+    """Every rule on work left out, in the order of the settings, with what was decided; none where no stage decided on any."""
+    found: dict[str, list[LeftOut]] = {}
+    for stage, d in _decided(manifests):
+        what, saved = str(d.get("what", "")), d.get("saved_s")
+        if what.startswith(PREFIX):
+            time = "" if saved is None else f"about {duration(float(saved))}"
+            found.setdefault(what, []).append(LeftOut(what, stage, str(d.get("choice", "")), str(d.get("evidence", "")), time))
+    rules = dict.fromkeys([*(PREFIX + rule for rule in Skip.model_fields), *found]) if found else {}
+    return tuple(row for rule in rules for row in found.get(rule, [LeftOut(rule, "", "not asked", "this run has no such step", "")]))
+
+
+def _decided(manifests: Manifests) -> Iterator[tuple[str, Mapping[str, Any]]]:
+    return ((stage, d) for stage, m in manifests.items() for d in m.get("decisions") or ())
 
 
 def warnings(manifests: Manifests) -> tuple[Warned, ...]:

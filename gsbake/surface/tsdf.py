@@ -114,6 +114,7 @@ class SparseTsdf:
         coarse.allocate_all()
         self.survey_field = FusedBlocks(coarse, max(self.truncation, 2 * coarse_cell))
         self._wanted = np.zeros(self.lattice.shape, np.bool_)
+        self.near_share = 1.0  # of all blocks, those the surface may run through; known once allocated
         self._filled: Floats | None = None
         self._fused: FusedBlocks | None = None
 
@@ -136,8 +137,8 @@ class SparseTsdf:
             self._wanted,
         )
 
-    def allocate(self) -> None:
-        """Between the passes: fill what no view saw (coarsely), and allocate the blocks the surface runs through."""
+    def allocate(self, everywhere: bool = False) -> None:
+        """Between the passes: fill what no view saw (coarsely), and allocate the blocks the surface runs through, or all of them."""
         field = self.survey_field
         field.doubt()
         unknown = field.seen == 0
@@ -155,7 +156,9 @@ class SparseTsdf:
         filled = field.lattice.dense(field.values)
         self._filled = filled
         self._mark_crossings(filled)
-        self.lattice.allocate(self._wanted & self._reachable())
+        near = self._wanted & self._reachable()
+        self.near_share = float(near.mean())
+        self.lattice.allocate(near | everywhere)
         self._fused = FusedBlocks(self.lattice, self.truncation)
 
     def integrate(self, view: DepthView) -> None:

@@ -48,7 +48,7 @@ class FakeContext:
     def check_stop(self) -> None:
         return None
 
-    def decide(self, what: str, choice: str, evidence: str) -> None:
+    def decide(self, what: str, choice: str, evidence: str, saved: float | None = None) -> None:
         self.decisions[what] = f"{choice} ({evidence})"
 
     def warn(self, text: str) -> None:
@@ -62,19 +62,19 @@ class Runner:
         self.root = root
 
     def ingest(
-        self, photos: Path, masks: Path | None = None, poses: Path | None = None, **settings: Any
+        self, photos: Path, masks: Path | None = None, poses: Path | None = None, skip: Mapping[str, str] | None = None, **settings: Any
     ) -> tuple[dict[str, Any], FakeContext]:
         from stages.ingest import run
 
         found = discover(photos, masks, poses)
         inputs = {k: v for k, v in {"photos": found.photos, "masks": found.masks, "poses": found.poses}.items() if v is not None}
-        ctx = FakeContext(self.root / "ingest", inputs, Profile.model_validate({"ingest": settings}), self.root / "c1")
+        ctx = FakeContext(self.root / "ingest", inputs, Profile.model_validate({"ingest": settings, "skip": skip or {}}), self.root / "c1")
         return run(ctx), ctx
 
-    def poses(self, **settings: Any) -> tuple[dict[str, Any], FakeContext]:
+    def poses(self, skip: Mapping[str, str] | None = None, **settings: Any) -> tuple[dict[str, Any], FakeContext]:
         from stages.poses import run
 
-        profile = Profile.model_validate({"poses": settings})
+        profile = Profile.model_validate({"poses": settings, "skip": skip or {}})
         ctx = FakeContext(self.root / "poses", {"ingest": self.root / "ingest"}, profile, self.root / "c2")
         return run(ctx), ctx
 

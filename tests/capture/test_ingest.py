@@ -76,7 +76,7 @@ def test_alpha_becomes_mask(tmp_path: Path, runner: Runner) -> None:
         rgba[10:30, 10:30, 3] = 255
         Image.fromarray(rgba).save(folder / f"p{i}.png")
     results, ctx = runner.ingest(folder)
-    assert results["masks"] == 3 and "3 alpha channels" in ctx.decisions["masks"]
+    assert results["masks"] == 3 and "3 alpha channels" in ctx.decisions["skip.masks"]
     mask = cv2.imread(str(ctx.out / "masks" / "p1.png"), cv2.IMREAD_GRAYSCALE)
     assert mask is not None and mask[20, 20] == 255 and mask[5, 5] == 0 and int((mask == 255).sum()) == 400
     assert (cv2.imread(str(ctx.out / "photos" / "p1.png"))[47, 63] == 0).all()

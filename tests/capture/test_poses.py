@@ -102,7 +102,7 @@ def test_given_poses_keep_their_frame_and_points_are_triangulated(tmp_path: Path
     transforms(tmp_path / "cap", true)
     runner.ingest(tmp_path / "cap", max_size=160)
     results, ctx = runner.poses(max_features=2000)
-    assert "skipped" in ctx.decisions["structure from motion"] and "poses given" in ctx.decisions["structure from motion"]
+    assert "left out" in ctx.decisions["skip.poses"] and "poses given" in ctx.decisions["skip.poses"]
     posed = PosedPhotos.open(ctx.out)
     world = posed.cameras.to_world
     for camera, wanted in zip(posed.cameras.cameras, true, strict=True):

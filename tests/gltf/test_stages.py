@@ -62,7 +62,7 @@ class Desk:
     def check_stop(self) -> None:
         pass
 
-    def decide(self, what: str, choice: str, evidence: str) -> None:
+    def decide(self, what: str, choice: str, evidence: str, saved: float | None = None) -> None:
         pass
 
     def warn(self, text: str) -> None:

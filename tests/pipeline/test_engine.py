@@ -58,7 +58,8 @@ def test_manifest_tells_all(tmp_path: Path, photos: Path) -> None:
     assert read["decisions"] == [{"what": "case", "choice": "lower", "evidence": "it is a toy"}]
     assert read["inputs"]["photos"]["files"].keys() == {"a.txt", "b.txt"}
     events = [json.loads(line) for line in (tmp_path / "out" / "events.jsonl").read_text().splitlines()]
-    assert [e["event"] for e in events if e.get("stage") == "sum"] == ["stage started", "stage finished"]
+    assert [e["event"] for e in events if e.get("stage") == "sum"] == ["stage started", "decision", "stage finished"]
+    assert manifest["decisions"] == [{"what": "rest", "choice": "left out", "evidence": "a sum needs none", "saved_s": 12.3}]
     assert events[-1]["event"] == "run ended" and events[-1]["exit_code"] == 0
 
 

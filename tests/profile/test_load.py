@@ -38,10 +38,10 @@ def test_every_setting_has_help() -> None:
 def test_extends_origins_and_overrides(tmp_path: Path) -> None:
     write(tmp_path / "base.toml", 'extends = "preview"\n[mesh]\nfaces = 777\nsmooth = 1\n')
     mine = write(tmp_path / "mine.toml", 'extends = "base.toml"\n[mesh]\nfaces = 888\n')
-    loaded = load_profile(mine, ["bake.size=512", "mesh.holes=leave", "export.copyright=2031 me = you", "train.early_stop=false"])
+    loaded = load_profile(mine, ["bake.size=512", "mesh.holes=leave", "export.copyright=2031 me = you", "skip.converged=never"])
     profile, preview = loaded.profile, load_profile("preview").profile
     assert (profile.mesh.faces, profile.mesh.smooth, profile.bake.size) == (888, 1, 512)
-    assert profile.mesh.holes == "leave" and profile.export.copyright == "2031 me = you" and profile.train.early_stop is False
+    assert profile.mesh.holes == "leave" and profile.export.copyright == "2031 me = you" and profile.skip.converged == "never"
     assert profile.train.iterations == preview.train.iterations
     origins = loaded.origins
     assert origins["mesh.faces"] == mine and origins["mesh.smooth"] == str(tmp_path / "base.toml")
@@ -53,13 +53,14 @@ def test_extends_origins_and_overrides(tmp_path: Path) -> None:
     ("text", "says"),
     [
         ("[train]\niteration = 5\n", ["there is no setting 'train.iteration'", "the nearest is 'train.iterations'"]),
-        ("[trian]\nearly_stop = true\n", ["'trian.early_stop'", "the nearest is 'train.early_stop'"]),
+        ("[trian]\niterations = 5\n", ["'trian.iterations'", "the nearest is 'train.iterations'"]),
+        ('[skip]\nphotos = "sometimes"\n', ["skip.photos = 'sometimes'", "one of auto, always, never"]),
         ("[bake]\nfaces = 5\n", ["'bake.faces'", "the nearest is 'mesh.faces'"]),
         ("faces = 5\n", ["'faces'", "the nearest is 'mesh.faces'"]),
         ("[mesh]\nfaces = 5\n", ["mesh.faces = 5 will not do: it must be ≥ 100"]),
         ("[bake]\nsize = 1000\n", ["bake.size = 1000", "one of 128, 256"]),
         ('[mesh]\nholes = "leaves"\n', ["mesh.holes = 'leaves'", "one of close, leave", "did you mean 'leave'?"]),
-        ('[train]\nearly_stop = "perhaps"\n', ["train.early_stop", "must be true or false"]),
+        ('[ingest]\ninvert_masks = "perhaps"\n', ["ingest.invert_masks", "must be true or false"]),
         ('[train]\niterations = "many"\n', ["train.iterations = 'many'"]),
         ('train = "fast"\n', ["'train'"]),
         ("[train\n", ["is not valid TOML", "line 1"]),
@@ -102,4 +103,4 @@ def test_unknown_profile() -> None:
 def test_bounds_in_words() -> None:
     known = fields()
     assert bounds(known["train.iterations"]) == "≥ 0" and bounds(known["mesh.holes"]) == "one of close, leave"
-    assert bounds(known["train.early_stop"]) == ""
+    assert bounds(known["ingest.invert_masks"]) == "" and bounds(known["skip.poses"]) == "one of auto, always, never"

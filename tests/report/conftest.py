@@ -52,7 +52,7 @@ class FakeContext:
     def check_stop(self) -> None:
         return None
 
-    def decide(self, what: str, choice: str, evidence: str) -> None:
+    def decide(self, what: str, choice: str, evidence: str, saved: float | None = None) -> None:
         return None
 
     def warn(self, text: str) -> None:

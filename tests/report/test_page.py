@@ -18,6 +18,7 @@ from gsbake.report.html import (
     Comparison,
     Decision,
     Figure,
+    LeftOut,
     Light,
     Page,
     Panel,
@@ -35,7 +36,7 @@ URI = picture_uri(GREY)
 EMPTY = Page(
     title="a & b <mug>", lead="3 photos", figures=(Figure("PSNR", "27.1 dB", "8 photos"),), warnings=(), model="", lights=(),
     comparisons=(), comparison_note="", relit_title="Under other light", relit=(), relit_note="", maps=(), maps_note="", audit=(),
-    curves=(), curves_note="", decisions=(), stages=(), time_chart="", memory_chart="", run_note="", footer="gsbake",
+    curves=(), curves_note="", left_out=(), decisions=(), stages=(), time_chart="", memory_chart="", run_note="", footer="gsbake",
 )  # fmt: skip
 
 FULL = replace(
@@ -48,6 +49,7 @@ FULL = replace(
     maps=(Panel("Base colour", "1024", URI),),
     audit=(Check("triangles", "pass", "29 998"), Check("size", "fail", "9 MB")),
     curves=(lines([Curve("train", [0, 1, 2], [20, 21, 22])], "PSNR"),),
+    left_out=(LeftOut("skip.converged", "train", "stopped", "gain < 0.05 dB", "about 12 s"),),
     decisions=(Decision("poses", "structure from motion", "skipped", "poses given"),),
     stages=(StageRow("Training", "12 s", (("Results", (("psnr", "27.1"),)), ("Settings", ()))),),
     time_chart=bars([Bar("train", 12, "12 s", (("steps", 9.0), ("eval", 3.0)))], "time"),
@@ -115,7 +117,7 @@ def test_text_is_escaped_and_figures_are_shown() -> None:
     html = render_page(FULL)
     text = " ".join(outline(html).text)
     assert "a & b <mug>" in text and "<script>alert(1)</script>" in text and "<script>alert" not in html
-    for words in ("27.12 dB", "0.923", "used in training", "poses given", "29 998", "27.1"):
+    for words in ("27.12 dB", "0.923", "used in training", "poses given", "29 998", "27.1", "skip.converged", "gain < 0.05", "12 s"):
         assert words in text
 
 

@@ -14,6 +14,7 @@ from gsbake.capture.posed import PosedPhotos
 from gsbake.gltf.read import read_glb
 from gsbake.light.environment import EnvironmentLight
 from gsbake.pipeline.errors import BadInputError
+from gsbake.profile.schema import Skip
 from gsbake.report import compose, manifests
 from gsbake.report.asset import open_asset
 from gsbake.report.lights import LitShader
@@ -165,6 +166,23 @@ def test_manifests_may_lack_everything(tmp_path: Path) -> None:
     assert "by hand" in manifests.time_chart(said) and manifests.stage_rows(said)[0].title == "mesh"
     assert manifests.decisions(said) == () and manifests.warnings(said) == () and manifests.capture_name(said) == "Asset"
     assert "0.0 s" in manifests.run_note(said)
+
+
+def test_every_rule_on_work_left_out_is_listed() -> None:
+    done = {"what": "skip.converged", "choice": "stopped", "evidence": "stood still", "saved_s": 75.0}
+    said = {
+        "poses": {"decisions": [{"what": "skip.photos", "choice": "all used", "evidence": "0 of 9"}, {"what": "matching", "choice": "x"}]},
+        "train": {"decisions": [done]},
+        "refine": {"decisions": [done | {"choice": "all steps", "saved_s": None}]},
+    }
+    rows = manifests.left_out(said)
+    assert list(dict.fromkeys(row.rule for row in rows)) == [f"skip.{rule}" for rule in Skip.model_fields]
+    by_stage = {(row.rule, row.stage): row for row in rows}
+    assert by_stage["skip.converged", "train"].saved == "about 1 min 15 s"
+    assert by_stage["skip.converged", "refine"].saved == "" and by_stage["skip.photos", "poses"].evidence == "0 of 9"
+    assert by_stage["skip.exposure", ""].choice == "not asked"
+    assert [d.what for d in manifests.decisions(said)] == ["matching"]
+    assert manifests.left_out({"mesh": {}}) == ()
 
 
 @pytest.mark.parametrize(

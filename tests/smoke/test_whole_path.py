@@ -5,6 +5,7 @@ The bounds are loose enough for 300 training steps at 128 pixels and tight enoug
 
 from __future__ import annotations
 
+import html
 import json
 import subprocess
 import sys
@@ -16,6 +17,7 @@ import trimesh
 from scipy.spatial import cKDTree
 
 from gsbake.gltf.read import read_glb
+from gsbake.profile.schema import Skip
 
 #: glTF (+Y up) to the capture's Z-up world.
 TO_WORLD = np.array([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])
@@ -53,6 +55,16 @@ def test_looks(baked: tuple[Path, Path]) -> None:
     figures = json.loads(next((baked[1] / "stages" / "report").glob("*/report.json")).read_text())
     assert figures["held_out"] and figures["compared"] >= 2
     assert figures["psnr"] > 18
+
+
+def test_every_rule_on_left_out_work_is_decided_and_shown(baked: tuple[Path, Path]) -> None:
+    """All that this profile can meet: it matches no photos and fits no materials."""
+    manifests = [json.loads(path.read_text()) for path in (baked[1] / "stages").glob("*/*/manifest.json")]
+    decided = {d["what"]: d for m in manifests for d in m["decisions"] if d["what"].startswith("skip.")}
+    assert set(decided) == {f"skip.{rule}" for rule in Skip.model_fields} - {"skip.view_dependence"}
+    assert decided["skip.poses"]["choice"] == "structure from motion left out" and "MB" in decided["skip.far_cells"]["evidence"]
+    page = html.unescape(next((baked[1] / "stages" / "report").glob("*/report.html")).read_text())
+    assert all(f"<code>{rule}</code>" in page and d["evidence"] in page for rule, d in decided.items())
 
 
 def test_albedo(baked: tuple[Path, Path]) -> None:

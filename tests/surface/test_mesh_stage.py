@@ -52,7 +52,7 @@ class Run:
     def check_stop(self) -> None:
         return
 
-    def decide(self, what: str, choice: str, evidence: str) -> None:
+    def decide(self, what: str, choice: str, evidence: str, saved: float | None = None) -> None:
         self.decisions[what] = (choice, evidence)
 
     def warn(self, text: str) -> None:

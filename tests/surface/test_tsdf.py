@@ -45,6 +45,20 @@ def test_clean_depth_gives_the_shape(shape: Shape) -> None:
     assert found.watertight and found.components == 1
 
 
+def test_cells_far_from_the_surface_change_nothing() -> None:
+    views = views_of(torus, cameras_around())
+    vertices, faces, sparse = fuse(views)
+    field = SparseTsdf([-1.1] * 3, [1.1] * 3, CELL, 4 * CELL, ball=1.05)
+    for view in views:
+        field.survey(view)
+    field.allocate(everywhere=True)
+    for view in views:
+        field.integrate(view)
+    assert field.nbytes > 1.5 * sparse.nbytes and sparse.near_share == field.near_share == pytest.approx(sparse.nbytes / field.nbytes)
+    all_vertices, all_faces = field.mesh()
+    assert len(all_faces) == len(faces) and np.abs(np.sort(all_vertices, 0) - np.sort(vertices, 0)).max() < 0.02 * CELL
+
+
 def test_noise_averages_out() -> None:
     off = sphere(fuse(views_of(sphere, cameras_around(), noise=0.5 * CELL))[0]) / CELL
     assert np.abs(off).mean() < 0.15
