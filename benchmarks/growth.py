@@ -80,7 +80,7 @@ def bake(photos: int, edge: int, target: str, out: Path, threads: int, rounds: i
         "stereo.enabled=always",
         f"train.iterations={STEPS}",
         f"refine.iterations={STEPS // 5}",
-        "skip.converged=never",
+        "skip.settled=never",
         "skip.photos=never",
         "skip.resolution=never",
         "skip.converged=never",
