@@ -29,7 +29,7 @@ def run(ctx: Context) -> dict[str, Any]:
     settings = ctx.settings.report
     said = manifests.load_manifests(ctx.inputs)
     glb = ctx.inputs["export"] / "asset.glb"
-    light = ctx.inputs["refine"] / "light.safetensors"
+    light = ctx.inputs["bake"] / "light.safetensors"
     posed = PosedPhotos.open(ctx.inputs["poses"])
     with ctx.part("open"):
         asset = open_asset(glb, unlit=not light.exists())
@@ -122,7 +122,7 @@ def _comparison_note(held: bool, masked: bool, lit: bool) -> str:
 
 STAGE = Stage(
     name="report",
-    version=1,
+    version=2,
     title="write the report",
     run=run,
     needs=("ingest", "poses", "stereo", "train", "refine", "mesh", "bake", "export"),

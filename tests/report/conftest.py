@@ -142,7 +142,7 @@ def make_run(tmp_path: Path) -> Callable[..., FakeContext]:
         ]  # fmt: skip
         (folders["export"] / "cameras.json").write_text(json.dumps({"frames": frames}))
         if materials:
-            EnvironmentLight.from_radiance(np.ones((6, 8, 8, 3), np.float32)).save(folders["refine"] / "light.safetensors")
+            EnvironmentLight.from_radiance(np.ones((6, 8, 8, 3), np.float32)).save(folders["bake"] / "light.safetensors")
         out = root / "report"
         out.mkdir()
         settings = SimpleNamespace(report=SimpleNamespace(views=2, view_size=48), train=SimpleNamespace(holdout=holdout))
