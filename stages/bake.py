@@ -267,7 +267,7 @@ def _fit_materials(
     from gsbake.capture.steadiness import looks_diffuse
     from gsbake.splat.views import held_out
     from gsbake.surface.resolution import pixel_footprint
-    from gsbake.surface.watch import PLACES, watch_mesh
+    from gsbake.surface.watch import PLACES, MeshWatch
     from gsbake.texture.coarse import Coarse
     from gsbake.texture.fit import TRIALS, MaterialFit, Priors, trial_cost, trial_roughness
     from gsbake.texture.pixels import PixelReader
@@ -281,11 +281,14 @@ def _fit_materials(
     ctx.decide("materials fitted at", f"{coarse.texels.size} texels", f"a texel is {coarse.edge / footprint:.2f} pixels of the photos")
     reader = PixelReader(surface.whole, surface.atlas.uv, coarse.texels, surface.diagonal)
     aside = set(held_out(len(posed), ctx.settings.train.holdout))
+    some = slice(None, None, max(1, len(surface.at) // PLACES))
+    watch = MeshWatch(surface.at[some], surface.facing[some], surface.caster, surface.diagonal)
     photos: list[Pixels] = []
     held: list[Pixels] = []
     for index in range(len(posed)):
         ctx.check_stop()
         view = posed.view(index, settings.fit_size)
+        watch.add(view)
         pixels = reader.read(view.camera, view.rgb, view.mask).thinned(MOST_PIXELS)
         (held if index in aside else photos).append(pixels.without_gain(shown.gains[index]))
 
@@ -307,9 +310,7 @@ def _fit_materials(
         light_size, bounce = ctx.settings.splat.env_size, settings.visibility == "bounce"
         return MaterialFit(coarse.texels, normal, occlusion[:, 0], base, light_size, priors, roughness, seen, bounce)
 
-    some = slice(None, None, max(1, len(surface.at) // PLACES))
-    views = (posed.view(index, settings.fit_size) for index in range(len(posed)))
-    diffuse, why = looks_diffuse(*watch_mesh(surface.at[some], surface.facing[some], surface.caster, surface.diagonal, views))
+    diffuse, why = looks_diffuse(*watch.changes())
     matte = wanted(ctx, "view_dependence", diffuse)
     trials = {} if matte else trial_roughness(start, photos, ctx.seed, lambda done, total: ctx.check_stop())
     best = max(trials, key=lambda roughness: trials[roughness]) if trials else TRIALS[-1] if matte else TRIALS[1]

@@ -99,6 +99,10 @@ class Camera:
         safe = np.where(np.abs(z) < 1e-12, 1e-12, z)
         return np.stack([self.fx * cam[:, 0] / safe + self.cx, self.fy * cam[:, 1] / safe + self.cy], 1), z
 
+    def shows(self, pixel: Array, z: Array) -> NDArray[np.bool_]:
+        """Whether what `project` gave, pixels (n, 2) and depths (n,), lies in front of the camera and inside the picture (n,)."""
+        return np.asarray((z > 1e-6) & (pixel >= 0).all(1) & (pixel[:, 0] < self.width) & (pixel[:, 1] < self.height))
+
     def rays(self) -> Array:
         """Directions (height, width, 3) in the set's frame through pixel centres, scaled so that depth z = 1."""
         x = (np.arange(self.width) + 0.5 - self.cx) / self.fx

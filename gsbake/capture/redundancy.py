@@ -46,7 +46,7 @@ class Coverage:
         pixel = np.ones((len(cameras), len(points)), np.float32)
         for i, camera in enumerate(cameras):
             place, z = camera.project(points)
-            sees[i] = (z > 1e-6) & (place >= 0).all(1) & (place[:, 0] < camera.width) & (place[:, 1] < camera.height)
+            sees[i] = camera.shows(place, z)
             ray = camera.centre - points
             length = np.maximum(np.linalg.norm(ray, axis=1), 1e-12)
             rays[i], pixel[i] = ray / length[:, None], length / camera.fx

@@ -34,7 +34,7 @@ def pair_worth(cameras: Sequence[Camera], points: Array, normals: Array | None) 
     rays = np.zeros((count, len(points), 3))
     for i, camera in enumerate(cameras):
         pixel, z = camera.project(points)
-        sees[i] = (z > 1e-6) & (pixel >= 0).all(1) & (pixel[:, 0] < camera.width) & (pixel[:, 1] < camera.height)
+        sees[i] = camera.shows(pixel, z)
         ray = centres[i] - points
         rays[i] = ray / np.maximum(np.linalg.norm(ray, axis=1, keepdims=True), 1e-12)
         if normals is not None:

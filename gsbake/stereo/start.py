@@ -80,7 +80,7 @@ def in_air(points: Array, maps: Iterator[tuple[Camera, NDArray[np.float32]]], ma
     votes = np.zeros(len(points), np.int64)
     for camera, depth in maps:
         pixel, z = camera.project(points)
-        seen = (z > 1e-6) & (pixel >= 0).all(1) & (pixel[:, 0] < camera.width) & (pixel[:, 1] < camera.height)
+        seen = camera.shows(pixel, z)
         column, row = np.floor(pixel[seen]).astype(np.int64).T
         there = depth[row, column]
         votes[np.flatnonzero(seen)[(there > 0) & (z[seen] < there - margin)]] += 1

@@ -129,18 +129,6 @@ def patch_means(vertices: Vertices, edges: Indices, spread: float) -> Vertices:
     return vertices
 
 
-def visible(caster: RayCaster, points: Vertices, normals: Vertices, camera: Camera, lift: float) -> NDArray[np.bool_]:
-    """Whether `camera` sees each of the `points` (n, 3) of the caster's mesh at LEAST_COSINE or better; rays start `lift` above them."""
-    uv, z = camera.project(points)
-    way = camera.centre - points
-    way /= np.maximum(np.linalg.norm(way, axis=1, keepdims=True), 1e-12)
-    seen = (z > 0) & (uv >= 0).all(1) & (uv[:, 0] < camera.width) & (uv[:, 1] < camera.height)
-    seen &= np.einsum("nk,nk->n", way, normals) > LEAST_COSINE
-    rows = np.flatnonzero(seen)
-    seen[rows] = ~caster.occluded(points[rows] + lift * normals[rows], way[rows])
-    return seen
-
-
 def measure(vertices: Vertices, plan: Plan, capture: Capture, threads: int) -> Samples:
     """What every photo with its pairs says about the chosen vertices."""
     edges, chosen = plan.edges, plan.chosen
@@ -149,7 +137,7 @@ def measure(vertices: Vertices, plan: Plan, capture: Capture, threads: int) -> S
     points, normals = vertices[chosen], vertex_normals(means, plan.faces)[chosen]
     sag = np.einsum("nk,nk->n", normals, means[chosen] - points)
     lift = 0.5 * float(np.linalg.norm(vertices[edges[:, 0]] - vertices[edges[:, 1]], axis=1).mean())
-    seen = np.stack([visible(caster, points, normals, camera, lift) for camera in capture.cameras])
+    seen = np.stack([caster.seen_from(camera, points, normals, LEAST_COSINE, lift) for camera in capture.cameras])
     parts = [_of_photo(index, others, seen, (points, normals, sag), capture) for index, others in enumerate(plan.pairs)]
     photo = np.repeat(np.arange(len(parts)), [len(part[0]) for part in parts])
     rows, shift, information, ncc = (np.concatenate(column) for column in zip(*parts, strict=True))

@@ -115,6 +115,17 @@ class RayCaster:
         out[~hits.hit] = np.nan
         return out
 
+    def seen_from(self, camera: Camera, points: NDArray[Any], normals: NDArray[Any], least_cosine: float, lift: float) -> NDArray[np.bool_]:
+        """Which points (n, 3) of the mesh with outward unit `normals` (n, 3) are in the camera's picture, hidden by nothing, and look at it
+        under more than `least_cosine`; rays start `lift` (mesh units) above them."""
+        pixel, z = camera.project(points)
+        way = camera.centre - points
+        way /= np.maximum(np.linalg.norm(way, axis=1, keepdims=True), 1e-12)
+        seen = camera.shows(pixel, z) & (np.einsum("nk,nk->n", way, normals) > least_cosine)
+        rows = np.flatnonzero(seen)
+        seen[rows] = ~self.occluded(points[rows] + lift * normals[rows], way[rows])
+        return seen
+
     def depth(self, camera: Camera) -> NDArray[np.float32]:
         """Depth z (h, w) of the mesh through the pixel centres of `camera`; 0 where nothing is seen."""
         rays = camera.rays().reshape(-1, 3)  # depth z = 1 along each, so distances are depths

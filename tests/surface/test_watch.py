@@ -8,7 +8,7 @@ import trimesh
 from gsbake.capture.posed import View
 from gsbake.capture.steadiness import looks_diffuse
 from gsbake.surface.raycast import RayCaster
-from gsbake.surface.watch import seen_on_mesh, watch_mesh
+from gsbake.surface.watch import MeshWatch, seen_on_mesh
 from tests.surface.scenes import camera_at, cameras_around
 
 
@@ -39,16 +39,16 @@ def photographed(glossy: bool) -> tuple[bool, str]:
     """The verdict on the larger ball, lit from above; glossy: from wherever the camera stands."""
     ball = trimesh.creation.icosphere(subdivisions=5, radius=0.5)
     caster = RayCaster(ball.vertices, ball.faces, 1)
-    views = []
+    points, faces = trimesh.sample.sample_surface(ball, 1500, seed=0)
+    watch = MeshWatch(points, ball.face_normals[faces], caster, 1.0)
     for camera in cameras_around():
         hits = caster.first_hit(camera.centre[None], camera.rays().reshape(-1, 3))
         at = np.nan_to_num(caster.points(hits)) / 0.5
         light = camera.centre / np.linalg.norm(camera.centre) if glossy else np.array([0.0, 0, 1])
         grey = np.where(hits.hit, 110 + 70 * (at @ light), 0).reshape(camera.height, camera.width)
         rgb = np.repeat(np.clip(grey, 0, 255).astype(np.uint8)[..., None], 3, 2)
-        views.append(View(camera, rgb, np.where(hits.hit, 255, 0).astype(np.uint8).reshape(rgb.shape[:2])))
-    points, faces = trimesh.sample.sample_surface(ball, 1500, seed=0)
-    return looks_diffuse(*watch_mesh(points, ball.face_normals[faces], caster, 1.0, views))
+        watch.add(View(camera, rgb, np.where(hits.hit, 255, 0).astype(np.uint8).reshape(rgb.shape[:2])))
+    return looks_diffuse(*watch.changes())
 
 
 def test_light_fixed_to_the_object_is_diffuse_light_that_moves_is_not() -> None:
