@@ -14,7 +14,7 @@ from gsbake.capture.cameras import Array, Camera
 from gsbake.stereo.cost import Pattern
 from gsbake.stereo.photos import Pair, Photo
 from gsbake.surface.normals import edges_of, vertex_normals
-from gsbake.surface.photometric import SETTLED, Agreed, agree
+from gsbake.surface.photometric import SETTLED, Agreed, agree, gains
 from gsbake.surface.photometric_kernel import displace
 from gsbake.surface.photometric_measure import BELIEVED, Capture, Plan, Samples, measure, patch_means
 from gsbake.surface.photometric_reference import displacement
@@ -125,6 +125,20 @@ def test_majority_decides() -> None:
     information = np.array([2.0, 2, 2, 0, 1, 1, 0, 0])
     samples = Samples(np.arange(8), np.repeat([3, 5], 4), np.zeros(8), information, np.ones(8))
     np.testing.assert_allclose(samples.weights(), [1, 1, 1, 0, 0, 0, 0, 0])
+
+
+def test_a_round_gains_where_most_measurements_match_better() -> None:
+    """A few patches that slip off an edge lose more than all the others gain; without those, losing is losing."""
+
+    def found(ncc: list[float]) -> Samples:
+        return Samples(np.arange(5), np.full(5, 2), np.zeros(5), np.ones(5), np.array(ncc))
+
+    before = found([0.8, 0.8, 0.8, 0.8, 0.8])
+    assert gains(before, found([0.81, 0.81, 0.81, 0.5, 0.5]))
+    assert not gains(before, found([0.79, 0.79, 0.79, 0.99, 0.99]))
+    assert not gains(before, before)
+    useless = Samples(np.arange(5), np.full(5, 2), np.zeros(5), np.zeros(5), np.full(5, 0.8))
+    assert not gains(useless, before)
 
 
 @pytest.mark.parametrize("error", [1.0, -1.0])
