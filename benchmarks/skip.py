@@ -1,18 +1,25 @@
 """Time and error with each rule of `[skip]` on and off.
 
-python -m benchmarks.skip CAPTURE [--profile preview] [--rules photos,converged] [--modes auto,never] [--out DIR] [--csv FILE]
+python -m benchmarks.skip CAPTURE [--profile preview] [--rules photos,converged] [--modes auto,never] [--reuse RUN] [--out DIR] [--csv FILE]
 
 CAPTURE is a folder of photos, or `built-in` for `gsbake synth`'s own. The first run leaves every rule at auto; then one rule after the
-other is set to each of the other modes, in the same output folder, so that stages it does not touch come from the cache. Seconds are
-those of the stages' manifests, cached ones included: what the run would take from nothing. Where the capture has its truth the mesh is
-measured against it (`benchmarks.truth`); PSNR and bytes are those of the finished asset, as the report says. A mode that cannot be had
-(poses that are not there, photos without masks) is a line with the reason.
+other is set to each of the other modes, in the same output folder, so that stages it does not touch come from the cache. `--reuse` puts
+the early stages (up to stereo) of a finished run of the same photos and profile there first; RUN itself is only read.
+
+Seconds are wall time, those of the stages' manifests, cached ones included: what the run would take from nothing. CPU seconds are of the
+processes of the stages, and of those only that ran here: what `--reuse` brought is in no row, so rows of one output folder compare.
+Where the capture has its truth the mesh is measured against it (`benchmarks.truth`); PSNR and bytes are those of the finished asset,
+as the report says. A mode that cannot be had (poses that are not there, photos without masks) is a line with the reason.
+Rows in the CSV of runs that are not made again stay.
 """
 
 from __future__ import annotations
 
 import argparse
 import csv
+import json
+import resource
+import shutil
 import sys
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields
@@ -22,11 +29,15 @@ from benchmarks.timeline import BUILT_IN, ROOT, find_capture, manifests, names
 from benchmarks.truth import measure_stage, read_truth
 from gsbake.cli.options import Options
 from gsbake.cli.session import open_session
+from gsbake.pipeline.engine import Observer
 from gsbake.pipeline.errors import BadInputError, UsageError
+from gsbake.pipeline.plan import StageState
 from gsbake.pipeline.skip import PREFIX
 from gsbake.profile.schema import Skip
 
 RESULTS = ROOT / "benchmarks" / "results" / "skip.csv"
+#: Stages that `--reuse` takes from another run.
+EARLY = ("ingest", "poses", "stereo")
 
 
 @dataclass(frozen=True)
@@ -44,18 +55,67 @@ class Row:
     evidence: str
     said_s: float | None = None
     seconds: float | None = None
+    cpu_s: float | None = None
     chamfer_pct: float | None = None
     normal_deg: float | None = None
     psnr: float | None = None
     megabytes: float | None = None
 
 
+class CpuClock(Observer):
+    """CPU seconds of each stage's process, by stage and key, kept in `file` for runs that find the stage in the cache."""
+
+    def __init__(self, file: Path) -> None:
+        self.file = file
+        self.spent: dict[str, float] = json.loads(file.read_text()) if file.is_file() else {}
+        self._begun = 0.0
+
+    def starts(self, state: StageState) -> None:
+        """Note what ended processes have taken so far."""
+        self._begun = _children()
+
+    def finished(self, state: StageState) -> None:
+        """The difference is this stage's."""
+        self.spent[_stage_key(state)] = _children() - self._begun
+        self.file.parent.mkdir(parents=True, exist_ok=True)
+        self.file.write_text(json.dumps(self.spent, indent=1))
+
+    def total(self, states: Sequence[StageState]) -> float:
+        """CPU seconds of those of the stages that ran under this clock."""
+        return sum(self.spent.get(_stage_key(state), 0.0) for state in states)
+
+
+def _children() -> float:
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
+
+
+def _stage_key(state: StageState) -> str:
+    assert state.artifact is not None
+    return f"{state.name}/{state.artifact.folder.name}"
+
+
+def reuse(run: Path, out: Path, stages: Sequence[str] = EARLY) -> None:
+    """Copy `stages` of the finished `run` to the output folder `out`, those that it lacks.
+
+    Raises UsageError where `run` has none.
+    """
+    found = [folder for stage in stages for folder in (run / "stages" / stage).glob("*") if (folder / "manifest.json").is_file()]
+    if not found:
+        raise UsageError(f"{run} holds no finished early stages; give the output folder of a finished run.")
+    for folder in found:
+        target = out / folder.relative_to(run)
+        if not target.exists():
+            shutil.copytree(folder, target)
+
+
 def measure_run(folder: Path, profile: str, rule: str, mode: str, out: Path, threads: int) -> Row:
     """Run everything with one rule set, or take what is cached, and measure it."""
     overrides = [f"{PREFIX}{rule}={mode}"] if rule else []
     options = Options(photos=folder, out=out, profile=profile, overrides=overrides, device="cpu", threads=threads)
+    clock = CpuClock(out / "cpu.json")
     try:
-        states = open_session(options).engine.run("report")
+        states = open_session(options, clock).engine.run("report")
     except BadInputError as error:
         return Row(folder.name, profile, rule, mode, "cannot be had", str(error))
     done = manifests(states)
@@ -77,6 +137,7 @@ def measure_run(folder: Path, profile: str, rule: str, mode: str, out: Path, thr
         evidence="; ".join(d["evidence"] for d in mine),
         said_s=sum(said) if said else None,
         seconds=sum(m["seconds"] for m in done.values()),
+        cpu_s=clock.total(states),
         chamfer_pct=figures.chamfer_pct if figures else None,
         normal_deg=figures.normal_deg if figures else None,
         psnr=done["report"]["results"]["psnr"],
@@ -90,11 +151,25 @@ def show(row: Row) -> None:
     def text(value: float | None, form: str) -> str:
         return "–" if value is None else format(value, form)
 
-    sys.stdout.write(
-        f"{row.capture:16} {row.rule:16} {row.mode:6} {text(row.seconds, '7.1f')} s  Chamfer {text(row.chamfer_pct, '.3f')} %  "
-        f"normals {text(row.normal_deg, '.2f')}°  PSNR {text(row.psnr, '.2f')} dB  {text(row.megabytes, '.2f')} MB  {row.choice}\n"
-    )
+    spent = f"{text(row.seconds, '7.1f')} s  CPU {text(row.cpu_s, '6.1f')} s"
+    errors = f"Chamfer {text(row.chamfer_pct, '.3f')} %  normals {text(row.normal_deg, '.2f')}°  PSNR {text(row.psnr, '.2f')} dB"
+    sys.stdout.write(f"{row.capture:16} {row.rule:16} {row.mode:6} {spent}  {errors}  {text(row.megabytes, '.2f')} MB  {row.choice}\n")
     sys.stdout.flush()
+
+
+def write(path: Path, rows: Sequence[Row]) -> None:
+    """Write the rows; those of other runs that the file holds stay before them."""
+    again = {(row.capture, row.profile, row.rule, row.mode) for row in rows}
+    old: list[dict[str, str]] = []
+    if path.is_file():
+        with path.open(newline="", encoding="utf-8") as file:
+            old = [line for line in csv.DictReader(file) if (line["capture"], line["profile"], line["rule"], line["mode"]) not in again]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, [f.name for f in fields(Row)], lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(old)
+        writer.writerows({k: round(v, 4) if isinstance(v, float) else v for k, v in asdict(row).items()} for row in rows)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -105,6 +180,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--rules", type=names, default=list(Skip.model_fields))
     parser.add_argument("--modes", type=names, default=["never"], help="besides auto: never, always")
     parser.add_argument("--threads", type=int, default=0, help="0: the physical cores")
+    parser.add_argument("--reuse", type=Path, help="a finished run of the same photos and profile, whose early stages are taken")
     parser.add_argument("--out", type=Path, default=ROOT / "out" / "bench" / "skip", help="where the runs are kept")
     parser.add_argument("--csv", type=Path, default=RESULTS)
     args = parser.parse_args(arguments)
@@ -114,15 +190,17 @@ def main(arguments: Sequence[str] | None = None) -> None:
         folder = find_capture(args.capture, args.out) if args.capture == BUILT_IN else Path(args.capture).resolve()
     except UsageError as error:
         parser.error(str(error))
+    out = args.out / "runs" / folder.name
+    try:
+        if args.reuse:
+            reuse(args.reuse, out)
+    except UsageError as error:
+        parser.error(str(error))
     rows: list[Row] = []
     for rule, mode in [("", "auto"), *((rule, mode) for rule in args.rules for mode in args.modes)]:
-        rows.append(measure_run(folder, args.profile, rule, mode, args.out / "runs" / folder.name, args.threads))
+        rows.append(measure_run(folder, args.profile, rule, mode, out, args.threads))
         show(rows[-1])
-        args.csv.parent.mkdir(parents=True, exist_ok=True)
-        with args.csv.open("w", newline="", encoding="utf-8") as file:
-            writer = csv.DictWriter(file, [f.name for f in fields(Row)])
-            writer.writeheader()
-            writer.writerows(asdict(row) for row in rows)
+        write(args.csv, rows)
 
 
 if __name__ == "__main__":

@@ -1,14 +1,21 @@
-"""The benchmark of left-out work: what cannot be had is a row with its reason, and a rule that is not there an error."""
+"""The benchmark of left-out work: what cannot be had is a row with its reason, a rule that is not there an error; what other runs made
+is reused, and their rows stay."""
 
 from __future__ import annotations
 
+import csv
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
 
-from benchmarks.skip import main, measure_run
+from benchmarks.skip import CpuClock, Row, main, measure_run, reuse, write
+from gsbake.pipeline.errors import UsageError
+from gsbake.pipeline.plan import StageState
+from gsbake.pipeline.store import Artifact
 
 
 def test_a_mode_that_cannot_be_had_is_a_row_with_the_reason(tmp_path: Path) -> None:
@@ -26,3 +33,42 @@ def test_an_unknown_rule_is_an_error(capsys: pytest.CaptureFixture[str]) -> None
     with pytest.raises(SystemExit):
         main(["built-in", "--rules", "photos,phots"])
     assert "there is no rule phots" in capsys.readouterr().err
+
+
+def test_early_stages_of_another_run_are_copied_and_the_run_is_left_alone(tmp_path: Path) -> None:
+    run, out = tmp_path / "run", tmp_path / "out"
+    for name in ("stages/poses/abc/manifest.json", "stages/poses/abc.checkpoint/half", "stages/train/def/manifest.json"):
+        (run / name).parent.mkdir(parents=True)
+        (run / name).write_text("theirs")
+    reuse(run, out)
+    assert [p.relative_to(out).as_posix() for p in out.rglob("*") if p.is_file()] == ["stages/poses/abc/manifest.json"]
+    (out / "stages/poses/abc/manifest.json").write_text("ours")
+    reuse(run, out)
+    assert (out / "stages/poses/abc/manifest.json").read_text() == "ours"
+    assert (run / "stages/poses/abc/manifest.json").read_text() == "theirs"
+
+
+def test_a_run_without_early_stages_cannot_be_reused(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="no finished early stages"):
+        reuse(tmp_path, tmp_path / "out")
+
+
+def test_rows_of_other_runs_stay_in_the_file(tmp_path: Path) -> None:
+    file = tmp_path / "skip.csv"
+    write(file, [Row("cup", "preview", "settled", "never", "old", "", seconds=1.0), Row("cup", "preview", "photos", "never", "kept", "")])
+    write(file, [Row("cup", "preview", "settled", "never", "new", "", seconds=2.25), Row("jug", "preview", "settled", "never", "more", "")])
+    with file.open(newline="") as body:
+        lines = [(line["capture"], line["choice"], line["seconds"]) for line in csv.DictReader(body)]
+    assert lines == [("cup", "kept", ""), ("cup", "new", "2.25"), ("jug", "more", "")]
+
+
+def test_the_clock_counts_what_a_stages_process_takes_and_remembers_it(tmp_path: Path) -> None:
+    def state(name: str) -> StageState:
+        return StageState(name, name, "run", (), None, Artifact(tmp_path / name / "key", {}, {}))
+
+    clock, train = CpuClock(tmp_path / "cpu.json"), state("train")
+    clock.starts(train)
+    subprocess.run([sys.executable, "-c", "import time\nwhile time.process_time() < 0.5: pass"], check=True)
+    clock.finished(train)
+    assert clock.total([train]) > 0.4  # what the process says of itself, whatever else runs
+    assert CpuClock(tmp_path / "cpu.json").total([train, state("mesh")]) == clock.total([train])
