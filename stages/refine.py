@@ -15,7 +15,7 @@ def run(ctx: Context) -> dict[str, Any]:
     from gsbake.splat.surfels import Surfels
 
     settings = ctx.settings
-    posed = PosedPhotos.open(ctx.inputs["poses"])
+    posed = PosedPhotos.open(ctx.inputs["poses"], ctx.inputs["train"])
     surfels = Surfels.load(ctx.inputs["train"] / "surfels.safetensors")
     light = None
     if (ctx.inputs["train"] / "light.safetensors").exists():
@@ -24,13 +24,13 @@ def run(ctx: Context) -> dict[str, Any]:
         light = EnvironmentLight.load(ctx.inputs["train"] / "light.safetensors")
     with ctx.part("prune and densify"):
         surfels, counts = prune_and_densify(surfels, posed, settings.refine, settings.train.max_size, ctx.seed)
-    session = Session(ctx, posed, surfels, light, settings.refine.iterations, 0.0, None)
+    session = Session(ctx, posed, surfels, light, settings.refine.iterations, 0.0, None, ctx.inputs["train"])
     return session.run() | {"counts": counts}
 
 
 STAGE = Stage(
     name="refine",
-    version=1,
+    version=2,
     title="refine surfels",
     run=run,
     needs=("poses", "train"),

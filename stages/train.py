@@ -9,7 +9,8 @@ from gsbake.pipeline.stage import Context, Stage
 
 
 def run(ctx: Context) -> dict[str, Any]:
-    """Start surfels, train them, and write `surfels.safetensors`, `light.safetensors` (materials only) and `log.csv`."""
+    """Start surfels, train them, and write `surfels.safetensors`, `light.safetensors` (materials only) and `log.csv`; where poses or
+    exposures were refined also `cameras.json` or `exposure.json`."""
     from gsbake.capture.posed import PosedPhotos
     from gsbake.splat.policies import growth
     from gsbake.splat.session import Session
@@ -44,11 +45,11 @@ def run(ctx: Context) -> dict[str, Any]:
 
 STAGE = Stage(
     name="train",
-    version=2,
+    version=3,
     title="train surfels",
     run=run,
     needs=("poses", "stereo"),
-    settings=("train.*", "splat.*", "loss.*", "skip.converged", "skip.settled"),
+    settings=("train.*", "splat.*", "loss.*", "skip.converged", "skip.settled", "skip.refined_*"),
     uses_device=True,
     seeded=True,
 )

@@ -33,9 +33,14 @@ class PosedPhotos:
     cameras: CameraSet
 
     @staticmethod
-    def open(folder: Path) -> PosedPhotos:
-        """Open the artifact folder of the poses stage."""
-        return PosedPhotos(folder, CameraSet.load(folder / "cameras.json"))
+    def open(folder: Path, trained: Path | None = None) -> PosedPhotos:
+        """Open the artifact folder of the poses stage, with the cameras in force.
+
+        These are the ones that training refined, if the folder of the train or refine stage, `trained`, holds any; else those of the poses
+        stage. Every stage after training has to pass that folder, so that all of them see the same cameras.
+        """
+        refined = None if trained is None else trained / "cameras.json"
+        return PosedPhotos(folder, CameraSet.load(folder / "cameras.json" if refined is None or not refined.exists() else refined))
 
     def __len__(self) -> int:
         return len(self.cameras.cameras)

@@ -120,6 +120,7 @@ class Mesh(Section):
     max_resolution: int = Field(384, ge=16, le=2048, description="Upper bound of the derived resolution.")
     field: Literal["tsdf", "imls"] = Field("tsdf", description="Field that is meshed: fused depth maps or the surfels' own SDF samples.")
     holes: Literal["close", "leave"] = Field("close", description="Close what no photo saw, or leave it open.")
+    support: Literal["cut", "keep"] = Field("cut", description="Without masks: leave out the plane that the object stands on, or keep it.")
     faces: int = Field(30_000, ge=100, description="Target triangle count of the asset.")
     smooth: int = Field(2, ge=0, description="Taubin smoothing steps on the dense mesh.")
     normal_reach: float = Field(8.0, ge=0, description="Waves shorter than this many cells follow the rendered normals instead of the depth; 0 leaves them.")
@@ -136,8 +137,8 @@ class Bake(Section):
     visibility: Literal["none", "ambient", "directional", "bounce"] = Field(
         "bounce", description="What the fit of materials knows of shadow: nothing, an even share, one that follows the light, and light from texel to texel too."
     )
-    materials: Literal["none", "fit", "surfels"] = Field(
-        "none", description="none: colours only; fit: materials and light fitted to the photos in texture space; surfels: those the surfels learnt (splat.shading = pbr)."
+    materials: Literal["none", "delit", "fit", "surfels"] = Field(
+        "none", description="none: colours only; delit: colours without the shading of one diffuse light, for matt things; fit: materials and light fitted to the photos in texture space; surfels: those the surfels learnt (splat.shading = pbr)."
     )
     fit_steps: int = Field(400, ge=1, description="Steps of fitting materials and light in texture space.")
     fit_size: int = Field(800, ge=16, description="Longer side in pixels of the photos that materials are fitted to.")
@@ -145,7 +146,7 @@ class Bake(Section):
     dark_prior: float = Field(0.005, ge=0, description="What a reflection explains is not paint; also settles how bright the light is.")
     metal_prior: float = Field(0.003, ge=0, description="Most things are not metal.")
     white_prior: float = Field(0.0005, ge=0, description="Most light is white.")
-    roughness: Fraction = Field(0.8, description="Roughness of the whole asset without materials (bake.materials = none).")
+    roughness: Fraction = Field(0.8, description="Roughness of the whole asset where it is not measured (bake.materials = none, delit).")
 
 
 class Export(Section):
@@ -172,9 +173,13 @@ class Skip(Section):
     photos: Rule = Field("auto", description="Photos that add nothing: saved twice, or of a place that many others show from the same side. always: in small sets too.")
     view_dependence: Rule = Field("auto", description="Colours that change with the direction, where the places of the surface look the same in all photos.")
     settled: Rule = Field("auto", description="Training steps where stereo has settled the surface: up to half of them, by the share of the object that it confirmed. always: half of them.")
+    refined_poses: Rule = Field("auto", description="Refining the photos' poses in training, where that gains nothing on held-out photos.")
+    refined_exposure: Rule = Field("auto", description="Learning one exposure gain per photo in training, where that gains nothing on held-out photos.")
     converged: Rule = Field("auto", description="Training steps after held-out PSNR and SDF median stand still. always: the last steps are left out in any case.")
     far_cells: Rule = Field("auto", description="Grid cells far from the surface.")
     normal_map: Rule = Field("auto", description="The normal map, where the decimated mesh has the normals of the dense one.")
+    metallic_map: Rule = Field("auto", description="The map of metal, where no texel shows it and the held-out photos do not miss it.")
+    roughness_map: Rule = Field("auto", description="The map of roughness, where one number shows the held-out photos as well.")
     exposure: Rule = Field("auto", description="Dividing out one exposure gain per photo, where photos compared on the surface are as bright as one another.")
 
 
