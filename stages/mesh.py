@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from gsbake.capture.posed import PosedPhotos
     from gsbake.surface.resolution import Resolution
     from gsbake.surface.spool import ViewSpool
+    from gsbake.surface.support import Support
     from gsbake.surface.tsdf import SparseTsdf
 
 #: The object lives in the unit sphere; a little more, so that its outermost point is not cut.
@@ -42,7 +43,7 @@ def run(ctx: Context) -> dict[str, Any]:
     from gsbake.capture.posed import PosedPhotos
     from gsbake.surface.spool import ViewSpool
 
-    posed = PosedPhotos.open(ctx.inputs["poses"])
+    posed = PosedPhotos.open(ctx.inputs["poses"], ctx.inputs["refine"])
     points, normals, weights = _samples(ctx.inputs["refine"])
     lower, upper, resolution = _choose(ctx, posed, points)
     with tempfile.TemporaryDirectory(dir=ctx.checkpoint, prefix="depth-") as folder:
@@ -53,7 +54,8 @@ def run(ctx: Context) -> dict[str, Any]:
         cells = min(max(3 * noise / resolution.cell, TRUNCATION_CELLS[0]), TRUNCATION_CELLS[1])
         evidence = f"median depth difference between neighbouring views {noise / resolution.cell:.2f} cells"
         ctx.decide("truncation", f"{cells:.1f} cells", evidence)
-        field = _field(ctx, spool, lower, upper, resolution, cells * resolution.cell, posed.has_masks, (points, normals, weights))
+        support = _support(ctx, posed, points, normals, weights)
+        field = _field(ctx, spool, lower, upper, resolution, cells * resolution.cell, posed.has_masks, support, (points, normals, weights))
         with ctx.part("marching"):
             dense = field.mesh(close=ctx.settings.mesh.holes == "close")
         del field
@@ -62,7 +64,7 @@ def run(ctx: Context) -> dict[str, Any]:
                 "mesh: the trained surfels show no surface inside the object's sphere; look at the training figures in the report, "
                 "give masks, or train longer (train.iterations)."
             )
-        return _finish(ctx, dense, posed, spool, resolution, noise)
+        return _finish(ctx, dense, posed, spool, resolution, noise, support)
 
 
 def _samples(folder: Path) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
@@ -131,6 +133,22 @@ def _render(ctx: Context, posed: PosedPhotos, spool: ViewSpool, resolution: Reso
         ctx.decide("depth", f"{share:.0f} % from stereo", f"there it agrees with the rendered depth to {MEASURED_CELLS:g} cells")
 
 
+def _support(
+    ctx: Context, posed: PosedPhotos, points: NDArray[np.float64], normals: NDArray[np.float64], weights: NDArray[np.float64]
+) -> Support | None:
+    """What the object stands on, which is left out of the mesh; not looked for where masks tell the object apart."""
+    import numpy as np
+
+    from gsbake.surface.support import find_support
+
+    if posed.has_masks or ctx.settings.mesh.support == "keep":
+        return None
+    centres = np.stack([camera.centre for camera in posed.cameras.cameras])
+    found, evidence = find_support(points, normals, weights, centres, ctx.seed)
+    ctx.decide("support", "part of the object" if found is None else "left out", evidence)
+    return found
+
+
 def _noise(spool: ViewSpool) -> float:
     """Median disagreement (unit frame) of neighbouring views' depths; 0 when no two views overlap."""
     import numpy as np
@@ -157,6 +175,7 @@ def _field(
     resolution: Resolution,
     truncation: float,
     masks: bool,
+    support: Support | None,
     samples: tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]],
 ) -> SparseTsdf:
     """The distance field, from depth maps or from the surfels' own samples."""
@@ -165,7 +184,7 @@ def _field(
     from gsbake.surface.imls import imls_field
     from gsbake.surface.tsdf import SparseTsdf
 
-    field = SparseTsdf(lower, upper, resolution.cell, truncation, ball=BALL, solid=masks)
+    field = SparseTsdf(lower, upper, resolution.cell, truncation, ball=BALL, solid=masks or support is not None, support=support)
     with ctx.part("survey"):
         for done, view in enumerate(spool):
             ctx.check_stop()
@@ -194,14 +213,20 @@ def _finish(
     spool: ViewSpool,
     resolution: Resolution,
     noise: float,
+    support: Support | None,
 ) -> dict[str, Any]:
     """Clean, refine along the normals, fit to the masks, decimate, write."""
     from gsbake.surface import clean
     from gsbake.surface.ply import write_ply
+    from gsbake.surface.support import drop_surroundings
 
     settings = ctx.settings.mesh
     vertices, faces = dense
     with ctx.part("clean"):
+        around = 0
+        if support is not None:
+            vertices, faces, around = drop_surroundings(vertices, faces, BALL - 3 * resolution.cell)
+            vertices = support.ground(vertices, resolution.cell)
         vertices, faces, dropped = clean.drop_small(vertices, faces, settings.min_component)
         if settings.normal_reach > 0:
             vertices = _follow(spool, vertices, faces, settings.normal_reach, resolution.cell)
@@ -239,7 +264,7 @@ def _finish(
         "cells": resolution.cells,
         "depth_noise_cells": noise / resolution.cell,
         "components": low.components,
-        "dropped_components": dropped,
+        "dropped_components": dropped + around,
         "watertight": low.watertight,
         "border_edges": low.border_edges,
         "decimation_error_cells": error / resolution.cell,
@@ -326,7 +351,7 @@ def _agree(
 
 STAGE = Stage(
     name="mesh",
-    version=3,
+    version=4,
     title="Mesh",
     run=run,
     needs=("poses", "stereo", "refine"),

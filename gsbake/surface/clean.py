@@ -43,8 +43,13 @@ def topology(vertices: Vertices, faces: Faces) -> Topology:
     edges = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1).astype(np.int64)
     _, counts = np.unique(edges[:, 0] * len(vertices) + edges[:, 1], return_counts=True)
     border, crowded = int((counts == 1).sum()), int((counts > 2).sum())
-    pieces = len(np.unique(_labels(len(vertices), faces)[faces[:, 0]]))
+    pieces = len(np.unique(piece_of_faces(vertices, faces)))
     return Topology(pieces, border == 0 and crowded == 0, border, crowded)
+
+
+def piece_of_faces(vertices: Vertices, faces: Faces) -> NDArray[Any]:
+    """The loose piece (f,) each face belongs to; the numbers count vertices without faces, too."""
+    return _labels(len(vertices), faces)[faces[:, 0]]
 
 
 def drop_small(vertices: Vertices, faces: Faces, min_share: float) -> tuple[Vertices, Faces, int]:
@@ -54,7 +59,7 @@ def drop_small(vertices: Vertices, faces: Faces, min_share: float) -> tuple[Vert
     """
     if len(faces) == 0:
         return vertices, faces, 0
-    piece = _labels(len(vertices), faces)[faces[:, 0]]
+    piece = piece_of_faces(vertices, faces)
     corners = vertices[faces]
     area = np.bincount(piece, np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1))
     volume = np.bincount(piece, np.einsum("fd,fd->f", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])))

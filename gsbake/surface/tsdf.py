@@ -22,6 +22,7 @@ from gsbake.surface.blocks import EDGE, BlockLattice
 from gsbake.surface.diffusion import crossing_blocks, diffuse, span
 from gsbake.surface.fusion import BY_DEPTH, BY_MASK, fuse_view, mark_depth, reach_tiles
 from gsbake.surface.marching import coarse_values, march
+from gsbake.surface.support import Support
 from gsbake.surface.views import DepthView, Floats
 
 #: The dense survey lattice has at most this many samples per axis.
@@ -97,16 +98,24 @@ class SparseTsdf:
     """A field over the box `lower`..`upper` (3,), samples `cell` apart, distances truncated at `truncation` (same units).
 
     `ball` is the radius around the origin that holds the object: with `solid` (masks tell the object apart, so everything outside
-    the ball is empty) the surface closes inside it; without, the surface is cut open there.
+    the ball is empty) the surface closes inside it; without, the surface is cut open there. Below the cut of a `support` all is empty.
     """
 
     def __init__(
-        self, lower: ArrayLike, upper: ArrayLike, cell: float, truncation: float, ball: float | None = None, solid: bool = True
+        self,
+        lower: ArrayLike,
+        upper: ArrayLike,
+        cell: float,
+        truncation: float,
+        ball: float | None = None,
+        solid: bool = True,
+        support: Support | None = None,
     ) -> None:
         self.lattice = BlockLattice(lower, upper, cell)
         self.truncation = float(truncation)
         self.ball = ball
         self.solid = solid
+        self.support = support
         self.ratio = max(4, -(-max(self.lattice.samples) // SURVEY_SAMPLES))
         coarse_cell = self.ratio * cell
         extent = np.array(self.lattice.samples) * cell
@@ -147,6 +156,10 @@ class SparseTsdf:
             empty = self._outside(field.lattice)
             field.values[empty] = 1
             unknown &= ~empty
+        if self.support is not None:
+            below = self._below(field.lattice, slice(None), field.truncation)
+            field.values[:] = np.maximum(field.values, below)
+            unknown &= below < 0
         # The filling asks on which side a sample lies, not how far: a thin layer of "inside" must weigh as much as the wide empty space.
         np.clip(SIDE * field.values, -1, 1, out=field.values)
         longest = max(field.lattice.samples)
@@ -192,15 +205,33 @@ class SparseTsdf:
             fused.values[fused.seen == BY_MASK] = np.maximum(fused.values[fused.seen == BY_MASK], 0.5)
             shallow = np.flatnonzero((unknown & (np.abs(fused.values) < 1)).any(axis=(1, 2, 3)))
             span(self.lattice, fused.values, unknown, shallow, SEAM_SWEEPS, 1.5, SEAM_ROUNDS)
+            self._cut()
             vertices, faces = march(self.lattice, fused.values, filled, float(self.ratio), scale)
         else:
             fused.values[(fused.seen & BY_DEPTH) == 0] = np.nan
+            self._cut()
             vertices, faces = march(self.lattice, fused.values)
         if self.ball is not None and not self.solid:
             keep = (np.linalg.norm(vertices, axis=1) <= self.ball)[faces].all(1)
             used, inverse = np.unique(faces[keep], return_inverse=True)
             vertices, faces = vertices[used], inverse.reshape(-1, 3).astype(np.int32)
         return vertices, faces
+
+    def _below(self, lattice: BlockLattice, rows: slice, truncation: float) -> Floats:
+        """Distance (n, 8, 8, 8) of the samples of some blocks below the support's cut, in units of `truncation`, kept in ±1."""
+        assert self.support is not None
+        height = self.support.height(lattice.positions(rows)) - self.support.cut
+        return np.clip(-height / truncation, -1, 1).astype(np.float32)
+
+    def _cut(self) -> None:
+        """Empty the fine blocks below the support's cut, so that what stands on it ends there in a flat face."""
+        assert self._fused is not None
+        if self.support is None:
+            return
+        step = 1024  # blocks: the positions of all at once would take more than the field itself
+        for start in range(0, len(self.lattice), step):
+            rows = slice(start, start + step)
+            self._fused.values[rows] = np.maximum(self._fused.values[rows], self._below(self.lattice, rows, self.truncation))
 
     def _outside(self, lattice: BlockLattice) -> NDArray[np.bool_]:
         """Samples outside the ball, and the outermost layer of the box: empty when the object is solid."""

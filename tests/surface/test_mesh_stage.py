@@ -97,6 +97,39 @@ def test_torus_comes_back(capture: Path, tmp_path: Path, field: str) -> None:
     assert sorted(p.name for p in run.out.iterdir()) == ["dense.ply", "mesh.ply"]
 
 
+@pytest.mark.parametrize("support", ["cut", "keep"])
+def test_without_masks_the_table_is_left_out(tmp_path: Path, support: str) -> None:
+    floor = -0.15
+    for folder in ("poses/photos", "refine"):
+        (tmp_path / folder).mkdir(parents=True)
+    cameras = cameras_around((20, 50), 5, 160)
+    CameraSet(tuple(cameras)).save(tmp_path / "poses" / "cameras.json")
+    for camera in cameras:
+        cv2.imwrite(str(tmp_path / "poses" / "photos" / f"{camera.name}.png"), np.full((camera.height, camera.width, 3), 90, np.uint8))
+    rng = np.random.default_rng(0)
+    body = rng.uniform(-0.9, 0.9, (9000, 3))
+    for _ in range(12):
+        body -= torus(body)[:, None] * gradient(torus, body)
+    body = body[body[:, 2] > floor]
+    angle, radius = rng.uniform(0, 2 * np.pi, 6000), np.sqrt(rng.uniform(0, 1, 6000))
+    table = np.stack([radius * np.cos(angle), radius * np.sin(angle), np.full(6000, floor)], 1)
+    points = np.concatenate([body, table])
+    normals = np.concatenate([gradient(torus, body), np.tile([0.0, 0.0, 1.0], (6000, 1))])
+    create(points, normals, np.full(len(points), 0.04), None, "colour", 0, 0.0, 4.0).save(tmp_path / "refine" / "surfels.safetensors")
+    run = Run(tmp_path / "run", faces=3000, max_resolution=80, support=support)
+    results = STAGE.run(run)
+    mesh = trimesh.load(run.out / "mesh.ply", process=False)
+    across = np.linalg.norm(np.asarray(mesh.vertices)[:, :2], axis=1).max()
+    if support == "keep":
+        assert "support" not in run.decisions and across > 0.95
+        return
+    assert run.decisions["support"][0] == "left out"
+    assert mesh.is_watertight and results["components"] == 1
+    assert across == pytest.approx(0.77, abs=2 * results["cell"])
+    assert mesh.bounds[0][2] == pytest.approx(floor, abs=results["cell"])
+    assert mesh.bounds[1][2] == pytest.approx(0.22, abs=results["cell"])
+
+
 def test_no_surfels_is_the_persons_error(capture: Path) -> None:
     from gsbake.splat.surfels import Surfels
 
