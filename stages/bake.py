@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from gsbake.pipeline.errors import BadInputError
@@ -14,11 +14,10 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from gsbake.surface.raycast import RayCaster
-    from gsbake.texture.atlas import Atlas
     from gsbake.texture.normals import Detail
     from gsbake.texture.pixels import Pixels
     from gsbake.texture.project import Blended
-    from gsbake.texture.texels import Texels
+    from gsbake.texture.surface import Surface
 
 #: Occlusion is smooth: it is traced on at most this many texels along the edge and enlarged.
 OCCLUSION_SIZE = 1024
@@ -32,30 +31,10 @@ MASK_MARGIN = 0.008
 MOST_PIXELS = 60_000
 #: Materials are fitted where the photos together saw a texel as well as this many frontal views do; elsewhere they are continued.
 LEAST_SEEN = 0.3
+#: Edge of the texture on which the shading of matt things is estimated: some ten thousand texels tell a light of nine numbers.
+DELIT_SIZE = 128
 #: Rendered materials count where the surfels are at least this opaque.
 SOLID = 0.8
-
-
-@dataclass(frozen=True)
-class Surface:
-    """The light mesh cut into charts.
-
-    Per atlas vertex `position` (v, 3), `normal` (v, 3), `tangent` (v, 4); its texels, their points `at` (n, 3) and unit normals `facing`
-    (n, 3); `caster` holds the mesh before it was cut, `whole` the cut one with the atlas'
-    triangles; `diagonal` of the bounding box and `texel` edge in the unit frame.
-    """
-
-    atlas: Atlas
-    position: NDArray[np.float64]
-    normal: NDArray[np.float64]
-    tangent: NDArray[np.float32]
-    texels: Texels
-    at: NDArray[np.float32]
-    facing: NDArray[np.float32]
-    caster: RayCaster
-    whole: RayCaster
-    diagonal: float
-    texel: float
 
 
 def run(ctx: Context) -> dict[str, Any]:
@@ -88,6 +67,9 @@ def run(ctx: Context) -> dict[str, Any]:
     if settings.materials == "fit":
         with ctx.part("fit"):
             blended, detail, fit = _fit_materials(ctx, surface, blended, detail, open_share)
+    elif settings.materials == "delit":
+        with ctx.part("delit"):
+            blended = _delit(ctx, surface, blended, detail, open_share)
     tangent = texels.interpolate(surface.tangent, surface.atlas.faces)
     agree, evidence = (False, "materials are fitted, which bends normals") if fit else normals_agree(detail, surface.facing)
     plain = leave_out(ctx, "normal_map", agree, evidence, "no normal map", "normal map baked")
@@ -101,13 +83,15 @@ def run(ctx: Context) -> dict[str, Any]:
             values = np.concatenate([values, constant], 1)
         values = np.clip(values, 0, 1)
         coverage = np.stack([np.ones(len(texels), np.float32), blended.seen.astype(np.float32), blended.confidence], 1)
-        packed = np.concatenate([values[:, :3], open_share[:, None], values[:, 3:5]] + ([] if coded is None else [coded]), 1)
-        image = flood(texels.image(packed), texels.covered(), rim=max(2, settings.size // 256))
+        parts = [values[:, :3], open_share[:, None], values[:, 3:5], *([] if coded is None else [coded]), values[:, 5:]]
+        image = flood(texels.image(np.concatenate(parts, 1)), texels.covered(), rim=max(2, settings.size // 256))
     with ctx.part("write"):
         write_exr(ctx.out / "base_color.exr", image[..., 0:3])
         write_exr(ctx.out / "orm.exr", image[..., 3:6])
         if coded is not None:
             write_exr(ctx.out / "normal.exr", image[..., 6:9])
+        if values.shape[1] == 8:
+            write_exr(ctx.out / "emissive.exr", image[..., -3:])
         write_exr(ctx.out / "coverage.exr", texels.image(coverage))
         _save_mesh(ctx, surface)
     unseen = float(1 - blended.seen.mean())
@@ -146,14 +130,9 @@ def _mesh(ctx: Context, name: str) -> tuple[NDArray[np.float64], NDArray[np.int6
 
 
 def _unwrap(ctx: Context, vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> Surface:
-    """Atlas, vertex frames and texels of the light mesh."""
-    import numpy as np
-
-    from gsbake.gltf.tangents import tangents
-    from gsbake.surface.raycast import RayCaster
+    """The light mesh cut into charts, with its texels."""
     from gsbake.texture.atlas import make_atlas
-    from gsbake.texture.normals import vertex_normals
-    from gsbake.texture.texels import rasterise
+    from gsbake.texture.surface import Surface
 
     size = ctx.settings.bake.size
     with ctx.part("atlas"):
@@ -162,21 +141,9 @@ def _unwrap(ctx: Context, vertices: NDArray[np.float64], faces: NDArray[np.int64
         except ValueError as error:
             raise BadInputError(f"bake: {error}; raise bake.size or lower mesh.faces.") from error
     with ctx.part("texels"):
-        position, normal = vertices[atlas.source], vertex_normals(vertices, faces)[atlas.source]
-        frames = tangents(position, normal, atlas.uv, atlas.faces)
-        atlas = replace(atlas, source=atlas.source[frames.source], uv=atlas.uv[frames.source], faces=frames.faces)
-        position, normal = position[frames.source], normal[frames.source]
-        texels = rasterise(atlas.uv, atlas.faces, size)
-        facing = texels.interpolate(normal, atlas.faces)
-        facing /= np.maximum(np.linalg.norm(facing, axis=1, keepdims=True), 1e-12)
-        corner = vertices[faces]
-        area = 0.5 * np.linalg.norm(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=1).sum()
+        surface = Surface.of(vertices, faces, atlas, size, ctx.threads)
     ctx.progress(1, 4, "atlas", charts=atlas.charts, fill=atlas.fill)
-    return Surface(
-        atlas, position, normal, frames.tangent, texels, texels.interpolate(position, atlas.faces), facing,
-        RayCaster(vertices, faces, ctx.threads), RayCaster(position, atlas.faces, ctx.threads),
-        float(np.linalg.norm(np.ptp(vertices, axis=0))), float(np.sqrt(area / (atlas.fill * size * size))),
-    )  # fmt: skip
+    return surface
 
 
 def _detail(ctx: Context, surface: Surface) -> tuple[tuple[RayCaster, NDArray[np.float64]], Detail]:
@@ -226,18 +193,22 @@ def _occlusion(ctx: Context, surface: Surface, dense: tuple[RayCaster, NDArray[n
 
 def _project_photos(ctx: Context, surface: Surface) -> Blended:
     """Base colour (n, 3) from the photos at their stored size."""
+    from gsbake.capture.exposure import TiePoints
     from gsbake.capture.posed import PosedPhotos
     from gsbake.splat.views import held_out
     from gsbake.texture.colour import decode_bytes
     from gsbake.texture.needed import constant_exposure
     from gsbake.texture.project import ProjectionBlender, mask_weights
 
-    posed = PosedPhotos.open(ctx.inputs["poses"])
+    posed = PosedPhotos.open(ctx.inputs["poses"], ctx.inputs["refine"])
     aside = set(held_out(len(posed), ctx.settings.train.holdout))
     blender = ProjectionBlender(surface.at, surface.facing, surface.caster, 3, surface.texel)
+    tied = TiePoints.of(ctx.inputs["poses"] / "sparse", posed.cameras.to_world.inverse())
     for index in range(len(posed)):
         ctx.check_stop()
         view = posed.view(index)
+        if tied is not None:
+            tied.add(view.camera, view.rgb)
         margin = MASK_MARGIN * max(view.camera.width, view.camera.height)
         weights = None if view.mask is None else mask_weights(view.mask, margin)
         blender.add(view.camera, decode_bytes(view.rgb), weights, HELD_OUT_WEIGHT if index in aside else 1.0)
@@ -246,10 +217,32 @@ def _project_photos(ctx: Context, surface: Surface) -> Blended:
         steady, evidence, blended = True, "not measured", blender.result()
     else:
         blended = blender.result(solve_exposure=True)
-        steady, evidence = constant_exposure(blended.gains)
+        steady, evidence = constant_exposure(blended.gains, None if tied is None else tied.spread())
     if leave_out(ctx, "exposure", steady, evidence, "exposure taken as constant", "exposure equalised") and (blended.gains != 1).any():
         blended = blender.result()
     return blended
+
+
+def _delit(ctx: Context, surface: Surface, shown: Blended, detail: Detail, open_share: NDArray[np.float32]) -> Blended:
+    """Base colour (n, 3): what the photos show without its shading; the light that made it is written beside the textures."""
+    import numpy as np
+
+    from gsbake.texture.coarse import Coarse
+    from gsbake.texture.delit import find_irradiance, without_shading
+
+    openness = np.ones_like(open_share) if ctx.settings.bake.visibility == "none" else open_share
+    coarse = Coarse.sized(surface.atlas.uv, surface.atlas.faces, surface.texels, surface.texel, DELIT_SIZE)
+    seen = shown.seen.astype(np.float32)[:, None]
+    share = coarse.down(seen)
+    known = share[:, 0] > 0.5
+    colour, normal, position, open_there = (
+        coarse.down(seen * x)[known] / share[known] for x in (shown.values, detail.normal, detail.position, openness[:, None])
+    )
+    irradiance = find_irradiance(colour, normal / np.linalg.norm(normal, axis=1, keepdims=True), position, open_there[:, 0])
+    values = shown.values.copy()
+    values[shown.seen], level = without_shading(shown.values[shown.seen], detail.normal[shown.seen], openness[shown.seen], irradiance)
+    irradiance.light(ctx.settings.splat.env_size, level).save(ctx.out / "light.safetensors")
+    return replace(shown, values=values)
 
 
 def _fit_materials(
@@ -257,9 +250,12 @@ def _fit_materials(
 ) -> tuple[Blended, Detail, dict[str, Any]]:
     """Base colour, roughness, metallic (n, 5) and normals fitted to the photos with the light, which is written beside the textures.
 
+    Where something glows, its radiance follows as three more columns.
+
     `shown` is what the photos show (n, 3): the fit starts from it, and where the fit works on a coarser texture it gives the fine detail.
     """
     import time
+    from functools import partial
 
     import numpy as np
 
@@ -271,10 +267,11 @@ def _fit_materials(
     from gsbake.texture.coarse import Coarse
     from gsbake.texture.fit import TRIALS, MaterialFit, Priors, trial_cost, trial_roughness
     from gsbake.texture.pixels import PixelReader
+    from gsbake.texture.plainer import plainer
     from gsbake.texture.visibility import Visibility
 
     settings = ctx.settings.bake
-    posed = PosedPhotos.open(ctx.inputs["poses"])
+    posed = PosedPhotos.open(ctx.inputs["poses"], ctx.inputs["refine"])
     cameras = [camera.within(settings.fit_size) for camera in posed.cameras.cameras]
     footprint = pixel_footprint(cameras, surface.position.mean(0))
     coarse = Coarse.of(surface.atlas.uv, surface.atlas.faces, surface.texels, surface.texel, footprint)
@@ -317,20 +314,26 @@ def _fit_materials(
     tried = ", ".join(f"{score:.2f} dB from {roughness:g}" for roughness, score in trials.items())
     ctx.decide("roughness starts at", f"{best:g}", tried or ("the object is matt" if matte else "too few photos for trials"))
     begun = time.perf_counter()
-    fitted = start(best).run(photos, held, settings.fit_steps, ctx.seed, each, metals=not matte)
+    fit = start(best)
+    fitted = fit.run(photos, held, settings.fit_steps, ctx.seed, each, metals=not matte)
     spent = (time.perf_counter() - begun) / settings.fit_steps
     leave_out(
         ctx, "view_dependence", diffuse, why, "reflections taken for broad, none tried", "reflections looked for", trial_cost(photos, spent)
     )
     fitted.light.save(ctx.out / "light.safetensors")
-    values = coarse.up(fitted.values)
-    values[:, :3] *= coarse.detail(shown.values)
+    fine = coarse.detail(shown.values)
+    judges = held if any(map(len, held)) else photos
+    values = coarse.up(plainer(fitted.values, fitted.weight, fitted.metals, partial(fit.psnr, judges), partial(leave_out, ctx)))
+    values[:, :3] *= fine
+    if fitted.glowing:
+        values = np.concatenate([values, coarse.up(fitted.glow) * fine], 1)
     known = coarse.up(fitted.weight[:, None])[:, 0] > LEAST_SEEN * (coarse.edge / footprint) ** 2
     figures: dict[str, Any] = {
         "fit_psnr": fitted.held_out,
         "fit_pixels": sum(map(len, photos)),
         "fit_texels": len(coarse.texels),
         "fit_metal_texels": fitted.metals,
+        "fit_glowing_regions": fitted.glowing,
     }
     turned = detail.normal + np.where(known[:, None], coarse.up(fitted.bend), 0)
     turned /= np.linalg.norm(turned, axis=1, keepdims=True)
@@ -347,7 +350,7 @@ def _project_materials(ctx: Context, surface: Surface) -> Blended:
     from gsbake.splat.render import SurfelRenderer
     from gsbake.texture.project import ProjectionBlender, mask_weights
 
-    posed = PosedPhotos.open(ctx.inputs["poses"])
+    posed = PosedPhotos.open(ctx.inputs["poses"], ctx.inputs["refine"])
     renderer = SurfelRenderer.load(ctx.inputs["refine"])
     blender = ProjectionBlender(surface.at, surface.facing, surface.caster, 5, surface.texel)
     size = ctx.settings.train.max_size
@@ -382,11 +385,14 @@ def _save_mesh(ctx: Context, surface: Surface) -> None:
 
 STAGE = Stage(
     name="bake",
-    version=3,
+    version=4,
     title="Textures",
     run=run,
     needs=("poses", "refine", "mesh"),
-    settings=("bake.*", "splat.env_size", "train.max_size", "train.holdout", "skip.exposure", "skip.normal_map", "skip.view_dependence"),
+    settings=(
+        "bake.*", "splat.env_size", "train.max_size", "train.holdout",
+        "skip.exposure", "skip.normal_map", "skip.view_dependence", "skip.metallic_map", "skip.roughness_map",
+    ),
     uses_device=True,
     seeded=True,
-)
+)  # fmt: skip

@@ -27,7 +27,7 @@ PREVIEW_LEVEL = 6
 def run(ctx: Context) -> dict[str, Any]:
     """Write `asset.glb`, `cameras.json`, `light.hdr` (with materials), `previews/` and `audit.json`; return the asset's figures."""
     import gsbake
-    from gsbake.capture.cameras import CameraSet
+    from gsbake.capture.posed import PosedPhotos
     from gsbake.gltf.audit import as_json, audit, failed
     from gsbake.gltf.encode import encode_within, quantise
     from gsbake.gltf.frame import asset_frame, transforms_json
@@ -36,19 +36,19 @@ def run(ctx: Context) -> dict[str, Any]:
 
     settings = ctx.settings.export
     baked = ctx.inputs["bake"]
-    cameras = CameraSet.load(ctx.inputs["poses"] / "cameras.json")
+    cameras = PosedPhotos.open(ctx.inputs["poses"], ctx.inputs["refine"]).cameras
     arrays = _arrays(ctx)
     frame = asset_frame(cameras, arrays["position"])
     mesh = _place(arrays, frame)
     with ctx.part("images"):
-        normal = read_exr(baked / "normal.exr") if (baked / "normal.exr").exists() else None
-        sheets = quantise(read_exr(baked / "base_color.exr"), read_exr(baked / "orm.exr"), normal)
+        normal, emissive = (read_exr(path) if path.exists() else None for path in (baked / "normal.exr", baked / "emissive.exr"))
+        sheets = quantise(read_exr(baked / "base_color.exr"), read_exr(baked / "orm.exr"), normal, emissive)
         geometry = sum(a.nbytes for a in (mesh.position, mesh.normal, mesh.tangent, mesh.uv, mesh.faces)) + 4096
         images, saving = encode_within(sheets, int(settings.max_megabytes * 1e6) - geometry)
     ctx.check_stop()
     with ctx.part("write"):
         extras = _extras(ctx, cameras, mesh, sheets)
-        data = build_glb(mesh, images, "asset", f"gsbake {gsbake.__version__}", settings.copyright, extras)
+        data = build_glb(mesh, images, "asset", f"gsbake {gsbake.__version__}", settings.copyright, extras, sheets.constants)
         (ctx.out / "asset.glb").write_bytes(data)
         (ctx.out / "cameras.json").write_text(json.dumps(transforms_json(cameras, frame, _sources(ctx)), indent=1))
         if ctx.settings.bake.materials != "none":
@@ -72,7 +72,7 @@ def run(ctx: Context) -> dict[str, Any]:
         "triangles": len(mesh.faces),
         "vertices": len(mesh.position),
         "texture_size": int(sheets.base_color.shape[0]),
-        "image_bytes": {"base_color": len(images.base_color), "orm": len(images.orm), "normal": len(images.normal or b"")},
+        "image_bytes": {name: len(content or b"") for name, content in vars(images).items()},
         "precision": saving.text,
         "scale": extras["scale"],
         "audit_passed": sum(f.passed for f in findings),
@@ -118,7 +118,10 @@ def _place(arrays: dict[str, NDArray[Any]], frame: Similarity) -> GltfMesh:
 
 def _extras(ctx: Context, cameras: CameraSet, mesh: GltfMesh, sheets: Sheets) -> dict[str, Any]:
     """What the asset says about itself: settings, scale, digests of what it holds."""
+    import numpy as np
     from blake3 import blake3
+
+    numbers = None if sheets.constants is None else np.array(sheets.constants, "<f8")
 
     def digest(*parts: NDArray[Any] | None) -> str:
         hasher = blake3()
@@ -134,7 +137,7 @@ def _extras(ctx: Context, cameras: CameraSet, mesh: GltfMesh, sheets: Sheets) ->
         "poses": cameras.poses,
         "digests": {
             "mesh": digest(mesh.position, mesh.normal, mesh.tangent, mesh.uv, mesh.faces),
-            "textures": digest(sheets.base_color, sheets.orm, sheets.normal),
+            "textures": digest(sheets.base_color, sheets.orm, sheets.normal, sheets.emissive, numbers),
         },
     }
 
@@ -170,7 +173,8 @@ def _write_previews(ctx: Context, sheets: Sheets, mesh: GltfMesh) -> None:
     def reduced(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
         return np.asarray(cv2.resize(image, (size, size), interpolation=cv2.INTER_AREA), np.uint8)
 
-    for name, sheet in (("base_color", sheets.base_color), ("orm", sheets.orm), ("normal", sheets.normal)):
+    named = {"base_color": sheets.base_color, "orm": sheets.orm, "normal": sheets.normal, "emissive": sheets.emissive}
+    for name, sheet in named.items():
         if sheet is not None:
             (folder / f"{name}.png").write_bytes(encode_png(reduced(sheet), PREVIEW_LEVEL))
     wires = (reduced(sheets.base_color) // 2 + 64).astype(np.uint8)
@@ -181,7 +185,7 @@ def _write_previews(ctx: Context, sheets: Sheets, mesh: GltfMesh) -> None:
 
 STAGE = Stage(
     name="export",
-    version=1,
+    version=2,
     title="Asset",
     run=run,
     needs=("ingest", "poses", "refine", "bake"),

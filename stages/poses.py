@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import shutil
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -325,7 +324,6 @@ def _extent(ctx: Context, cameras: Sequence[Camera], points: Any) -> Extent:
     pairs = [posed.mask(i, _HULL_SIZE) for i in range(len(cameras))]
     masked = [(camera, mask) for camera, mask in pairs if mask is not None]
     if len(masked) >= max(3, 0.5 * len(cameras)):
-        os.environ.setdefault("NUMBA_NUM_THREADS", str(ctx.threads))
         extent = extent_from_masks([c for c, _ in masked], [m for _, m in masked])
         if extent is not None:
             return extent

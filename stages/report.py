@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 from gsbake.pipeline.errors import BadInputError
@@ -30,7 +31,7 @@ def run(ctx: Context) -> dict[str, Any]:
     said = manifests.load_manifests(ctx.inputs)
     glb = ctx.inputs["export"] / "asset.glb"
     light = ctx.inputs["bake"] / "light.safetensors"
-    posed = PosedPhotos.open(ctx.inputs["poses"])
+    posed = PosedPhotos.open(ctx.inputs["poses"], ctx.inputs["refine"])
     with ctx.part("open"):
         asset = open_asset(glb, unlit=not light.exists())
         cameras = asset_cameras(ctx.inputs["export"] / "cameras.json")
@@ -73,13 +74,13 @@ def run(ctx: Context) -> dict[str, Any]:
         masked = posed.has_masks
         page = Page(
             title=manifests.capture_name(said),
-            lead=_lead(count, bool(learnt), posed.cameras.poses),
+            lead=_lead(count, _kind(bool(learnt), said), posed.cameras.poses),
             figures=compose.headline(said, asset, size, scored, (len(posed), count)),
             warnings=manifests.warnings(said),
             model=base64.b64encode(glb.read_bytes()).decode(),
             lights=lights,
             comparisons=compose.comparisons([scored[i] for i in shown]),
-            comparison_note=_comparison_note(held, masked, bool(learnt)),
+            comparison_note=_comparison_note(held, masked, bool(learnt), (ctx.inputs["refine"] / "cameras.json").exists()),
             relit_title="Under other light" if learnt else "From other sides",
             relit=relit,
             relit_note="The learnt light is the one in the photos; studio and sunset lit none of them."
@@ -104,20 +105,29 @@ def run(ctx: Context) -> dict[str, Any]:
     return figures | {"page_bytes": len(text)}
 
 
-def _lead(photos: int, materials: bool, poses: str) -> str:
+def _kind(lit: bool, said: Mapping[str, Mapping[str, Any]]) -> str:
+    """What the asset's colours are."""
+    if not lit:
+        return "colour as photographed"
+    if said["bake"].get("settings", {}).get("bake.materials") == "delit":
+        return "diffuse colour, without the shading of the photos' light"
+    return "base colour, roughness and metallic learnt together with the light"
+
+
+def _lead(photos: int, kind: str, poses: str) -> str:
     """The line below the title."""
-    kind = "base colour, roughness and metallic learnt together with the light" if materials else "colour as photographed"
     found = "poses given" if poses == "given" else "poses solved from the photos"
     return f"{photos} photos, {found}; {kind}."
 
 
-def _comparison_note(held: bool, masked: bool, lit: bool) -> str:
+def _comparison_note(held: bool, masked: bool, lit: bool, refined: bool) -> str:
     """What is compared, and how."""
     words = ["The exported GLB drawn from the photos' cameras" + (" under the learnt light." if lit else ", unlit.")]
     unseen, seen = "Training never saw these photos.", "No photo was held out, so training saw these: the figures flatter."
     both = "Figures are over the pixels where mask or asset shows the object."
     own = "There are no masks: figures are over the asset's pixels."
-    return " ".join([*words, unseen if held else seen, both if masked else own])
+    fitted = ["Their poses were fitted to the trained surfels."] if refined else []
+    return " ".join([*words, unseen if held else seen, *fitted, both if masked else own])
 
 
 STAGE = Stage(

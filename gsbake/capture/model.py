@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gsbake.capture.cameras import Camera
 from gsbake.capture.frames import Given, PhotoSize, collect, rigid
@@ -49,19 +50,36 @@ def read_model(folder: Path, sizes: Mapping[str, PhotoSize]) -> Given:
 
     Raises BadInputError for files that are broken or hold NaN, and for camera models that are not perspective.
     """
-    from gsbake.capture.colmap import pycolmap
-
-    try:
-        model = pycolmap.Reconstruction(str(folder))
-    except (ValueError, RuntimeError, OSError, IndexError) as error:
-        reason = str(error).strip().splitlines()[-1]
-        raise BadInputError(f"The COLMAP model {folder} cannot be read ({reason}).") from error
+    model = _open(folder)
     frames = [(im.name, camera_of(im, im.name, str(folder))) for im in model.images.values() if im.has_pose]
     if not frames:
         raise BadInputError(f"The COLMAP model {folder} holds no image with a pose.")
     cameras, missing = collect(frames, sizes, str(folder))
     points, colours = cloud(model)
     return Given(cameras, missing, points if len(points) else None, colours if len(points) else None)
+
+
+def read_tracks(folder: Path) -> tuple[Any, dict[str, NDArray[np.int64]]]:
+    """Points (n, 3) of a COLMAP model folder in its own frame, and the indices of those that each photo shows, by the photo's name
+    without suffix. Raises BadInputError for files that are broken."""
+    model = _open(folder)
+    index = {name: k for k, name in enumerate(model.points3D)}
+    points = np.array([p.xyz for p in model.points3D.values()], float).reshape(-1, 3)
+    seen = {
+        Path(image.name).stem: np.array([index[p.point3D_id] for p in image.points2D if p.has_point3D()], np.int64)
+        for image in model.images.values()
+    }
+    return points, seen
+
+
+def _open(folder: Path) -> Any:
+    from gsbake.capture.colmap import pycolmap
+
+    try:
+        return pycolmap.Reconstruction(str(folder))
+    except (ValueError, RuntimeError, OSError, IndexError) as error:
+        reason = str(error).strip().splitlines()[-1]
+        raise BadInputError(f"The COLMAP model {folder} cannot be read ({reason}).") from error
 
 
 def cloud(model: Any) -> tuple[Any, Any]:

@@ -145,9 +145,13 @@ def _layout(asset: GltfAsset, check: Any) -> None:
 
 def _images(asset: GltfAsset, check: Any) -> None:
     """Textures: PNG of a power of two without colour chunks; packing; plausible values."""
-    check("textures present", {"base_color", "orm"} <= set(asset.roles), ", ".join(asset.roles))
-    check("occlusion packed with roughness", asset.roles.get("occlusion") in (None, asset.roles.get("orm")), "one image")
-    for role in ("base_color", "orm", "normal"):
+    surface = asset.document["materials"][0].get("pbrMetallicRoughness", {}) if asset.document.get("materials") else {}
+    numbers = {"roughnessFactor", "metallicFactor"} <= surface.keys()
+    stated = "base_color" in asset.roles and ("orm" in asset.roles or numbers)
+    check("textures present", stated, ", ".join(asset.roles) + (" and numbers" if numbers else ""))
+    alone = "orm" not in asset.roles
+    check("occlusion packed with roughness", alone or asset.roles.get("occlusion") in (None, asset.roles["orm"]), "one image")
+    for role in ("base_color", "occlusion" if alone else "orm", "normal", "emissive"):
         if role not in asset.roles:
             continue
         content = asset.images[asset.roles[role]]
@@ -156,7 +160,8 @@ def _images(asset: GltfAsset, check: Any) -> None:
             check(f"{role}: PNG", False, "not a PNG file")
             continue
         width, height, depth, kind = struct.unpack_from(">IIBB", content, 16)
-        check(f"{role}: 8-bit RGB PNG", depth == 8 and kind == 2, f"{width}x{height}, {depth} bits, colour type {kind}")
+        named, wanted = ("grey", 0) if role == "occlusion" else ("RGB", 2)
+        check(f"{role}: 8-bit {named} PNG", depth == 8 and kind == wanted, f"{width}x{height}, {depth} bits, colour type {kind}")
         power = width == height and width & (width - 1) == 0
         check(f"{role}: square power of two", power, f"{width}x{height}")
         check(f"{role}: usual size", USUAL_SIZES[0] <= width <= USUAL_SIZES[1], f"{width} texels", "info")

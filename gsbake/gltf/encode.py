@@ -1,7 +1,7 @@
 """Linear masters to the 8-bit images of the asset, as small as the budget asks and no smaller.
 
-Base colour is coded in sRGB; occlusion-roughness-metallic and the normal map stay linear. If the asset would exceed its size, the low bits
-of the linear maps go first, then their resolution; the base colour is never touched.
+Base colour and emission are coded in sRGB; occlusion-roughness-metallic and the normal map stay linear. If the asset would exceed its size,
+the low bits of the linear maps go first, then their resolution; the colours are never touched.
 """
 
 from __future__ import annotations
@@ -40,29 +40,40 @@ LADDER = (
 
 @dataclass(frozen=True)
 class Sheets:
-    """The 8-bit maps (s, s, 3): base colour coded in sRGB, ORM and normal map linear."""
+    """The 8-bit maps (s, s, 3): base colour and emission coded in sRGB, ORM and normal map linear.
+
+    Where roughness and metallic are one number all over, they are `constants` instead, and `orm` (s, s) is occlusion alone.
+    """
 
     base_color: Bytes
     orm: Bytes
     normal: Bytes | None
+    emissive: Bytes | None
+    constants: tuple[float, float] | None = None
 
 
-def quantise(base_color: NDArray[Any], orm: NDArray[Any], normal: NDArray[Any] | None) -> Sheets:
+def quantise(base_color: NDArray[Any], orm: NDArray[Any], normal: NDArray[Any] | None, emissive: NDArray[Any] | None = None) -> Sheets:
     """Masters (s, s, 3) as 8-bit maps."""
-    return Sheets(encode_bytes(base_color), _linear(orm), None if normal is None else _linear(normal))
+    glow = None if emissive is None else encode_bytes(emissive)
+    packed, constants = _linear(orm), None
+    if (packed[..., 1:] == packed[0, 0, 1:]).all():
+        constants = (round(float(orm[0, 0, 1]), 3), round(float(orm[0, 0, 2]), 3))
+        packed = np.ascontiguousarray(packed[..., 0])
+    return Sheets(encode_bytes(base_color), packed, None if normal is None else _linear(normal), glow, constants)
 
 
 def encode_within(sheets: Sheets, budget: int) -> tuple[GltfImages, Saving]:
     """PNG files whose sizes sum to at most `budget` bytes if any rung of `LADDER` reaches that, else those of the last rung."""
     base = encode_png(sheets.base_color)
+    glow = None if sheets.emissive is None else encode_png(sheets.emissive)
     for saving in LADDER:
         orm = encode_png(_coarser(_smaller(sheets.orm, saving.shrink), saving.orm_bits))
         normal = None
         if sheets.normal is not None:
             normal = encode_png(_coarser(_shorter(sheets.normal, saving.shrink), saving.normal_bits))
-        if len(base) + len(orm) + len(normal or b"") <= budget:
+        if len(base) + len(orm) + len(normal or b"") + len(glow or b"") <= budget:
             break
-    return GltfImages(base, orm, normal), saving
+    return GltfImages(base, orm, normal, glow), saving
 
 
 def _linear(image: NDArray[Any]) -> Bytes:

@@ -25,7 +25,8 @@ class GltfAsset:
     """A GLB taken apart.
 
     `attributes` maps names ("POSITION", …) to arrays (v, k); `faces` (f, 3) int64; `images` holds the encoded bytes of each image and
-    `roles` the image index of each texture role of the material ("base_color", "orm", "occlusion", "normal"; absent roles are left out).
+    `roles` the image index of each texture role of the material ("base_color", "orm", "occlusion", "normal", "emissive"; absent roles
+    are left out).
     """
 
     document: dict[str, Any]
@@ -98,5 +99,6 @@ def _roles(document: dict[str, Any], material: dict[str, Any]) -> dict[str, int]
         "orm": surface.get("metallicRoughnessTexture"),
         "occlusion": material.get("occlusionTexture"),
         "normal": material.get("normalTexture"),
+        "emissive": material.get("emissiveTexture"),
     }
     return {role: document["textures"][texture["index"]]["source"] for role, texture in found.items() if texture is not None}

@@ -1,4 +1,4 @@
-"""A small writer of the one kind of glTF file gsbake makes: one mesh, one material, three textures, one GLB.
+"""A small writer of the one kind of glTF file gsbake makes: one mesh, one material, up to four textures, one GLB.
 
 trimesh and others cannot write TANGENT, and bytes that depend only on the input make assets comparable by digest.
 
@@ -36,11 +36,13 @@ class GltfMesh:
 
 @dataclass(frozen=True)
 class GltfImages:
-    """Encoded PNG files: base colour (sRGB), occlusion-roughness-metallic and normal map (both linear; the normal map may be absent)."""
+    """Encoded PNG files: base colour (sRGB), occlusion-roughness-metallic and normal map (both linear), emissive (sRGB); the last two may
+    be absent."""
 
     base_color: bytes
     orm: bytes
     normal: bytes | None
+    emissive: bytes | None = None
 
 
 @dataclass
@@ -77,9 +79,18 @@ class _Buffer:
 
 
 def build_glb(
-    mesh: GltfMesh, images: GltfImages, name: str, generator: str, copyright_line: str = "", extras: dict[str, Any] | None = None
+    mesh: GltfMesh,
+    images: GltfImages,
+    name: str,
+    generator: str,
+    copyright_line: str = "",
+    extras: dict[str, Any] | None = None,
+    constants: tuple[float, float] | None = None,
 ) -> bytes:
-    """The bytes of the asset. Raises ValueError when the mesh is empty or its arrays do not fit together."""
+    """The bytes of the asset. Raises ValueError when the mesh is empty or its arrays do not fit together.
+
+    `constants` are roughness and metallic where `images.orm` is occlusion alone.
+    """
     count = len(mesh.position)
     if len(mesh.faces) == 0 or not (len(mesh.normal) == len(mesh.tangent) == len(mesh.uv) == count):
         raise ValueError("the mesh is empty or its attributes differ in length")
@@ -94,17 +105,26 @@ def build_glb(
     component, width = (UNSIGNED_SHORT, "<u2") if count < 65535 else (UNSIGNED_INT, "<u4")
     indices = buffer.accessor(np.ascontiguousarray(mesh.faces, width).ravel(), "SCALAR", component, ELEMENT_ARRAY_BUFFER)
     pictures: list[dict[str, Any]] = []
+    surface: dict[str, Any] = {"baseColorTexture": {"index": 0}}
+    if constants is None:
+        surface["metallicRoughnessTexture"] = {"index": 1}
+    else:
+        surface["roughnessFactor"], surface["metallicFactor"] = constants
     material: dict[str, Any] = {
         "name": name,
-        "pbrMetallicRoughness": {"baseColorTexture": {"index": 0}, "metallicRoughnessTexture": {"index": 1}},
+        "pbrMetallicRoughness": surface,
         "occlusionTexture": {"index": 1},
         "alphaMode": "OPAQUE",
     }
-    for label, content in (("base_color", images.base_color), ("orm", images.orm), ("normal", images.normal)):
+    packed = "orm" if constants is None else "occlusion"
+    contents = {"base_color": images.base_color, packed: images.orm, "normal": images.normal, "emissive": images.emissive}
+    for label, content in contents.items():
         if content is not None:
             pictures.append({"name": label, "mimeType": "image/png", "bufferView": buffer.view(content)})
-    if images.normal is not None:
-        material["normalTexture"] = {"index": 2}
+            if label in ("normal", "emissive"):
+                material[f"{label}Texture"] = {"index": len(pictures) - 1}
+    if images.emissive is not None:
+        material["emissiveFactor"] = [1, 1, 1]
     asset: dict[str, Any] = {"version": "2.0", "generator": generator}
     if copyright_line:
         asset["copyright"] = copyright_line

@@ -33,11 +33,14 @@ def from_gltf(file: GltfAsset, unlit: bool, name: str) -> Asset:
     orm: Floats = np.ones((1, 1, 3), np.float32) if packed is None else packed.astype(np.float32) / np.float32(255)
     orm = orm * np.array([1, surface.get("roughnessFactor", 1.0), surface.get("metallicFactor", 1.0)], np.float32)
     occlusion = file.image("occlusion")
+    if packed is None and occlusion is not None:
+        orm = np.broadcast_to(orm, occlusion.shape).copy()
     if occlusion is None:
         orm[..., 0] = 1
     elif occlusion.shape == orm.shape:
         orm[..., 0] = occlusion[..., 0].astype(np.float32) / 255
-    coded = file.image("normal")
+    coded, glow = file.image("normal"), file.image("emissive")
+    strength = np.array(material.get("emissiveFactor", (0, 0, 0)), np.float32)
     samplers = file.document.get("samplers") or [{}]
     return Asset(
         position=file.attributes["POSITION"].astype(np.float64),
@@ -48,6 +51,7 @@ def from_gltf(file: GltfAsset, unlit: bool, name: str) -> Asset:
         base_color=base,
         orm=orm,
         normal_map=None if coded is None else coded.astype(np.float32) / np.float32(127.5) - 1,
+        emissive=None if glow is None else decode_srgb(glow.astype(np.float32) / 255) * strength,
         unlit=unlit,
         wrap=samplers[0].get("wrapS") != CLAMP,
     )

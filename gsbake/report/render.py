@@ -40,7 +40,8 @@ class Asset:
     """A textured mesh ready to be drawn, in one frame (the glTF asset's own when it was read from a GLB).
 
     `position`, `normal` (v, 3); `tangent` (v, 4) or None; `uv` (v, 2) with the origin top left; `faces` (f, 3). `base_color` (h, w, 3)
-    linear, `orm` (h, w, 3) linear occlusion, roughness, metallic, `normal_map` (h, w, 3) vectors in -1..1; the last two may be None.
+    linear, `orm` (h, w, 3) linear occlusion, roughness, metallic, `normal_map` (h, w, 3) vectors in -1..1, `emissive` (h, w, 3) linear
+    radiance; the last three may be None.
     `unlit`: the base colour is the picture, no light falls on it. `wrap`: textures repeat beyond 0..1, else their edge goes on.
     """
 
@@ -52,6 +53,7 @@ class Asset:
     base_color: Floats
     orm: Floats | None = None
     normal_map: Floats | None = None
+    emissive: Floats | None = None
     unlit: bool = False
     wrap: bool = True
 
@@ -69,7 +71,7 @@ class Asset:
 @dataclass(frozen=True, eq=False)
 class Samples:
     """What n camera samples on the asset see, in the asset's frame: unit `normal` and `view` (towards the eye) (n, 3), linear
-    `base_color` (n, 3), `occlusion`, `roughness`, `metallic` (n,)."""
+    `base_color` (n, 3), `occlusion`, `roughness`, `metallic` (n,), own radiance `emissive` (n, 3) if any part glows."""
 
     normal: Floats
     view: Floats
@@ -77,10 +79,11 @@ class Samples:
     occlusion: Floats
     roughness: Floats
     metallic: Floats
+    emissive: Floats | None = None
 
 
 class Shader(Protocol):
-    """Turns samples into linear radiance (n, 3)."""
+    """Turns samples into the linear radiance (n, 3) they reflect."""
 
     def __call__(self, samples: Samples) -> Floats:
         """Radiance towards the eye (n, 3), linear."""
@@ -144,7 +147,7 @@ class Renderer:
         hits = self._caster.first_hit(fine.centre[None], rays.reshape(-1, 3))
         index = np.flatnonzero(hits.hit)
         surface = self._samples(fine, rays.reshape(-1, 3)[index], hits.face[index], hits.bary[index], hits.distance[index])
-        radiance = shader(surface)
+        radiance = shader(surface) if surface.emissive is None else shader(surface) + surface.emissive
         columns = (
             radiance, np.ones((len(index), 1)), surface.base_color, surface.normal,
             np.stack([surface.occlusion, surface.roughness, surface.metallic], 1),
@@ -190,7 +193,7 @@ class Renderer:
         if orm is None:
             orm = np.broadcast_to(np.array([1, 1, 0], np.float32), (len(face), 3))
         assert base is not None
-        return Samples(normal, view, base, orm[:, 0], orm[:, 1], orm[:, 2])
+        return Samples(normal, view, base, orm[:, 0], orm[:, 1], orm[:, 2], self._read("emissive", level, uv))
 
     def _choose_level(self, camera: Camera, distance: Floats) -> int:
         """Halvings after which a texel is about as large as a sample's footprint on the surface."""

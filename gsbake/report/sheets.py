@@ -73,6 +73,8 @@ def map_panels(asset: Asset) -> tuple[Panel, ...]:
             low, high = float(asset.orm[..., k].min()), float(asset.orm[..., k].max())
             span = f"{low:.2f} everywhere" if high - low < 0.004 else f"{caption}, {low:.2f}–{high:.2f}"
             out.append(panel(title, span, grey(asset.orm[..., k])))
+    if asset.emissive is not None:
+        out.append(panel("Emission", "light of its own", encode_srgb(asset.emissive)))
     charts = int(chart_of_faces(asset.faces, len(asset.uv)).max()) + 1 if len(asset.faces) else 0
     out.append(panel("UV sheet", f"{charts} charts, {len(asset.faces)} triangles", uv_sheet(asset)))
     return tuple(out)

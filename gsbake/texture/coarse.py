@@ -43,6 +43,12 @@ class Coarse:
         size = fine.size
         while size // 2 >= SMALLEST and edge * fine.size / size * 2 <= WIDEST * pixel:
             size //= 2
+        return cls.sized(uv, faces, fine, edge, size)
+
+    @classmethod
+    def sized(cls, uv: NDArray[Any], faces: NDArray[Any], fine: Texels, edge: float, size: int) -> Coarse:
+        """The texture of `size`, or `fine` itself where that is no larger."""
+        size = min(size, fine.size)
         texels = fine if size == fine.size else rasterise(uv, faces, size)
         return cls(fine, texels, edge * fine.size / size)
 

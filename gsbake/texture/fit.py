@@ -16,6 +16,9 @@ fitted to, and the best goes on; from there every texel finds its own.
 Metals are looked for when the light is known well enough, and again when they have sharpened it (`metal`); those found are set, and the
 steps that follow may take it back.
 
+Regions that glow by themselves are looked for once, before the last metals (`emission`); their light is then part of what they show, and
+their paint starts again from black.
+
 Normals bend a little where reflections ask for it: meshes are smoother than the light is sharp.
 
 What the object keeps of the light from itself follows the present light (`visibility`), renewed every few steps without gradient: a shadow
@@ -42,6 +45,7 @@ from gsbake.light.environment import EnvironmentLight
 from gsbake.light.shade import shade
 from gsbake.light.tables import LightTables
 from gsbake.texture.colour import decode
+from gsbake.texture.emission import find_glow
 from gsbake.texture.metal import Evidence, find_metals
 from gsbake.texture.pixels import Pixels
 from gsbake.texture.texels import Texels
@@ -63,10 +67,14 @@ BETAS, STILL = (0.9, 0.99), 2e-3
 BASE_RANGE = (0.01, 0.95)
 #: Shares of the steps after which metals are looked for, and the metallic that those found go on from.
 METALS_AT, METAL = (0.3, 0.55), 0.8
+#: Share of the steps after which glowing regions are looked for: the light must be known.
+GLOW_AT = 0.5
 #: How much of the smoothness price base colour (three channels), roughness and metallic pay: print changes the colour alone.
 ALIKE = (1.0, 1.0, 1.0, 6.0, 4.0)
 #: Shadows and bounced light are renewed every so many steps.
 RENEWED = 25
+#: Columns of what is around a texel after its openness to this light and to an even one: irradiance / π from other texels, own light.
+BOUNCED, GLOW = slice(2, 5), slice(5, 8)
 #: Share of the neighbouring pairs of texels that one step compares.
 COMPARED = 0.25
 
@@ -84,15 +92,17 @@ class Priors:
 @dataclass(frozen=True)
 class Fitted:
     """`values` (n, 5): linear base colour, roughness, metallic of each texel; `bend` (n, 3) to be added to its unit normal; `weight` (n,):
-    what all photos together say about it (in pixels); the `light` in the mesh's frame; PSNR in dB over the pixels of held-out photos (None
-    without any); texels last set to metal."""
+    what all photos together say about it (in pixels); `glow` (n, 3): its own radiance; the `light` in the mesh's frame; PSNR in dB over the
+    pixels of held-out photos (None without any); texels last set to metal, regions that glow."""
 
     values: Floats
     bend: Floats
     weight: Floats
+    glow: Floats
     light: EnvironmentLight
     held_out: float | None
     metals: int
+    glowing: int
 
 
 class MaterialFit:
@@ -122,7 +132,8 @@ class MaterialFit:
         self._bend = torch.zeros(n, 3, requires_grad=True)
         self._even = EVEN * (texels.size / 512) ** 2  # a slope per texel is steeper where texels are larger
         open_share = torch.as_tensor(np.ascontiguousarray(occlusion, np.float32))[:, None]
-        self._around = torch.cat([open_share, open_share, torch.zeros(n, 3)], 1)
+        self._around = torch.cat([open_share, open_share, torch.zeros(n, 6)], 1)
+        self._place = np.column_stack([texels.index % texels.size, texels.index // texels.size]).astype(np.float64)
         self._visibility, self._bounce = visibility, bounce
         self._light = EnvironmentLight(light_size)
         self._priors = priors
@@ -140,16 +151,19 @@ class MaterialFit:
         seed: int,
         each: Callable[[int, int], None] | None = None,
         metals: bool = True,
+        glow: bool = True,
     ) -> Fitted:
         """Fit to `photos` in `steps` steps of one photo each, in an order drawn from `seed`; `held` only tell how good it got.
 
-        Without `metals` none are looked for: in trials, and on things that do not shine.
+        Without `metals` none are looked for: in trials, and on things that do not shine. Without `glow` nothing glows.
         """
         generator = torch.Generator().manual_seed(seed)
         batches = [_Batch.of(p, self._normal) for p in photos if len(p)]
         order: list[int] = []
-        found = 0
+        found = glowing = 0
         for step in range(steps if batches else 0):
+            if glow and step == int(GLOW_AT * steps):
+                glowing = self._set_glow(batches)
             if metals and step in {int(share * steps) for share in METALS_AT}:
                 found = self._set_metals(batches)
             if step % RENEWED == 0:
@@ -165,8 +179,7 @@ class MaterialFit:
         with torch.no_grad():
             values = torch.sigmoid(self._logits).numpy()
         bend = self._bend.detach().numpy()
-        score = self._score([_Batch.of(p, self._normal) for p in held if len(p)])
-        return Fitted(values, bend, weight.numpy(), self._light, score, found)
+        return Fitted(values, bend, weight.numpy(), self._around[:, GLOW].numpy(), self._light, self.psnr(held), found, glowing)
 
     def _step(self, batch: _Batch, decay: float, generator: torch.Generator) -> None:
         values = torch.sigmoid(self._logits)
@@ -205,7 +218,7 @@ class MaterialFit:
             # (1 − m) albedo + F0: whatever the roughness, what is not reflected as paint is reflected as gloss.
             reflectance = values[:, :3] + 0.04 * (1 - values[:, 4:])
             irradiance = self._light.prefilter().diffuse(self._normal) * openness[:, None]
-            self._around[:, 2:] = torch.as_tensor(self._visibility.bounced(irradiance.numpy(), reflectance.numpy()))
+            self._around[:, BOUNCED] = torch.as_tensor(self._visibility.bounced(irradiance.numpy(), reflectance.numpy()))
 
     @torch.no_grad()
     def _set_metals(self, batches: list[_Batch]) -> int:
@@ -213,21 +226,38 @@ class MaterialFit:
         tables = self._light.prefilter()
         own = torch.sigmoid(self._logits[:, 3]).numpy()
         found = find_metals([batch.evidence(self._bend, tables, self._around) for batch in batches], own)
-        texel = torch.as_tensor(found.texel)
-        start = np.column_stack([np.clip(found.base, *BASE_RANGE), found.roughness, np.full(len(texel), METAL)])
-        self._logits[texel] = torch.logit(torch.as_tensor(start, dtype=torch.float32))
-        for moment in self._adam.state[self._logits].values():
-            if moment.shape == self._logits.shape:
-                moment[texel] = 0
-        return len(texel)
+        start = np.column_stack([np.clip(found.base, *BASE_RANGE), found.roughness, np.full(len(found.texel), METAL)])
+        self._restart(found.texel, start)
+        return len(found.texel)
 
     @torch.no_grad()
-    def _score(self, batches: list[_Batch]) -> float | None:
-        """PSNR in dB over all pixels of the batches."""
+    def _set_glow(self, batches: list[_Batch]) -> int:
+        """Give the regions that glow their light and start their paint anew from black; how many regions they are."""
+        tables = self._light.prefilter()
+        values = torch.sigmoid(self._logits).numpy()
+        found = find_glow([b.evidence(self._bend, tables, self._around) for b in batches], values[:, 3], self._pairs.numpy(), self._place)
+        self._around[torch.as_tensor(found.texel), GLOW] = torch.as_tensor(found.radiance, dtype=torch.float32)
+        black = values[found.texel]
+        black[:, :3], black[:, 4] = BASE_RANGE[0], METALLIC
+        self._restart(found.texel, black)
+        return found.regions
+
+    def _restart(self, texel: NDArray[np.int64], values: NDArray[Any]) -> None:
+        """Let texels (m,) go on from `values` (m, 5), without the optimiser's memory of what they were."""
+        at = torch.as_tensor(texel)
+        self._logits[at] = torch.logit(torch.as_tensor(values, dtype=torch.float32))
+        for moment in self._adam.state[self._logits].values():
+            if moment.shape == self._logits.shape:
+                moment[at] = 0
+
+    @torch.no_grad()
+    def psnr(self, photos: list[Pixels], values: Floats | None = None) -> float | None:
+        """PSNR in dB over all pixels of `photos` (None without any) of the texels as they are, or with `values` (n, 5) instead."""
+        batches = [_Batch.of(p, self._normal) for p in photos if len(p)]
         if not batches:
             return None
-        values, tables = torch.sigmoid(self._logits), self._light.prefilter()
-        shaded = (b.shade(values, self._bend, tables, self._around).clamp_min(0) for b in batches)
+        shown, tables = torch.sigmoid(self._logits) if values is None else torch.as_tensor(values), self._light.prefilter()
+        shaded = (b.shade(shown, self._bend, tables, self._around).clamp_min(0) for b in batches)
         squares = torch.cat([((linear_to_srgb(s) - b.colour) ** 2).mean(1) for s, b in zip(shaded, batches, strict=True)])
         return -10 * math.log10(max(float(squares.mean()), 1e-10))
 
@@ -245,7 +275,7 @@ def trial_roughness(
     judges, rest = few[::TRIAL_PHOTO], [p for i, p in enumerate(few) if i % TRIAL_PHOTO]
     found: dict[float, float] = {}
     for turn, roughness in enumerate(TRIALS):
-        score = make(roughness).run(rest, judges, TRIAL_STEPS, seed, metals=False).held_out
+        score = make(roughness).run(rest, judges, TRIAL_STEPS, seed, metals=False, glow=False).held_out
         if score is not None:
             found[roughness] = score
         if each is not None:
@@ -279,7 +309,7 @@ class _Batch:
         return cls(texel, share, towards, colour, weight, _read(normal, texel, share))
 
     def shade(self, values: Tensor, bend: Tensor, tables: LightTables, around: Tensor) -> Tensor:
-        """Linear colours (n, 3) of the pixels when the texels have `values` (texels, 5) and their surroundings are `around` (texels, 5)."""
+        """Linear colours (n, 3) of the pixels when the texels have `values` (texels, 5) and their surroundings are `around` (texels, 8)."""
         g = _read(values, self.texel, self.share)
         near = _read(around, self.texel, self.share)
         return _lit(self._turned(bend), self.towards, g[:, :3], g[:, 3], g[:, 4], tables, near)
@@ -302,9 +332,9 @@ class _Batch:
 
 
 def _lit(normal: Tensor, towards: Tensor, albedo: Tensor, roughness: Tensor, metallic: Tensor, tables: LightTables, near: Tensor) -> Tensor:
-    """`shade` with the surroundings `near` (n, 5): openness to this light and to an even one, irradiance / π from the object itself."""
+    """`shade` with the surroundings `near` (n, 8), see `BOUNCED` and `GLOW`."""
     direct = shade(normal, towards, albedo, roughness, metallic, tables, near[:, 1], near[:, 0])
-    return direct + (1 - metallic)[:, None] * albedo * near[:, 2:]
+    return direct + (1 - metallic)[:, None] * albedo * near[:, BOUNCED] + near[:, GLOW]
 
 
 def _read(values: Tensor, texel: Tensor, share: Tensor) -> Tensor:

@@ -6,9 +6,9 @@ it gains a reflection. Seen through one light, though, either answer is linear i
     paint: shade = b · E(n) + L(d) · (.04 A + B)        metal: shade = b · L(d) A + L(d) B
 
 (METHOD §6), so for each of a few roughnesses the best b and what it leaves unexplained are sums over the texel's pixels. Errors are
-weighed by the slope of the sRGB curve at the photo's own colour: those of the eye, not of the lamp. Metals reflect a third of every
-colour or more (gold's blue, the darkest of the common ones, is .34: Lagarde & de Rousiers, *Moving Frostbite to PBR*, 2014); without
-that bound black paint passes for a dark metal.
+weighed by the slope of the sRGB curve at the photo's own colour: those of the eye, not of the lamp. A metal must reflect clearly more of
+every colour than the .04 of paint, or black gloss passes for a dark metal. Clean metals reflect a third or more (gold's blue is .34:
+Lagarde & de Rousiers, *Moving Frostbite to PBR*, 2014), but rusty, anodised and dirty ones, and many that artists painted, go down to .1.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ Floats = NDArray[np.float64]
 
 #: Roughnesses tried beside a texel's own.
 ROUGHNESS = (0.1, 0.2, 0.35, 0.55)
-#: Least base colour of a metal.
-DARKEST_METAL = 0.3
-#: What the metal leaves unexplained must be below this share of what the paint leaves.
-CLEARLY = 0.9
+#: Least base colour of a metal, and of a clean one (its mean).
+DARKEST_METAL, CLEAN_METAL = 0.1, 0.3
+#: What the metal leaves unexplained must be below this share of what the paint leaves: for dark metals, which are rarer, and clean ones.
+CLEARLY = (0.7, 0.8)
 #: Darkest linear colour that the slope of the sRGB curve is taken at.
 DIM = 0.02
 #: Texels with less weight of pixels than this are left alone.
@@ -45,6 +45,11 @@ class Evidence:
     colour: NDArray[np.float32]
     weight: NDArray[np.float32]
     shade: Shader
+
+
+def by_eye(evidence: Evidence) -> NDArray[np.float32]:
+    """Weights (n, 3) of squared errors of linear colours: the pixels' own times the squared slope of the sRGB curve (a power of 1/2.4)."""
+    return np.asarray(evidence.weight[:, None] * np.maximum(evidence.colour, DIM) ** (-7 / 6), np.float32)
 
 
 @dataclass(frozen=True)
@@ -78,7 +83,7 @@ class _Sums:
 def find_metals(photos: Sequence[Evidence], own: NDArray[np.float32], each: Callable[[], None] | None = None) -> Metals:
     """The texels that are better explained as metal; `own` (texels,) is their present roughness, `each` is called now and then."""
     texels = len(own)
-    weights = [e.weight[:, None] * np.maximum(e.colour, DIM) ** (-7 / 6) for e in photos]  # slope² of the curve's power of 1/2.4
+    weights = [by_eye(e) for e in photos]
     paint = np.full(texels, np.inf)
     metal, base, roughness = np.full(texels, np.inf), np.zeros((texels, 3)), np.zeros(texels)
     for tried in (own, *(np.full(texels, r, np.float32) for r in ROUGHNESS)):
@@ -98,5 +103,6 @@ def find_metals(photos: Sequence[Evidence], own: NDArray[np.float32], each: Call
     seen = np.zeros(texels)
     for evidence in photos:
         seen += np.bincount(evidence.texel, evidence.weight, texels)
-    chosen = np.flatnonzero((metal < CLEARLY * paint) & (seen > LEAST_WEIGHT))
+    share = np.where(base.mean(1) < CLEAN_METAL, *CLEARLY)
+    chosen = np.flatnonzero((metal < share * paint) & (seen > LEAST_WEIGHT))
     return Metals(chosen, base[chosen], roughness[chosen])

@@ -11,16 +11,22 @@ from gsbake.texture.normals import Detail
 
 #: Gains between photos below this factor are taken for view dependence, not exposure: dividing them out would wash reflections away.
 STEADY = 1.25
+#: Tie points, which hardly shine, show changes of exposure from this factor on.
+TIED = 1.15
 #: A normal map is not needed where it would turn the mesh's own normals by less than this angle (degrees) ...
 SMALL_TURN = 2.0
 #: ... at this share of the texels.
 NEARLY_ALL = 0.95
 
 
-def constant_exposure(gains: NDArray[Any]) -> tuple[bool, str]:
-    """Whether the photos' `gains` (photos, channels; 1 = none) show one exposure, and the evidence."""
+def constant_exposure(gains: NDArray[Any], tied: float | None = None) -> tuple[bool, str]:
+    """Whether the photos have one exposure, and the evidence: `gains` (photos, channels; 1 = none) solved on the surface, or, because what
+    shines changes by more than any exposure, the factor `tied` within which most photos agree at tie points (`capture.exposure`)."""
     spread = float(np.exp(np.abs(np.log(gains)).max()))
-    return spread < STEADY, f"photos compared on the surface differ by up to {spread:.2f}x; {STEADY:g}x may be view dependence"
+    evidence = f"photos compared on the surface differ by up to {spread:.2f}x; {STEADY:g}x may be view dependence"
+    if tied is not None:
+        evidence += f"; at tie points nine tenths of them agree within {tied:.2f}x, {TIED:g}x may be chance"
+    return spread < STEADY or (tied is not None and tied < TIED), evidence
 
 
 def normals_agree(detail: Detail, normal: NDArray[Any]) -> tuple[bool, str]:

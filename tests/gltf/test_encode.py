@@ -42,6 +42,18 @@ def test_budget_lowers_the_linear_maps_only() -> None:
 def test_flat_normals_and_ends_survive_every_rung() -> None:
     flat = np.tile([0.5, 0.5, 1.0], (8, 8, 1))
     orm = np.tile([1.0, 0.6, 0.0], (8, 8, 1))
+    orm[::2, :, 1] = 0.4
     images, _ = encode_within(quantise(flat, orm, flat), 0)
     assert (pixels(images.normal or b"") == [128, 128, 255]).all()
     assert (pixels(images.orm)[..., [0, 2]] == [255, 0]).all()
+
+
+def test_roughness_and_metallic_of_one_number_are_no_picture() -> None:
+    orm = np.random.default_rng(0).random((8, 8, 3))
+    orm[..., 1:] = np.float16([0.8, 0.0])  # as the masters hold them
+    sheets = quantise(orm, orm, None)
+    assert sheets.constants == (0.8, 0.0)
+    images, _ = encode_within(sheets, 10**9)
+    assert np.array_equal(pixels(images.orm), quantise(orm[..., [0, 0, 0]], orm[..., [0, 0, 0]], None).orm[..., 0])
+    orm[3, 3, 1] += 0.01
+    assert quantise(orm, orm, None).constants is None

@@ -12,12 +12,15 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+import torch
 import trimesh
+from safetensors.numpy import load_file
 from scipy.spatial import cKDTree
 
 from gsbake.capture.cameras import Camera, CameraSet, Similarity
 from gsbake.gltf.read import GltfAsset, read_glb
 from gsbake.gltf.tangents import frame_to_world
+from gsbake.light.environment import EnvironmentLight
 from gsbake.pipeline.errors import BadInputError
 from gsbake.pipeline.settings import SettingsView
 from gsbake.pipeline.stage import Stage
@@ -177,11 +180,28 @@ def test_normal_map_gives_the_true_normals_in_the_assets_frame(asset: GltfAsset)
     assert angle.mean() < 1.5 and np.quantile(angle, 0.99) < 4
 
 
-def test_occlusion_roughness_metallic_are_packed(run: Path, asset: GltfAsset) -> None:
-    image = asset.image("orm")
-    assert image is not None and np.array_equal(image, asset.image("occlusion"))
-    assert (image[..., 1] == 204).all() and (image[..., 2] == 0).all() and image[..., 0].mean() > 240
+def test_occlusion_is_alone_where_roughness_and_metallic_are_numbers(run: Path, asset: GltfAsset) -> None:
+    _, texels, _ = unit_points(asset)
+    occlusion = asset.image("occlusion")
+    assert occlusion is not None and "orm" not in asset.roles
+    shown = occlusion.reshape(-1, 3)[texels.index]
+    assert shown[:, 0].mean() > 245
     assert read_exr(run / "bake/coverage.exr")[..., 1].mean() > 0.4
+    surface = asset.document["materials"][0]["pbrMetallicRoughness"]
+    assert (surface["roughnessFactor"], surface["metallicFactor"]) == (0.8, 0.0)
+
+
+def test_colours_without_shading_look_the_same_under_their_light(run: Path, tmp_path: Path) -> None:
+    out = desk(bake.STAGE, run, tmp_path / "bake", bake=Bake(size=SIZE, occlusion_rays=8, materials="delit"))
+    bake.run(out)
+    mesh = load_file(out.out / "mesh.safetensors")
+    texels = rasterise(mesh["uv"], mesh["faces"], SIZE)
+    facing, points = (texels.interpolate(mesh[name], mesh["faces"]) for name in ("normal", "position"))
+    base, openness = (read_exr(out.out / name).reshape(SIZE * SIZE, 3)[texels.index] for name in ("base_color.exr", "orm.exr"))
+    light = EnvironmentLight.load(out.out / "light.safetensors").prefilter().diffuse(torch.as_tensor(facing)).detach().numpy()
+    seen = base * light * openness[:, :1]
+    assert np.abs(seen - colour(points)).mean() < 0.01
+    assert np.abs(base - colour(points)).mean() > 0.01
 
 
 def test_cameras_look_at_the_asset(run: Path, asset: GltfAsset) -> None:
@@ -255,8 +275,6 @@ class Painted:
 
 
 def test_materials_and_light_of_a_relightable_asset(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from gsbake.light.environment import EnvironmentLight
-
     monkeypatch.setattr("gsbake.splat.render.SurfelRenderer", Painted)
     folder = tmp_path / "run"
     folder.mkdir()

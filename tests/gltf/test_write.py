@@ -14,11 +14,13 @@ import pytest
 import trimesh
 from PIL import Image
 
+from gsbake.gltf.audit import audit, failed
 from gsbake.gltf.container import pack_glb, unpack_glb
 from gsbake.gltf.png import encode_png
 from gsbake.gltf.read import parse_glb
 from gsbake.gltf.write import GltfImages, GltfMesh, build_glb
 from gsbake.pipeline.errors import BadInputError
+from gsbake.report.asset import from_gltf
 
 
 def test_trimesh_reads_the_same_mesh(glb: bytes, mesh: GltfMesh) -> None:
@@ -40,6 +42,19 @@ def test_own_reader_gives_back_what_was_written(glb: bytes, mesh: GltfMesh, imag
     assert asset.images == (images.base_color, images.orm, images.normal)
     assert asset.roles == {"base_color": 0, "orm": 1, "occlusion": 1, "normal": 2}
     assert asset.document["asset"] == {"version": "2.0", "generator": "gsbake test", "copyright": "me", "extras": {"scale": "unknown"}}
+
+
+@pytest.mark.parametrize("flat", [True, False])
+def test_light_of_its_own_is_an_emissive_texture(mesh: GltfMesh, images: GltfImages, flat: bool) -> None:
+    glow = np.zeros((128, 128, 3), np.uint8)
+    glow[:64] = (0, 180, 240)
+    data = build_glb(mesh, GltfImages(images.base_color, images.orm, None if flat else images.normal, encode_png(glow)), "lamp", "test")
+    asset = parse_glb(data, "lamp")
+    lit = asset.image("emissive")
+    assert lit is not None and np.array_equal(lit, glow)
+    (read,) = trimesh.load(io.BytesIO(data), file_type="glb", process=False).geometry.values()
+    assert read.visual.material.emissiveTexture.getpixel((0, 0)) == (0, 180, 240)
+    assert list(read.visual.material.emissiveFactor) == [1, 1, 1]
 
 
 def test_small_meshes_use_short_indices_and_large_ones_do_not(images: GltfImages) -> None:
@@ -76,6 +91,17 @@ def test_damaged_files_are_named() -> None:
             unpack_glb(bad, "x.glb")
     with pytest.raises(BadInputError, match="no readable triangle mesh"):
         parse_glb(good, "x.glb")
+
+
+def test_numbers_stand_for_maps_that_are_not_there(mesh: GltfMesh, images: GltfImages) -> None:
+    occlusion = np.random.default_rng(2).integers(99, 256, (128, 128), np.uint8)
+    plain = GltfImages(images.base_color, encode_png(occlusion), images.normal)
+    data = build_glb(mesh, plain, "ball", "g", extras={"scale": "unknown"}, constants=(0.8, 0.25))
+    asset = parse_glb(data, "ball")
+    assert asset.roles == {"base_color": 0, "occlusion": 1, "normal": 2}
+    assert not failed(audit(data, "ball", 5.0, 10_000))
+    drawn = from_gltf(asset, False, "ball").orm
+    assert drawn is not None and np.allclose(drawn[..., 0], occlusion / 255) and np.allclose(drawn[..., 1:], [0.8, 0.25])
 
 
 def test_an_empty_mesh_is_refused(mesh: GltfMesh, images: GltfImages) -> None:

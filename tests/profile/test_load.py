@@ -21,7 +21,8 @@ def test_shipped_profiles() -> None:
     assert set(shipped()) == {"smoke", "preview", "relight", "quality", "scan"}
     loaded = {name: load_profile(name).profile for name in shipped()}
     assert all(p.description for p in loaded.values())
-    assert {name for name, p in loaded.items() if p.bake.materials != "none"} == {"relight", "quality"}
+    assert {name for name, p in loaded.items() if p.bake.materials == "fit"} == {"relight", "quality"}
+    assert {name for name, p in loaded.items() if p.bake.materials == "delit"} == {"scan"}
     cost = [loaded[name].train.iterations for name in ("smoke", "preview", "relight", "quality")]
     assert cost == sorted(cost) and cost[0] < cost[1]
     assert load_profile().name == DEFAULT == "relight"

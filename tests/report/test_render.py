@@ -116,6 +116,13 @@ def test_light_frame_and_occlusion() -> None:
     np.testing.assert_allclose(got, 0.3 * (0.5 + 2 / 3 * 0.3), rtol=0.02)
 
 
+def test_light_of_its_own_is_added_to_what_it_reflects() -> None:
+    glow = np.full((4, 4, 3), (0.0, 0.1, 0.3), np.float32)
+    for strength, light in ((0.0, 0.0), (1.0, 0.25)):
+        shown = Renderer(quad(np.full((4, 4, 3), light), emissive=strength * glow)).draw(front_camera(4, 40, 60), unlit, samples=1)
+        np.testing.assert_allclose(decode_srgb(shown.rgb[20, 20]), light + strength * glow[0, 0], atol=1e-4)
+
+
 def test_viewer_light_shows_the_asset_frame() -> None:
     turn = np.array([[0, 0, 1.0], [1, 0, 0], [0, 1, 0]])
     image = LitShader(linear_light(0.5, (0.3, 0, 0)), turn).equirectangular(32)

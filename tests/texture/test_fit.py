@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -97,6 +99,22 @@ def test_paint_and_roughness_come_back(glossy: Scene) -> None:
     assert np.abs(fitted.values[known, 3] - 0.25).mean() < 0.12
     assert fitted.values[known, 4].mean() < 0.1
     assert fitted.held_out is not None and fitted.held_out > 22
+
+
+def test_a_lamp_on_the_ball_is_told_from_paint(glossy: Scene) -> None:
+    lamp = glossy.normal @ np.array([0.5, -0.8, 0.33]) > 0.88
+    light = np.array([0.0, 0.5, 0.9], np.float32)
+    photos = []
+    for p in glossy.photos:
+        share = (p.share * lamp[p.texel]).sum(1, keepdims=True)
+        photos.append(replace(p, colour=encode(np.clip((1 - share) * decode(p.colour) + share * light, 0, 1))))
+    fitted = glossy.fit(0.2).run(photos, [], 300, 0)
+    known = fitted.weight > 0.3
+    found = fitted.glow.max(1) > 0.1
+    assert fitted.glowing == 1
+    assert found[known & lamp].mean() > 0.8 and found[known & ~lamp].mean() < 0.03
+    np.testing.assert_allclose(np.median(fitted.glow[found & lamp], 0), light, atol=0.1)  # less the gloss of black paint, which it lacks
+    assert np.median(fitted.values[found & known, :3]) < 0.05
 
 
 def test_wrong_normals_bend_towards_what_reflections_show(glossy: Scene) -> None:

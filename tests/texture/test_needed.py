@@ -10,7 +10,7 @@ import trimesh
 
 from gsbake.surface.raycast import RayCaster
 from gsbake.texture.fit import TRIAL_PIXELS, TRIAL_STEPS, TRIALS, trial_cost
-from gsbake.texture.needed import STEADY, constant_exposure, normals_agree
+from gsbake.texture.needed import STEADY, TIED, constant_exposure, normals_agree
 from gsbake.texture.normals import find_detail, vertex_normals
 
 
@@ -20,6 +20,14 @@ def test_exposure_is_constant_up_to_what_view_dependence_shows(gain: float, stea
     gains[2, 1] = gain
     holds, evidence = constant_exposure(gains)
     assert holds is steady and f"{max(gain, 1 / gain):.2f}x" in evidence
+
+
+@pytest.mark.parametrize(("tied", "steady"), [(TIED - 0.02, True), (TIED + 0.02, False), (None, False)])
+def test_tie_points_have_the_last_word_on_shining_things(tied: float | None, steady: bool) -> None:
+    gains = np.ones((5, 3))
+    gains[3] = 1.6
+    assert constant_exposure(gains, tied)[0] is steady
+    assert constant_exposure(np.ones((5, 3)), tied)[0]
 
 
 def agreement(light: int, ripple: float) -> tuple[bool, str]:

@@ -1,0 +1,90 @@
+"""Baked textures against those of the true asset, texel by texel: cheap enough for every row of a table, and no renderer in between.
+
+Every texel that a photo saw is compared with the nearest point of the true surface: base colour in dB over sRGB values after one gain per
+channel (nobody knows how bright the light was), roughness and metallic as root mean squares. The independent scorer compares renders of
+the same textures; it weighs what its views show, this every texel alike.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize_scalar
+
+from benchmarks.truth import align, nearest, nearest_on_faces, read_centres, read_mesh, read_truth
+from gsbake.capture.cameras import CameraSet
+from gsbake.texture.colour import decode, encode
+from gsbake.texture.masters import read_exr
+from gsbake.texture.texels import rasterise
+
+Floats = NDArray[np.float64]
+
+#: Texels compared.
+COMPARED = 100_000
+#: Logarithms of the gains that are tried.
+GAINS = (-1.5, 1.5)
+
+
+@dataclass(frozen=True)
+class MapErrors:
+    """Base colour in dB (higher is better), roughness and metallic as root mean squares (0..1)."""
+
+    texel_albedo_psnr: float
+    texel_roughness_rmse: float
+    texel_metallic_rmse: float
+
+
+def measure_maps(bake: Path, mesh: Path, poses: Path, capture: Path) -> MapErrors:
+    """The errors of a bake stage's textures, with the stage folders of its mesh and poses and the `capture` whose `gt/` holds the truth."""
+    from safetensors.numpy import load_file
+
+    cut = load_file(bake / "mesh.safetensors")
+    base, orm, coverage = (read_exr(bake / f"{name}.exr") for name in ("base_color", "orm", "coverage"))
+    texels = rasterise(cut["uv"], cut["faces"], len(base))
+    seen = np.flatnonzero(coverage.reshape(-1, 3)[texels.index, 1] > 0.5)
+    chosen = seen[:: max(1, len(seen) // COMPARED)]
+    mine = np.concatenate([base, orm[..., 1:]], 2).reshape(-1, 5)[texels.index[chosen]].astype(np.float64)
+    truth, cameras = read_truth(capture), CameraSet.load(poses / "cameras.json")
+    points = cameras.to_world.apply(texels.interpolate(cut["position"], cut["faces"])[chosen].astype(np.float64))
+    if cameras.poses != "given":
+        points = align(read_mesh(mesh / "mesh.ply").moved(cameras.to_world), read_centres(poses / "cameras.json"), truth).apply(points)
+    face = nearest(points, truth.surface, 3)[1]
+    corners = truth.surface.corners[face]
+    theirs = _true_values(capture / "gt" / "asset.glb", face, nearest_on_faces(points, corners), corners)
+    decibels = -10 * np.log10(np.mean([_least_error(mine[:, k], theirs[:, k]) for k in range(3)]))
+    roughness, metallic = np.sqrt(((mine[:, 3:] - theirs[:, 3:]) ** 2).mean(0))
+    return MapErrors(float(decibels), float(roughness), float(metallic))
+
+
+def _true_values(asset: Path, face: NDArray[np.int64], points: Floats, corners: Floats) -> Floats:
+    """Linear base colour, roughness and metallic (n, 5) of the true asset at `points` (n, 3) on its faces (n,) with `corners` (n, 3, 3)."""
+    import trimesh
+
+    mesh: Any = trimesh.load(asset, force="mesh", process=False)
+    share = np.clip(np.nan_to_num(trimesh.triangles.points_to_barycentric(corners, points, method="cramer"), nan=1 / 3), 0, 1)
+    share /= share.sum(1, keepdims=True)
+    uv = np.einsum("nk,nkd->nd", share, np.asarray(mesh.visual.uv)[np.asarray(mesh.faces)[face]])
+    material = mesh.visual.material
+
+    def read(image: Any) -> Floats:
+        if image is None:
+            return np.ones((len(uv), 3))
+        pixels = np.asarray(image.convert("RGB"))
+        height, width = pixels.shape[:2]
+        # trimesh turns v round: its origin is at the bottom.
+        row, column = ((1 - uv[:, 1]) % 1 * height).astype(np.int64), (uv[:, 0] % 1 * width).astype(np.int64)
+        return pixels[np.minimum(row, height - 1), np.minimum(column, width - 1)] / 255.0
+
+    packed = read(material.metallicRoughnessTexture)
+    factors = [1.0 if f is None else f for f in (material.roughnessFactor, material.metallicFactor)]
+    return np.column_stack([decode(read(material.baseColorTexture)), packed[:, 1:] * factors])
+
+
+def _least_error(mine: Floats, theirs: Floats) -> float:
+    """Mean square of the differences of sRGB values (0..1) of two linear channels (n,), at the gain that makes it least."""
+    shown = encode(theirs)
+    return float(minimize_scalar(lambda gain: ((encode(mine * np.exp(gain)) - shown) ** 2).mean(), bounds=GAINS, method="bounded").fun)

@@ -1,0 +1,205 @@
+"""What each part of the materials brings: from the surfels' own, projected, to the fit in texture space with everything it knows.
+
+python -m benchmarks.materials [CAPTURE ...] [--profile relight] [--reuse RUN ...] [--rows projected,fit] [--set section.key=value ...]
+    [--scorer DIR] [--views 0] [--out DIR] [--csv FILE]
+
+CAPTURE is a folder with its truth in `gt/`; without any, boombox and avocado where they are ($GSBAKE_CAPTURES, else ../shared/captures).
+The rows are cumulative: each keeps the settings of the one before and adds its own (`STEPS`). Rows of the texture fit share one run up to
+the mesh; the first trains surfels that carry materials themselves, so its mesh is its own. `--reuse` takes everything up to the mesh from
+a finished run of the same photos and profile, one per capture; RUN itself is only read. `--set` holds for all rows.
+
+`psnr` compares the asset, drawn under the light found with it, with the held-out photos, as the report does; `texel_…` compare its
+textures with the true ones (`benchmarks.maps`). The rest comes from the independent scorer, where it is installed (`make score` once, or
+`--scorer`): looks under lights that lit no photo, base colour, roughness and metallic against the truth. `--views` scores on that many of
+the truth's views, evenly chosen, instead of all. CPU seconds are those of the processes of the stages that made materials: of the surfels
+(train, refine) where they carry them, and the bake.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import json
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any
+
+from benchmarks.maps import measure_maps
+from benchmarks.skip import CpuClock, reuse
+from benchmarks.timeline import CAPTURES, ROOT, manifests, names
+from gsbake.cli.options import Options
+from gsbake.cli.session import open_session
+from gsbake.pipeline.errors import GsbakeError, UsageError
+
+RESULTS = ROOT / "benchmarks" / "results" / "materials.csv"
+#: The scorer's folder and interpreter, where `make score` has them.
+SCORER, PYTHON = ROOT.parent / "shared" / "score", ROOT / ".score" / "bin" / "python"
+#: What the stages up to the mesh are called.
+TO_MESH = ("ingest", "poses", "stereo", "train", "refine", "mesh")
+#: Rows and what each sets beside the profile.
+NO_PRIORS = tuple(f"bake.{prior}_prior=0" for prior in ("smooth", "dark", "metal", "white"))
+STEPS: dict[str, tuple[str, ...]] = {
+    "projected": ("splat.shading=pbr", "bake.materials=surfels"),
+    "fit": ("bake.materials=fit", "bake.visibility=none", *NO_PRIORS),
+    "visibility": ("bake.materials=fit", "bake.visibility=directional", *NO_PRIORS),
+    "bounce": ("bake.materials=fit", "bake.visibility=bounce", *NO_PRIORS),
+    "priors": ("bake.materials=fit", "bake.visibility=bounce"),
+}
+
+
+@dataclass(frozen=True)
+class Row:
+    """One asset: which row of which capture, what was set for all rows, its cost and its errors; None where there is no such figure."""
+
+    capture: str
+    profile: str
+    row: str
+    settings: str
+    cpu_s: float
+    psnr: float | None = None
+    texel_albedo_psnr: float | None = None
+    texel_roughness_rmse: float | None = None
+    texel_metallic_rmse: float | None = None
+    relight_psnr: float | None = None
+    relight_psnr_scaled: float | None = None
+    albedo_psnr_scaled: float | None = None
+    roughness_rmse: float | None = None
+    metallic_rmse: float | None = None
+
+    @property
+    def key(self) -> tuple[str, ...]:
+        """Rows of one key replace each other in the CSV."""
+        return self.capture, self.profile, self.row, self.settings
+
+
+def thinned(truth: Path, views: int, folder: Path) -> Path:
+    """A copy of `truth` in `folder` with `views` of its views, evenly chosen; `truth` itself for 0."""
+    if views == 0:
+        return truth
+    every: dict[str, Any] = json.loads((truth / "views.json").read_text())
+    count = len(every["c2w"])
+    chosen = [k * count // views for k in range(min(views, count))]
+    shutil.copytree(truth, folder, ignore=shutil.ignore_patterns("ref", "views.json"))
+    (folder / "views.json").write_text(json.dumps(every | {"c2w": [every["c2w"][k] for k in chosen]}))
+    for light in (truth / "ref").iterdir():
+        (folder / "ref" / light.name).mkdir(parents=True)
+        for new, old in enumerate(chosen):
+            shutil.copyfile(light / f"{old:03d}.png", folder / "ref" / light.name / f"{new:03d}.png")
+    return folder
+
+
+def score(asset: Path, solved: bool, truth: Path, scorer: Path, python: Path) -> dict[str, float]:
+    """The scorer's figures of an asset, laid on the truth by its cameras where they were `solved`; none where there is no scorer.
+
+    Raises UsageError when the scorer fails.
+    """
+    if not (scorer / "score.py").is_file() or not python.is_file():
+        sys.stderr.write(f"not scored: {scorer}/score.py or {python} is not here; `make score` installs it\n")
+        return {}
+    with tempfile.TemporaryDirectory() as folder:
+        out = Path(folder) / "score.json"
+        cameras = ["--cameras", str(asset.with_name("cameras.json"))] if solved else []
+        done = subprocess.run(
+            [python, scorer / "score.py", truth, asset, *cameras, "--json", out], capture_output=True, text=True, check=False
+        )  # fmt: skip
+        if done.returncode:
+            raise UsageError(f"{scorer}/score.py failed on {asset}: {done.stderr.strip().splitlines()[-1:]}")
+        figures: dict[str, Any] = json.loads(out.read_text())
+    wanted = {f.name for f in fields(Row)}
+    return {k: float(v) for k, v in figures.items() if k in wanted}
+
+
+def measure(folder: Path, profile: str, row: str, overrides: Sequence[str], out: Path, threads: int) -> tuple[Row, Path, bool]:
+    """Make the asset of one row, or take what is cached: its row without the scorer's figures, its GLB, and whether poses were solved."""
+    clock = CpuClock(out / "cpu.json")
+    options = Options(photos=folder, out=out, profile=profile, overrides=[*STEPS[row], *overrides], device="cpu", threads=threads)
+    states = open_session(options, clock).engine.run("report")
+    done = manifests(states)
+    folders = {s.name: s.artifact.folder for s in states if s.artifact is not None}
+    own = ("train", "refine", "bake") if row == "projected" else ("bake",)
+    spent = clock.total([s for s in states if s.name in own])
+    solved = json.loads((folders["poses"] / "cameras.json").read_text())["poses"] != "given"
+    maps = measure_maps(folders["bake"], folders["mesh"], folders["poses"], folder)
+    made = Row(folder.name, profile, row, " ".join(overrides), spent, done["report"]["results"]["psnr"], **asdict(maps))
+    return made, folders["export"] / "asset.glb", solved
+
+
+def write(path: Path, rows: Sequence[Row]) -> None:
+    """Write the rows; those that the file holds of others stay before them."""
+    again = {row.key for row in rows}
+    old: list[dict[str, str]] = []
+    if path.is_file():
+        with path.open(newline="", encoding="utf-8") as file:
+            old = [line for line in csv.DictReader(file) if (line["capture"], line["profile"], line["row"], line["settings"]) not in again]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, [f.name for f in fields(Row)], lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(old)
+        writer.writerows({k: round(v, 3) if isinstance(v, float) else v for k, v in asdict(row).items()} for row in rows)
+
+
+def markdown(rows: Sequence[Row]) -> str:
+    """The rows as the table of docs/materials.md."""
+
+    def text(value: float | None, form: str) -> str:
+        return "–" if value is None else format(value, form)
+
+    head = "| | | held out dB | texels: base colour dB | roughness rmse | metallic rmse | relit dB | scaled | base colour dB | CPU s |"
+    lines = [head, "|---" * 10 + "|"]
+    for r in rows:
+        parts = " | ".join(text(v, ".3f") for v in (r.texel_roughness_rmse, r.texel_metallic_rmse))
+        scored = " | ".join(text(v, ".1f") for v in (r.relight_psnr, r.relight_psnr_scaled, r.albedo_psnr_scaled))
+        shown = f"{text(r.psnr, '.1f')} | {text(r.texel_albedo_psnr, '.1f')} | {parts} | {scored}"
+        lines.append(f"| {r.capture} | {r.row} | {shown} | {r.cpu_s:.0f} |")
+    return "\n".join(lines) + "\n"
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Make, score and write one row after the other; then print them all as a table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("captures", type=Path, nargs="*")
+    parser.add_argument("--profile", default="relight")
+    parser.add_argument("--reuse", type=Path, action="append", default=[], help="a finished run, one per capture and in their order")
+    parser.add_argument("--rows", type=names, default=list(STEPS))
+    parser.add_argument("--set", dest="overrides", action="append", default=[], metavar="KEY=VALUE", help="for all rows")
+    parser.add_argument("--scorer", type=Path, default=SCORER, help="folder of score.py")
+    parser.add_argument("--scorer-python", type=Path, default=PYTHON, help="interpreter that has Blender's module")
+    parser.add_argument("--views", type=int, default=0, help="views of the truth to score on; 0: all")
+    parser.add_argument("--threads", type=int, default=0, help="0: the physical cores")
+    parser.add_argument("--out", type=Path, default=ROOT / "out" / "bench" / "materials", help="where the runs are kept")
+    parser.add_argument("--csv", type=Path, default=RESULTS)
+    args = parser.parse_args(arguments)
+    captures = args.captures or [CAPTURES / name for name in ("boombox", "avocado")]
+    if unknown := set(args.rows) - set(STEPS):
+        parser.error(f"there is no row {', '.join(sorted(unknown))}; there are {', '.join(STEPS)}")
+    if args.reuse and len(args.reuse) != len(captures):
+        parser.error(f"{len(args.reuse)} finished runs for {len(captures)} captures; give one for each")
+    rows: list[Row] = []
+    try:
+        for k, capture in enumerate(folder.resolve() for folder in captures):
+            if not (capture / "gt" / "views.json").is_file():
+                raise UsageError(f"{capture} has no truth to measure against (gt/views.json).")
+            out = args.out / capture.name
+            if args.reuse:
+                reuse(args.reuse[k], out, TO_MESH)
+            with tempfile.TemporaryDirectory() as folder:
+                truth = thinned(capture / "gt", args.views, Path(folder) / "gt")
+                for name in args.rows:
+                    row, asset, solved = measure(capture, args.profile, name, args.overrides, out, args.threads)
+                    rows.append(Row(**asdict(row) | score(asset, solved, truth, args.scorer, args.scorer_python)))
+                    write(args.csv, rows)
+                    sys.stdout.write(markdown(rows[-1:]).splitlines()[-1] + "\n")
+                    sys.stdout.flush()
+    except GsbakeError as error:
+        parser.error(str(error))
+    sys.stdout.write("\n" + markdown(rows))
+
+
+if __name__ == "__main__":
+    main()
