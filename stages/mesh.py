@@ -351,7 +351,7 @@ def _agree(
 
 STAGE = Stage(
     name="mesh",
-    version=4,
+    version=5,
     title="Mesh",
     run=run,
     needs=("poses", "stereo", "refine"),

@@ -2,6 +2,10 @@
 
 A rendered depth is right everywhere to about a cell, a matched one to a fraction of a pixel where there is texture. Where they differ
 by more than a few cells one of them is wrong, and the one that was trained against every photo stays.
+
+Rendered depths also share an error that measured ones do not have (on avocado they lie .45 pixels behind them all over), so a photo's
+rendered depths are scaled by what both say where they meet.
+On avocado that takes chamfer from .0418 to .0388 % and normals from 4.09 to 3.95°, on boombox from .0907 to .0901 % and 6.55 to 6.50°.
 """
 
 from __future__ import annotations
@@ -18,6 +22,8 @@ Floats = NDArray[np.float32]
 
 #: Confidence below which a measured depth is not used.
 LEAST_CONFIDENCE = 0.2
+#: Pixels with both depths from which on they say how far all rendered ones of the photo are off.
+ENOUGH = 500
 #: A measured pixel weighs up to this many times a rendered one.
 GAIN = 4.0
 
@@ -43,7 +49,8 @@ def resampled(depth: Floats, confidence: Floats, width: int, height: int, step: 
 
 
 def with_measured(view: DepthView, depth: Floats, confidence: Floats, tolerance: float) -> tuple[DepthView, float]:
-    """`view` with measured z-depths (h, w, any size of the same photo; 0 = none) where they agree with it to `tolerance` (world units).
+    """`view` with measured z-depths (h, w, any size of the same photo; 0 = none) where they agree with it to `tolerance` (world units), and
+    its own, scaled to agree with them in the median, elsewhere.
 
     Also the share of the view's pixels with a depth that took one.
     """
@@ -53,9 +60,10 @@ def with_measured(view: DepthView, depth: Floats, confidence: Floats, tolerance:
     z, rendered = 1 / np.where(both, inverse, 1), 1 / np.where(both, view.inverse, 1)
     take = both & (np.abs(z - rendered) < tolerance)
     known = int((view.inverse > 0).sum())
+    ratio = np.median(rendered[take] / z[take]) if take.sum() >= ENOUGH else 1.0
     out = replace(
         view,
-        inverse=np.where(take, inverse, view.inverse).astype(np.float32),
+        inverse=np.where(take, inverse, view.inverse * ratio).astype(np.float32),
         weight=np.where(take, view.weight * (1 + (GAIN - 1) * sure), view.weight).astype(np.float32),
     )
     return out, float(take.sum()) / max(known, 1)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gsbake.surface.measured import GAIN, resampled, with_measured
+from gsbake.surface.measured import ENOUGH, GAIN, resampled, with_measured
 from gsbake.surface.views import DepthView
 from tests.stereo.scenes import arc, plane_depth, sphere_depth
 
@@ -42,9 +42,26 @@ def test_only_what_agrees_is_taken() -> None:
     left[:, half - 2 :] = False
     right[:, : half + 2] = False
     np.testing.assert_allclose(1 / out.inverse[left], truth[left], rtol=1e-5)
-    np.testing.assert_array_equal(out.inverse[right], view.inverse[right])
+    np.testing.assert_allclose(out.inverse[right], view.inverse[right], rtol=5e-3)  # all of them scaled by one ratio
     np.testing.assert_allclose(out.weight[left], GAIN * view.weight[left], rtol=1e-6)
     np.testing.assert_array_equal(out.weight[right], view.weight[right])
     assert share == pytest.approx(left.sum() / known.sum(), abs=0.03)
+    assert np.ptp(out.inverse[right] / view.inverse[right]) < 1e-6
     unsure, share = with_measured(view, measured, 0.1 * sure, 0.03)
     assert share == 0 and unsure.inverse is not None and (unsure.inverse == view.inverse).all()
+
+
+@pytest.mark.parametrize("enough", [True, False])
+def test_what_all_rendered_depths_are_off_by_is_taken_out(enough: bool) -> None:
+    camera = arc(1)[0]
+    truth = sphere_depth(camera).astype(np.float32)
+    known = truth > 0
+    view = DepthView.of(camera, 1.004 * truth)
+    met = known.copy()
+    met[:, truth.shape[1] // 2 :] = False
+    if not enough:
+        met &= np.cumsum(met).reshape(met.shape) < ENOUGH / 2
+    out, _ = with_measured(view, np.where(met, truth, 0).astype(np.float32), met.astype(np.float32), 0.03)
+    rest = known & ~met
+    rest[:, : truth.shape[1] // 2 + 2] = False
+    np.testing.assert_allclose(1 / out.inverse[rest], truth[rest] * (1 if enough else 1.004), rtol=1e-4)
