@@ -18,7 +18,6 @@ the truth's views, evenly chosen, instead of all. CPU seconds are those of the p
 from __future__ import annotations
 
 import argparse
-import csv
 import json
 import shutil
 import subprocess
@@ -30,7 +29,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.maps import measure_maps
-from benchmarks.skip import CpuClock, reuse
+from benchmarks.skip import CpuClock, reuse, write
 from benchmarks.timeline import CAPTURES, ROOT, manifests, names
 from gsbake.cli.options import Options
 from gsbake.cli.session import open_session
@@ -70,11 +69,6 @@ class Row:
     albedo_psnr_scaled: float | None = None
     roughness_rmse: float | None = None
     metallic_rmse: float | None = None
-
-    @property
-    def key(self) -> tuple[str, ...]:
-        """Rows of one key replace each other in the CSV."""
-        return self.capture, self.profile, self.row, self.settings
 
 
 def thinned(truth: Path, views: int, folder: Path) -> Path:
@@ -129,21 +123,6 @@ def measure(folder: Path, profile: str, row: str, overrides: Sequence[str], out:
     return made, folders["export"] / "asset.glb", solved
 
 
-def write(path: Path, rows: Sequence[Row]) -> None:
-    """Write the rows; those that the file holds of others stay before them."""
-    again = {row.key for row in rows}
-    old: list[dict[str, str]] = []
-    if path.is_file():
-        with path.open(newline="", encoding="utf-8") as file:
-            old = [line for line in csv.DictReader(file) if (line["capture"], line["profile"], line["row"], line["settings"]) not in again]
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, [f.name for f in fields(Row)], lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(old)
-        writer.writerows({k: round(v, 3) if isinstance(v, float) else v for k, v in asdict(row).items()} for row in rows)
-
-
 def markdown(rows: Sequence[Row]) -> str:
     """The rows as the table of docs/materials.md."""
 
@@ -193,7 +172,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
                 for name in args.rows:
                     row, asset, solved = measure(capture, args.profile, name, args.overrides, out, args.threads)
                     rows.append(Row(**asdict(row) | score(asset, solved, truth, args.scorer, args.scorer_python)))
-                    write(args.csv, rows)
+                    write(args.csv, rows, 3)
                     sys.stdout.write(markdown(rows[-1:]).splitlines()[-1] + "\n")
                     sys.stdout.flush()
     except GsbakeError as error:

@@ -22,8 +22,9 @@ import resource
 import shutil
 import sys
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 from benchmarks.timeline import BUILT_IN, ROOT, find_capture, manifests, names
 from benchmarks.truth import measure_stage, read_truth
@@ -157,19 +158,20 @@ def show(row: Row) -> None:
     sys.stdout.flush()
 
 
-def write(path: Path, rows: Sequence[Row]) -> None:
-    """Write the rows; those of other runs that the file holds stay before them."""
-    again = {(row.capture, row.profile, row.rule, row.mode) for row in rows}
+def write(path: Path, rows: Sequence[Any], digits: int = 4) -> None:
+    """Write dataclass rows of one kind, whose first four columns say which run each is; others that the file holds stay before them."""
+    table = [{k: round(v, digits) if isinstance(v, float) else v for k, v in asdict(row).items()} for row in rows]
+    columns = list(table[0])
+    again = {tuple(line[column] for column in columns[:4]) for line in table}
     old: list[dict[str, str]] = []
     if path.is_file():
         with path.open(newline="", encoding="utf-8") as file:
-            old = [line for line in csv.DictReader(file) if (line["capture"], line["profile"], line["rule"], line["mode"]) not in again]
+            old = [line for line in csv.DictReader(file) if tuple(line[column] for column in columns[:4]) not in again]
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, [f.name for f in fields(Row)], lineterminator="\n")
+        writer = csv.DictWriter(file, columns, lineterminator="\n")
         writer.writeheader()
-        writer.writerows(old)
-        writer.writerows({k: round(v, 4) if isinstance(v, float) else v for k, v in asdict(row).items()} for row in rows)
+        writer.writerows([*old, *table])
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -203,21 +203,20 @@ def _project_photos(ctx: Context, surface: Surface) -> Blended:
     posed = PosedPhotos.open(ctx.inputs["poses"], ctx.inputs["refine"])
     aside = set(held_out(len(posed), ctx.settings.train.holdout))
     blender = ProjectionBlender(surface.at, surface.facing, surface.caster, 3, surface.texel)
-    tied = TiePoints.of(ctx.inputs["poses"] / "sparse", posed.cameras.to_world.inverse())
+    asked = ctx.settings.skip.exposure != "always"
+    tied = TiePoints.of(ctx.inputs["poses"] / "sparse", posed.cameras.to_world.inverse()) if asked else None
     for index in range(len(posed)):
         ctx.check_stop()
         view = posed.view(index)
+        linear = decode_bytes(view.rgb)
         if tied is not None:
-            tied.add(view.camera, view.rgb)
+            tied.add(view.camera, linear)
         margin = MASK_MARGIN * max(view.camera.width, view.camera.height)
         weights = None if view.mask is None else mask_weights(view.mask, margin)
-        blender.add(view.camera, decode_bytes(view.rgb), weights, HELD_OUT_WEIGHT if index in aside else 1.0)
+        blender.add(view.camera, linear, weights, HELD_OUT_WEIGHT if index in aside else 1.0)
         ctx.progress(index + 1, len(posed), "photos onto the texture")
-    if ctx.settings.skip.exposure == "always":
-        steady, evidence, blended = True, "not measured", blender.result()
-    else:
-        blended = blender.result(solve_exposure=True)
-        steady, evidence = constant_exposure(blended.gains, None if tied is None else tied.spread())
+    blended = blender.result(solve_exposure=asked)
+    steady, evidence = constant_exposure(blended.gains, None if tied is None else tied.spread()) if asked else (True, "not measured")
     if leave_out(ctx, "exposure", steady, evidence, "exposure taken as constant", "exposure equalised") and (blended.gains != 1).any():
         blended = blender.result()
     return blended

@@ -9,14 +9,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from gsbake.capture.cameras import Camera, Similarity
 from gsbake.capture.model import read_tracks
-from gsbake.capture.photo import srgb_decode
-from gsbake.capture.steadiness import exposures
+from gsbake.capture.steadiness import exposures, luminance_at
 
 #: Blur (pixels) before photos are compared: keypoints sit on corners.
 BLUR = 2.0
@@ -26,7 +24,6 @@ RANGE = (0.01, 0.9)
 LEAST_PHOTOS, LEAST_POINTS, LEAST_IN_ALL = 3, 30, 200
 #: Share of the photos that the answer holds for: one that shares few points with the others may be off.
 MOST = 0.9
-_LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)
 
 
 class TiePoints:
@@ -45,8 +42,8 @@ class TiePoints:
         points, seen = read_tracks(folder)
         return cls(to_frame.apply(points), seen)
 
-    def add(self, camera: Camera, rgb: NDArray[np.uint8]) -> None:
-        """One undistorted photo (h, w, 3) sRGB of `camera`."""
+    def add(self, camera: Camera, linear: NDArray[np.float32]) -> None:
+        """One undistorted photo (h, w, 3), linear, of `camera`."""
         row = np.full(len(self._points), np.nan)
         index = self._seen.get(camera.name, np.zeros(0, np.int64))
         if len(index):
@@ -54,9 +51,7 @@ class TiePoints:
             inside = (depth > 0) & (pixel > 2).all(1) & (pixel[:, 0] < camera.width - 2) & (pixel[:, 1] < camera.height - 2)
             index, pixel = index[inside], pixel[inside]
         if len(index):
-            linear = cv2.GaussianBlur(srgb_decode(rgb) @ _LUMINANCE, (0, 0), BLUR)
-            x, y = (pixel.T - 0.5).astype(np.float32)
-            value = cv2.remap(linear, x, y, cv2.INTER_LINEAR).ravel().astype(np.float64)
+            value = luminance_at(linear, pixel, BLUR)
             good = (value > RANGE[0]) & (value < RANGE[1])
             row[index[good]] = np.log(value[good])
         self._rows.append(row)

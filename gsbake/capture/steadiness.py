@@ -58,10 +58,9 @@ class Sightings:
         pixel, _ = camera.project(self.points)
         index = np.flatnonzero(seen & (pixel > 1).all(1) & (pixel[:, 0] < camera.width - 1) & (pixel[:, 1] < camera.height - 1))
         if len(index):
-            linear = cv2.GaussianBlur(srgb_decode(rgb) @ _LUMINANCE, (0, 0), BLUR)
+            value = luminance_at(srgb_decode(rgb), pixel[index], BLUR)
             strongest = cv2.GaussianBlur(rgb.max(2), (0, 0), BLUR)
             x, y = (pixel[index].T - 0.5).astype(np.float32)
-            value = cv2.remap(linear, x, y, cv2.INTER_LINEAR).ravel().astype(np.float64)
             code = cv2.remap(strongest, x, y, cv2.INTER_LINEAR).ravel()
             good = (code > DARKEST) & (value > 0)
             row[index[good]] = np.log(value[good])
@@ -77,6 +76,13 @@ class Sightings:
         rise = np.expm1(np.nanquantile(left, BRIGHT_PHOTOS, axis=0) - np.nanmedian(left, 0))
         photos = float(np.median(np.isfinite(table).sum(0)))
         return Changes(table.shape[1], photos, float(np.median(rise)), float((rise > CHANGE).mean()))
+
+
+def luminance_at(linear: NDArray[np.float32], pixel: Array, blur: float) -> NDArray[np.float64]:
+    """Luminance (n,) of a linear picture (h, w, 3), blurred by `blur` pixels, at the pixel positions (n, 2)."""
+    smooth = cv2.GaussianBlur(linear @ _LUMINANCE, (0, 0), blur)
+    x, y = (pixel.T - 0.5).astype(np.float32)
+    return np.asarray(cv2.remap(smooth, x, y, cv2.INTER_LINEAR).ravel(), np.float64)
 
 
 def exposures(table: NDArray[np.float64]) -> NDArray[np.float64]:

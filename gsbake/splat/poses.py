@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from gsbake.capture.cameras import Camera
@@ -49,17 +50,12 @@ class Correction:
 
 def rotated(omega: Tensor) -> Tensor:
     """Rotation matrix (3, 3) of a rotation vector (3,): exp of its cross-product matrix."""
-    x, y, z = omega.unbind()
-    zero = torch.zeros_like(x)
-    cross = torch.stack([torch.stack([zero, -z, y]), torch.stack([z, zero, -x]), torch.stack([-y, x, zero])])
-    return torch.linalg.matrix_exp(cross)
+    return torch.from_numpy(Rotation.from_rotvec(omega.numpy()).as_matrix())
 
 
 def turned_by(rotation: Tensor) -> Tensor:
-    """Rotation vector (3,) of a rotation matrix (3, 3) that turns by less than a quarter."""
-    skew = torch.stack([rotation[2, 1] - rotation[1, 2], rotation[0, 2] - rotation[2, 0], rotation[1, 0] - rotation[0, 1]]) / 2
-    sine = skew.norm()
-    return skew if sine < 1e-12 else skew * (torch.asin(sine.clamp(max=1.0)) / sine)
+    """Rotation vector (3,) of a rotation matrix (3, 3)."""
+    return torch.from_numpy(Rotation.from_matrix(rotation.numpy()).as_rotvec())
 
 
 def then(first: Tensor, second: Tensor) -> Tensor:

@@ -24,7 +24,7 @@ import scipy.sparse
 import scipy.sparse.csgraph
 from numpy.typing import NDArray
 
-from gsbake.texture.metal import LEAST_WEIGHT, Evidence, by_eye
+from gsbake.texture.metal import LEAST_WEIGHT, Evidence, by_eye, seen
 
 Floats = NDArray[np.float64]
 
@@ -56,9 +56,9 @@ class Glow:
 def find_glow(photos: Sequence[Evidence], own: NDArray[np.float32], pairs: NDArray[np.int64], place: NDArray[Any]) -> Glow:
     """The texels that glow; `own` (n,) is their present roughness, `pairs` (p, 2) the neighbouring ones, `place` (n, 2) where each lies in
     the texture."""
-    left, irradiance, seen = _left(photos, own)
+    left, irradiance = _left(photos, own)
     peak = left.max(1)
-    pairs = pairs[(seen > LEAST_WEIGHT)[pairs].all(1)]
+    pairs = pairs[(seen(photos, len(own)) > LEAST_WEIGHT)[pairs].all(1)]
     first, second = pairs[(peak > DIMMEST)[pairs].all(1)].T
     apart = np.abs(left[first] - left[second]).max(1)
     like = apart < ALIKE * np.maximum(peak[first], peak[second])
@@ -79,8 +79,8 @@ def find_glow(photos: Sequence[Evidence], own: NDArray[np.float32], pairs: NDArr
     return Glow(texel, np.maximum(left[texel], 0), len(chosen))
 
 
-def _left(photos: Sequence[Evidence], own: NDArray[np.float32]) -> tuple[Floats, Floats, Floats]:
-    """Per texel, averaged over the photos: light (n, 3) without the gloss of black paint, irradiance / π (n, 3); and the weight (n,)."""
+def _left(photos: Sequence[Evidence], own: NDArray[np.float32]) -> tuple[Floats, Floats]:
+    """Per texel, averaged over the photos: light (n, 3) without the gloss of black paint, and irradiance / π (n, 3)."""
     n = len(own)
     left, irradiance, total = np.zeros((n, 3)), np.zeros((n, 3)), np.zeros((n, 3))
     for photo in photos:
@@ -89,11 +89,8 @@ def _left(photos: Sequence[Evidence], own: NDArray[np.float32]) -> tuple[Floats,
         for sums, value in ((left, weight * (photo.colour - gloss)), (irradiance, weight * lit), (total, weight)):
             for k in range(3):
                 sums[:, k] += np.bincount(photo.texel, value[:, k], n)
-    seen = np.zeros(n)
-    for photo in photos:
-        seen += np.bincount(photo.texel, photo.weight, n)
     whole = np.maximum(total, 1e-12)
-    return left / whole, irradiance / whole, seen
+    return left / whole, irradiance / whole
 
 
 def _components(n: int, first: NDArray[np.int64], second: NDArray[np.int64]) -> NDArray[np.int64]:

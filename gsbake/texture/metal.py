@@ -52,6 +52,14 @@ def by_eye(evidence: Evidence) -> NDArray[np.float32]:
     return np.asarray(evidence.weight[:, None] * np.maximum(evidence.colour, DIM) ** (-7 / 6), np.float32)
 
 
+def seen(photos: Sequence[Evidence], texels: int) -> Floats:
+    """Weight (texels,) of all pixels that show each texel."""
+    out = np.zeros(texels)
+    for photo in photos:
+        out += np.bincount(photo.texel, photo.weight, texels)
+    return out
+
+
 @dataclass(frozen=True)
 class Metals:
     """Texels (m,) that metal explains better than paint, with the metal's linear base colour (m, 3) and roughness (m,)."""
@@ -100,9 +108,6 @@ def find_metals(photos: Sequence[Evidence], own: NDArray[np.float32], each: Call
             b, left = sums.best(DARKEST_METAL)
             better = left < metal
             metal[better], base[better], roughness[better] = left[better], b[better], tried[better]
-    seen = np.zeros(texels)
-    for evidence in photos:
-        seen += np.bincount(evidence.texel, evidence.weight, texels)
     share = np.where(base.mean(1) < CLEAN_METAL, *CLEARLY)
-    chosen = np.flatnonzero((metal < share * paint) & (seen > LEAST_WEIGHT))
+    chosen = np.flatnonzero((metal < share * paint) & (seen(photos, texels) > LEAST_WEIGHT))
     return Metals(chosen, base[chosen], roughness[chosen])
