@@ -11,7 +11,7 @@ LEAST_PHOTOS, LEAST_SIZE = 5, 200
 
 
 def run(ctx: Context) -> dict[str, Any]:
-    """Write `points.ply` and `depth/<name>.npz`, or nothing when stereo is skipped."""
+    """Write `points.ply`, `depth/<name>.npz` and, with masks, `hull.npz`; nothing when stereo is skipped."""
     import numpy as np
 
     from gsbake.capture.hull import visual_hull
@@ -62,6 +62,15 @@ def run(ctx: Context) -> dict[str, Any]:
                 ctx.decide(
                     "loose stereo pieces", f"{ghosts.points} points dropped", "too few, or alone and deep under the hull: mirror images"
                 )
+        with ctx.part("opening"):
+            opened = run.opened()
+    if opened is not None:
+        opened.hull.save(ctx.out / "hull.npz")
+        ctx.decide(
+            "hull opened at",
+            f"{opened.made} places",
+            f"photos see through {100 * opened.share:.1f} % of its cells onto something behind; {opened.refused} places refused",
+        )
     (ctx.out / "depth").mkdir()
     for one in maps:
         one.save(ctx.out / "depth" / f"{one.camera.name}.npz")
@@ -87,7 +96,7 @@ def run(ctx: Context) -> dict[str, Any]:
 
 STAGE = Stage(
     name="stereo",
-    version=1,
+    version=2,
     title="Multi-view stereo",
     run=run,
     needs=("poses",),

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import cv2
@@ -165,6 +166,17 @@ class Hull:
         kept = _largest_parts(inside)
         field[inside & ~kept] = cell
         return Hull(kept, np.asarray(centre, float) - radius, cell, field)
+
+    def save(self, path: Path) -> None:
+        """Write as a NumPy archive, the distances in half precision."""
+        np.savez_compressed(path, field=self.field.astype(np.float16), lower=self.lower, cell=self.cell)
+
+    @staticmethod
+    def load(path: Path) -> Hull:
+        """Read what `save` wrote."""
+        with np.load(path) as body:
+            field = body["field"].astype(np.float32)
+            return Hull(field < 0, body["lower"], float(body["cell"]), field)
 
     @property
     def empty(self) -> bool:

@@ -116,11 +116,9 @@ def begin(posed: PosedPhotos, train: Any, splat: Any, seed: int, stereo: Path | 
 
 def _from_stereo(posed: PosedPhotos, train: Any, splat: Any, seed: int, folder: Path) -> tuple[Surfels, str, str] | None:
     """Surfels on the stereo points and on the hull in their holes, or None when stereo found too few."""
-    from gsbake.capture.hull import visual_hull
     from gsbake.stereo.start import start_points
 
-    hull = visual_hull(posed) if posed.has_masks else None
-    begun = start_points(posed, folder, hull, min(train.init_surfels, splat.max_surfels), seed)
+    begun = start_points(posed, folder, min(train.init_surfels, splat.max_surfels), seed)
     if begun is None:
         return None
     points, normals, colours = begun.points, begun.normals, begun.colours

@@ -16,7 +16,7 @@ from gsbake.stereo.agree import Agreement
 Floats = NDArray[np.float32]
 
 #: Costs (mean 1 − NCC) from which on a pixel is not even asked about.
-WORST_COST = 0.5
+WORST_COST = 0.6
 #: A pixel falls when more views see through it than this share of those that agree with it.
 THROUGH_SHARE = 0.34
 #: Views beyond which one more makes a pixel no surer.
@@ -70,6 +70,13 @@ def candidates(cost: Floats) -> NDArray[np.uint8]:
 def confirmed(found: Agreement, least: int) -> NDArray[np.uint8]:
     """Pixels (h, w) with which at least `least` views agree and which few see through."""
     return ((found.agreeing >= least) & (found.through <= THROUGH_SHARE * found.agreeing)).astype(np.uint8)
+
+
+def shared_depth(camera: Camera, plane: Floats, found: Agreement, least: int) -> Floats:
+    """z-depth (h, w) of the planes (h, w, 3) with which `least` views agree, whoever else sees through them; 0 elsewhere."""
+    rho = inverse_depth(camera, plane)
+    good = (found.agreeing >= least) & (rho > 0)
+    return np.where(good, 1 / np.where(good, rho, 1), 0).astype(np.float32)
 
 
 def trusted(camera: Camera, cost: Floats, found: Agreement, least: int, hull: Hull | None) -> DepthMap:

@@ -18,8 +18,9 @@ from gsbake.stereo.agree import agreement
 from gsbake.stereo.bounds import depth_bounds, seed_depths
 from gsbake.stereo.cloud import StereoCloud
 from gsbake.stereo.fuse import fuse
-from gsbake.stereo.maps import DepthMap, candidates, confirmed, trusted
+from gsbake.stereo.maps import DepthMap, candidates, confirmed, shared_depth, trusted
 from gsbake.stereo.neighbours import choose
+from gsbake.stereo.opening import Opened, open_hull
 from gsbake.stereo.photos import Photo, levels, load_photo
 from gsbake.stereo.search import Planes, find_planes
 
@@ -50,6 +51,7 @@ class StereoRun:
     photos: list[list[Photo]] = field(default_factory=list)
     matched: list[list[int]] = field(default_factory=list)
     asked: list[list[int]] = field(default_factory=list)
+    shared: list[NDArray[np.float32]] = field(default_factory=list)
 
     def prepare(self) -> None:
         """Load the photos and choose their neighbours."""
@@ -123,7 +125,10 @@ class StereoRun:
         return Planes(body[..., :3], body[..., 3])
 
     def confirm(self) -> list[DepthMap]:
-        """Ask the photos about one another twice: about all that match, then about what the first round left."""
+        """Ask the photos about one another twice: about all that match, then about what the first round left.
+
+        `shared` keeps the depths (h, w; 0 = none) of each photo that others agreed with in the first round.
+        """
         least = self.settings.min_views
 
         def ask(index: int, good: Sequence[NDArray[np.uint8]]) -> Any:
@@ -132,12 +137,25 @@ class StereoRun:
             return agreement(self.photos[index][-1].camera, own, good[index], others)
 
         first = self.parallel(lambda i: candidates(self._planes(i).cost), "confirming")
-        second = self.parallel(lambda i: confirmed(ask(i, first), least), "confirming", MOST_ASKING)
+
+        def again(index: int) -> Any:
+            found = ask(index, first)
+            depth = shared_depth(self.photos[index][-1].camera, self._planes(index).plane, found, least)
+            return confirmed(found, least), depth
+
+        answers = self.parallel(again, "confirming", MOST_ASKING)
+        second, self.shared = [good for good, _ in answers], [depth for _, depth in answers]
 
         def last(index: int) -> DepthMap:
             return trusted(self.photos[index][-1].camera, self._planes(index).cost, ask(index, second), least, self.hull)
 
         return self.parallel(last, "confirming", MOST_ASKING)
+
+    def opened(self) -> Opened | None:
+        """The hull without what the shared depths see through; None without a hull. After `confirm`."""
+        if self.hull is None:
+            return None
+        return open_hull(self.hull, [sizes[-1].camera for sizes in self.photos], self.shared)
 
     def points(self, maps: Sequence[DepthMap]) -> StereoCloud:
         """Fuse the depth maps."""

@@ -1,4 +1,4 @@
-"""Points to start surfels from: stereo where it is sure, the visual hull where stereo left holes.
+"""Points to start surfels from: stereo where it is sure, the opened visual hull (`gsbake.stereo.opening`) where stereo left holes.
 
 Hull points are kept only where no stereo point lies near and no depth map sees through them: a hull bulges over concave places that stereo
 has measured, and what lies before a measured surface is air.
@@ -87,8 +87,8 @@ def in_air(points: Array, maps: Iterator[tuple[Camera, NDArray[np.float32]]], ma
     return votes >= AIR_PHOTOS
 
 
-def start_points(posed: PosedPhotos, folder: Path, hull: Hull | None, count: int, seed: int) -> StartPoints | None:
-    """At most `count` evenly spread points from the stereo stage's `folder`, and up to as many from the hull.
+def start_points(posed: PosedPhotos, folder: Path, count: int, seed: int) -> StartPoints | None:
+    """At most `count` evenly spread points from the stereo stage's `folder`, and up to as many from its opened hull, where there is one.
 
     None where stereo found too few.
     The hull's points take the mean colour of the stereo points: nothing is known of theirs.
@@ -101,8 +101,9 @@ def start_points(posed: PosedPhotos, folder: Path, hull: Hull | None, count: int
     if len(cloud) < LEAST_POINTS:
         return None
     points, normals, colours = thin(cloud.points, cloud.normals, cloud.colours / 255.0, cloud.confidence, count)
-    if hull is None or hull.empty:
+    if not (folder / "hull.npz").exists():
         return StartPoints(points, normals, colours, len(points))
+    hull = Hull.load(folder / "hull.npz")
     tree = cKDTree(points)
     gap = float(np.median(tree.query(points, k=min(2, len(points)))[0][:, -1]))
     more, more_normals = hull.surface_points(count, seed)

@@ -13,7 +13,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 from gsbake.capture.cameras import CameraSet
-from gsbake.capture.hull import visual_hull
+from gsbake.capture.hull import Hull, visual_hull
 from gsbake.capture.posed import PosedPhotos
 from gsbake.profile.schema import Profile
 from gsbake.stereo.cloud import StereoCloud
@@ -104,6 +104,14 @@ def test_what_it_writes(done: tuple[Path, dict[str, Any]]) -> None:
         assert ((confidence > 0) == known).all() and confidence.max() <= 1
 
 
+def test_the_hull_goes_with_it(poses: Path, done: tuple[Path, dict[str, Any]]) -> None:
+    kept, whole = Hull.load(done[0] / "hull.npz"), visual_hull(PosedPhotos.open(poses))
+    # A ball has no concave place: what is taken away lies outside the ball, where few photos bound the hull.
+    assert not (kept.occupancy & ~whole.occupancy).any()
+    points = kept.lower + (np.argwhere(whole.occupancy & ~kept.occupancy) + 0.5) * kept.cell
+    assert (np.linalg.norm(points, axis=1) > RADIUS - kept.cell).all()
+
+
 def test_it_goes_on_where_it_stopped(poses: Path, done: tuple[Path, dict[str, Any]], tmp_path: Path) -> None:
     with pytest.raises(Stopped):
         STAGE.run(Run(poses, tmp_path, "cut", stop_after=3))
@@ -133,7 +141,7 @@ def test_it_is_skipped(poses: Path, tmp_path: Path) -> None:
 
 def test_start_is_stereo_and_hull_in_its_holes(poses: Path, done: tuple[Path, dict[str, Any]]) -> None:
     posed = PosedPhotos.open(poses)
-    begun = start_points(posed, done[0], visual_hull(posed), 1500, 0)
+    begun = start_points(posed, done[0], 1500, 0)
     assert begun is not None
     assert 500 < begun.stereo <= 1500 and len(begun.points) > begun.stereo
     off = np.linalg.norm(begun.points, axis=1) - RADIUS
@@ -142,7 +150,7 @@ def test_start_is_stereo_and_hull_in_its_holes(poses: Path, done: tuple[Path, di
     # The matched side looks along +x; the hull fills the other one.
     assert from_stereo[:, 0].mean() > 0.3 > from_hull[:, 0].mean()
     assert ((begun.normals * begun.points).sum(1) > 0).mean() > 0.95
-    assert start_points(posed, poses, None, 100, 0) is None  # no stereo there
+    assert start_points(posed, poses, 100, 0) is None  # no stereo there
 
 
 def test_surfels_begin_from_stereo(poses: Path, done: tuple[Path, dict[str, Any]]) -> None:

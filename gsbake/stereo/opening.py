@@ -1,0 +1,136 @@
+"""The visual hull opened where matching sees through it.
+
+A hull bulges over every concave place. Stereo confirms few depths there (gloss, no texture, edges close together), yet far more pixels are
+matched to a depth that one or two other photos share, and most of those lie behind the bulge. So the hull's cells are put to the vote:
+a ray whose depth is farther speaks for air, one whose depth is here for a surface, and what lies behind a depth says nothing
+(Hernández, Vogiatzis & Cipolla, *Probabilistic visibility for multi-view stereo*, CVPR 2007, as plain counts). Air that is connected to the
+outside is taken away, but only where the surface that this lays bare has votes of its own: mirror images lie behind a glossy surface
+too, but at another place for every photo.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numba as nb
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from gsbake.capture.cameras import Camera
+from gsbake.capture.hull import Hull
+from gsbake.stereo.cost import FAST
+
+Floats = NDArray[np.float32]
+
+#: Half the depth, in cells, within which a vote is for a surface.
+BAND = 0.5
+#: Votes are spread over this many cells (standard deviation): those of one cell are few.
+SPREAD = 1.0
+#: Air: this share of the votes, where nothing being known counts as a vote of this weight for a surface.
+AIR, UNKNOWN = 0.65, 0.3
+#: Cells under the hull up to which it is opened.
+DEEPEST = 6.0
+#: Openings of fewer cells are noise; of larger ones the new surface must have this share of the votes in the mean.
+LEAST_CELLS, BACKED = 8, 0.12
+
+
+@dataclass(frozen=True)
+class Opened:
+    """The opened hull, the share of the hull's cells taken away, and how many openings were made and refused."""
+
+    hull: Hull
+    share: float
+    made: int
+    refused: int
+
+
+@nb.njit(fastmath=FAST, error_model="numpy", nogil=True, cache=True)
+def _count(
+    field: Any, lower: Any, cell: float, band: float, depth: Any, starts: Any, sizes: Any, lenses: Any, poses: Any, air: Any, surface: Any
+) -> None:
+    """Kernel of `count_votes`: all depth maps one after another in `depth`."""
+    n0, n1, n2 = field.shape
+    for i in range(n0):
+        x = lower[0] + (i + 0.5) * cell
+        for j in range(n1):
+            y = lower[1] + (j + 0.5) * cell
+            for k in range(n2):
+                if not field[i, j, k] < cell:
+                    continue
+                z = lower[2] + (k + 0.5) * cell
+                for v in range(starts.shape[0]):
+                    p, lens = poses[v], lenses[v]
+                    here = p[2, 0] * x + p[2, 1] * y + p[2, 2] * z + p[2, 3]
+                    if not here > 1e-6:
+                        continue
+                    across = lens[0] * (p[0, 0] * x + p[0, 1] * y + p[0, 2] * z + p[0, 3]) / here + lens[2]
+                    down = lens[1] * (p[1, 0] * x + p[1, 1] * y + p[1, 2] * z + p[1, 3]) / here + lens[3]
+                    if not (across >= 0 and down >= 0 and across < sizes[v, 0] and down < sizes[v, 1]):
+                        continue
+                    there = depth[np.uint64(starts[v] + np.int64(down) * sizes[v, 0] + np.int64(across))]
+                    if not there > 0:
+                        continue
+                    if there > here + band:
+                        air[i, j, k] += np.float32(1)
+                    elif there > here - band:
+                        surface[i, j, k] += np.float32(1)
+
+
+def count_votes(hull: Hull, cameras: Sequence[Camera], depths: Sequence[Floats]) -> tuple[Floats, Floats]:
+    """For each cell (n, n, n) in or next to the hull how many depths lie behind it (air) and within half a cell of it (surface).
+
+    `depths` are z-depths (h, w) of the cameras' sizes, 0 = none.
+    """
+    air, surface = np.zeros(hull.field.shape, np.float32), np.zeros(hull.field.shape, np.float32)
+    if not cameras:
+        return air, surface
+    _count(
+        hull.field,
+        np.asarray(hull.lower, float),
+        float(hull.cell),
+        BAND * float(hull.cell),
+        np.concatenate([np.asarray(d, np.float32).ravel() for d in depths]),
+        np.concatenate([[0], np.cumsum([d.size for d in depths])[:-1]]).astype(np.int64),
+        np.array([(c.width, c.height) for c in cameras], np.int64),
+        np.array([(c.fx, c.fy, c.cx, c.cy) for c in cameras], float),
+        np.array([np.concatenate([c.R, c.t[:, None]], 1) for c in cameras], float),
+        air,
+        surface,
+    )
+    return air, surface
+
+
+def open_hull(hull: Hull, cameras: Sequence[Camera], depths: Sequence[Floats]) -> Opened:
+    """Take from the hull what `depths` (h, w; 0 = none) of the `cameras` see through.
+
+    The cells at the new surface take their distance from the share of the votes: it lies where air just has AIR of them.
+    """
+    air, surface = (ndimage.gaussian_filter(v, SPREAD) for v in count_votes(hull, cameras, depths))
+    total = air + surface + UNKNOWN
+    through, backing = air / total, surface / total
+    solid = hull.field < 0
+    outside = ~solid
+    free = solid & (through > AIR) & (hull.field > -DEEPEST * hull.cell)
+    # A tunnel of one cell is a leak, not a concave place.
+    free &= ndimage.binary_opening(free | outside, ndimage.generate_binary_structure(3, 1))
+    label, _ = ndimage.label(free | outside)
+    reached = free & np.isin(label, np.unique(label[outside]))
+    label, count = ndimage.label(reached)
+    keep = np.zeros(count + 1, bool)
+    for number, box in enumerate(ndimage.find_objects(label), 1):
+        wider = tuple(slice(max(0, s.start - 1), s.stop + 1) for s in box)
+        piece = label[wider] == number
+        bare = ndimage.binary_dilation(piece) & solid[wider] & ~reached[wider]
+        keep[number] = piece.sum() >= LEAST_CELLS and bare.any() and backing[wider][bare].mean() >= BACKED
+    carved = keep[label]
+    if not carved.any():
+        return Opened(hull, 0.0, 0, count)
+    # Distances in cells follow from how fast the share of air falls across a new surface: by about a quarter a cell.
+    edge = np.where(ndimage.binary_dilation(carved), (through - AIR) * 4 * hull.cell, -np.inf)
+    field = np.maximum(hull.field, edge)
+    field[carved] = np.maximum(field[carved], 0.2 * hull.cell)
+    opened = replace(hull, occupancy=field < 0, field=field.astype(np.float32))
+    return Opened(opened, float(carved.sum() / solid.sum()), int(keep.sum()), count - int(keep.sum()))
