@@ -56,6 +56,8 @@ def run(ctx: Context) -> dict[str, Any]:
     cloud = None if points is None or len(points) < _FEWEST_POINTS else to_unit.apply(points)
     if cloud is not None:
         write_cloud(ctx.out / "points.ply", cloud, colours if colours is not None else cloud * 0)
+    with ctx.part("masks"):
+        _mend_masks(ctx, unit, cloud)
     with ctx.part("photos that add nothing"):
         unit, dropped = _drop_spare(ctx, entries, unit, cloud)
     CameraSet(tuple(unit), to_world, origin).save(ctx.out / "cameras.json")
@@ -76,6 +78,33 @@ def _settle_poses(ctx: Context, ingest: Path, photos: int) -> bool:
     if known.exists():
         evidence = f"poses given for {len(CameraSet.load(known).cameras)} of {photos} photos"
     return leave_out(ctx, "poses", known.exists(), evidence, "structure from motion left out", "poses solved from the photos")
+
+
+def _mend_masks(ctx: Context, cameras: Sequence[Camera], cloud: Any) -> None:
+    """Where tie points (unit frame) show that a mask leaves out a part of the object, put that part into its file."""
+    import cv2
+    import numpy as np
+
+    from gsbake.capture.cameras import CameraSet
+    from gsbake.capture.mending import mend
+    from gsbake.capture.posed import PosedPhotos
+
+    posed = PosedPhotos(ctx.out, CameraSet(tuple(cameras)))
+    if cloud is None or not posed.has_masks:
+        return
+    smaller = [posed.mask(i, _HULL_SIZE) for i in range(len(posed))]
+    mended = mend([camera for camera, _ in smaller], [mask for _, mask in smaller if mask is not None], cloud)
+    for one in mended:
+        mask = posed.mask(one.index)[1]
+        assert mask is not None  # as all have one
+        missing = cv2.resize(255 * one.missing.astype(np.uint8), mask.shape[::-1], interpolation=cv2.INTER_LINEAR)
+        whole = np.where(missing > 127, 255, mask).astype(np.uint8)
+        coded = cv2.imencode(".png", whole, [cv2.IMWRITE_PNG_COMPRESSION, _PNG_LEVEL])[1]
+        (ctx.out / "masks" / f"{cameras[one.index].name}.png").write_bytes(coded.tobytes())
+    if mended:
+        names = _some([cameras[one.index].name for one in mended])
+        points = sum(one.points for one in mended)
+        ctx.decide("masks mended", f"{len(mended)} of {len(posed)}", f"they left out {points} points that nearly all others hold: {names}")
 
 
 def _drop_spare(ctx: Context, entries: Sequence[dict[str, Any]], cameras: list[Camera], cloud: Any) -> tuple[list[Camera], list[str]]:
@@ -338,7 +367,7 @@ def _some(names: Sequence[str]) -> str:
 
 STAGE = Stage(
     name="poses",
-    version=2,
+    version=3,
     title="Camera poses",
     run=run,
     needs=("ingest",),

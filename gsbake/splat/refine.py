@@ -15,6 +15,7 @@ import torch
 from scipy.spatial import cKDTree
 
 from gsbake.capture.posed import PosedPhotos
+from gsbake.pipeline.errors import BadInputError
 from gsbake.splat.adapt import OPACITY_FLOOR
 from gsbake.splat.gbuffer import rasterise
 from gsbake.splat.policies import PRUNING, Placement
@@ -26,6 +27,8 @@ from gsbake.splat.views import TrainView, pose_of
 SEEN_WEIGHT = 0.05
 #: A neighbour gap wider than this many median gaps is under-sampled.
 SPARSE = 1.6
+#: Fewer surfels than this are no surface.
+FEWEST = 10
 
 
 def _visibility(surfels: Surfels, posed: PosedPhotos, max_size: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
@@ -63,9 +66,9 @@ def _visibility(surfels: Surfels, posed: PosedPhotos, max_size: int) -> tuple[to
 
 def prune_and_densify(surfels: Surfels, posed: PosedPhotos, refine: Any, max_size: int, seed: int) -> tuple[Surfels, dict[str, int]]:
     """Surfels after pruning and seeding, and the count of each rule; `refine` is the profile's section, `max_size` the size of the
-    probing renders."""
+    probing renders. Raises BadInputError when next to nothing would be left."""
     before = len(surfels)
-    if before < 10:
+    if before < FEWEST:
         return surfels, {"before": before, "after": before}
     best, outside, distance = _visibility(surfels, posed, max_size)
     gap = torch.from_numpy(spacing(surfels.position.numpy().astype(float)).astype(np.float32))
@@ -83,6 +86,12 @@ def prune_and_densify(surfels: Surfels, posed: PosedPhotos, refine: Any, max_siz
     keep = ~torch.stack(list(rules.values())).any(0)
     counts = {"before": before} | {f"dropped, {k}": int(v.sum()) for k, v in rules.items()}
     kept = surfels.select(keep.nonzero()[:, 0])
+    if len(kept) < FEWEST:
+        worst = max(rules, key=lambda rule: int(rules[rule].sum()))
+        raise BadInputError(
+            f"refine: {before - len(kept)} of {before} surfels would be dropped, most of them as {worst}: training did not find the "
+            "object; train longer (train.iterations) or start nearer to it (train.init=auto)."
+        )
     added = _fill(kept, refine.densify_share, seed)
     counts["added"] = len(added)
     if len(added):

@@ -12,6 +12,7 @@ import pytest
 from PIL import Image
 
 from gsbake.capture.cameras import Camera, CameraSet
+from gsbake.capture.cloud import write_cloud
 from gsbake.capture.posed import PosedPhotos
 from gsbake.capture.solve import Watch, run_job
 from gsbake.pipeline.errors import BadInputError, InterruptedRun
@@ -195,6 +196,31 @@ def test_masks_centre_the_object(tmp_path: Path, runner: Runner) -> None:
     assert results["centre"] == pytest.approx(CENTRE, abs=0.04) and results["radius"] == pytest.approx(RADIUS, rel=0.08)
     assert "visual hull of 16 masks" in ctx.decisions["unit sphere"]
     assert CameraSet.load(ctx.out / "cameras.json").to_world.scale == pytest.approx(results["radius"] / 0.9)
+
+
+def test_a_mask_that_lacks_a_part_is_mended(tmp_path: Path, runner: Runner) -> None:
+    """A ball with given poses and points; in one photo the mask misses a disc in its middle."""
+    from tests.capture.test_hull import CENTRE, RADIUS, ball_mask, ring
+
+    (tmp_path / "images").mkdir()
+    cameras = ring(16)
+    for camera in cameras:
+        mask = ball_mask(camera)
+        if camera.name == "c05":
+            rows, columns = np.nonzero(mask)
+            cv2.circle(mask, (int(columns.mean()), int(rows.mean())), 14, 0, -1)
+        noise = np.random.default_rng(int(camera.name[1:])).integers(0, 255, (160, 160, 3), np.uint8)
+        Image.fromarray(np.dstack([noise, mask])).save(tmp_path / "images" / f"{camera.name}.png")
+    transforms(tmp_path, cameras)
+    runner.ingest(tmp_path)
+    points = np.random.default_rng(0).normal(size=(800, 3))
+    points = CENTRE + RADIUS * points / np.linalg.norm(points, axis=1, keepdims=True)
+    write_cloud(runner.root / "ingest" / "poses" / "points.ply", points, np.full((800, 3), 90, np.uint8))
+    _, ctx = runner.poses()
+    assert ctx.decisions["masks mended"].startswith("1 of 16") and "c05" in ctx.decisions["masks mended"]
+    for camera in cameras:
+        mended = cv2.imread(str(ctx.out / "masks" / f"{camera.name}.png"), cv2.IMREAD_GRAYSCALE)
+        assert mended is not None and ((mended > 127) != (ball_mask(camera) > 127)).mean() < 0.002
 
 
 @pytest.mark.slow

@@ -12,6 +12,7 @@ import torch
 
 from gsbake.capture.cameras import Camera, CameraSet
 from gsbake.capture.posed import PosedPhotos
+from gsbake.pipeline.errors import BadInputError
 from gsbake.profile.schema import Profile
 from gsbake.splat.refine import prune_and_densify
 from gsbake.splat.render import SurfelRenderer
@@ -116,6 +117,13 @@ def test_a_resumed_run_ends_with_the_same_bits(posed: PosedPhotos, tmp_path: Pat
     while second.done < second.end:
         second.step()
     assert all(torch.equal(v, second.surfels.tensors()[k]) for k, v in whole.surfels.tensors().items())
+
+
+def test_refine_says_so_when_nothing_is_left(posed: PosedPhotos) -> None:
+    s = ball()
+    s.sdf = torch.full_like(s.sdf, 5.0)
+    with pytest.raises(BadInputError, match="1500 of 1500 surfels would be dropped, most of them as transparent"):
+        prune_and_densify(s, posed, profile().model_copy().refine, SIZE, 0)
 
 
 def test_refine_drops_floaters_and_fills_gaps(posed: PosedPhotos) -> None:
