@@ -29,8 +29,9 @@ Floats = NDArray[np.float32]
 BAND = 0.5
 #: Votes are spread over this many cells (standard deviation): those of one cell are few.
 SPREAD = 1.0
-#: Air: this share of the votes, where nothing being known counts as a vote of this weight for a surface.
-AIR, UNKNOWN = 0.65, 0.3
+#: Air: this share of the votes. Nothing being known counts as so many votes for a surface: at least the second, and the third as a share
+#: of how many cells that are seen through mostly get, for where most get many, few say little.
+AIR, UNKNOWN, UNKNOWN_SHARE = 0.65, 0.3, 0.2
 #: Cells under the hull up to which it is opened.
 DEEPEST = 6.0
 #: Openings of fewer cells are noise; of larger ones the new surface must have this share of the votes in the mean.
@@ -106,13 +107,17 @@ def count_votes(hull: Hull, cameras: Sequence[Camera], depths: Sequence[Floats])
 def open_hull(hull: Hull, cameras: Sequence[Camera], depths: Sequence[Floats]) -> Opened:
     """Take from the hull what `depths` (h, w; 0 = none) of the `cameras` see through.
 
-    The cells at the new surface take their distance from the share of the votes: it lies where air just has AIR of them.
+    The cells at the new surface take their distance from the share of the votes: it lies where air just has AIR of them, which is up to a
+    cell before the true one. That is the side to be on: surfels behind the true surface are never seen.
     """
     air, surface = (ndimage.gaussian_filter(v, SPREAD) for v in count_votes(hull, cameras, depths))
-    total = air + surface + UNKNOWN
-    through, backing = air / total, surface / total
     solid = hull.field < 0
     outside = ~solid
+    doubted = solid & (air > AIR * (air + surface))
+    if not doubted.any():
+        return Opened(hull, 0.0, 0, 0)
+    total = air + surface + max(UNKNOWN, UNKNOWN_SHARE * float(np.median((air + surface)[doubted])))
+    through, backing = air / total, surface / total
     free = solid & (through > AIR) & (hull.field > -DEEPEST * hull.cell)
     # A tunnel of one cell is a leak, not a concave place.
     free &= ndimage.binary_opening(free | outside, ndimage.generate_binary_structure(3, 1))
