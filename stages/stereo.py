@@ -69,7 +69,7 @@ def run(ctx: Context) -> dict[str, Any]:
         ctx.decide(
             "hull opened at",
             f"{opened.made} places",
-            f"photos see through {100 * opened.share:.1f} % of its cells onto something behind; {opened.refused} places refused",
+            f"photos see through {100 * opened.share:.1f} % of its cells onto a surface behind, at {opened.refused} other places onto none",
         )
     (ctx.out / "depth").mkdir()
     for one in maps:

@@ -26,6 +26,8 @@ LEAST_PHOTOS, LEFT_OUT = 5, 0.03
 LEAST_POINTS, LEAST_SHARE = 10, 0.01
 #: With more wrong masks than this share it is not clear which are right.
 MOST_WRONG = 0.2
+#: Points looked at: more say no more.
+MOST_POINTS = 50_000
 #: Cells along the cube of half edge 1 in the hull of the right masks.
 CELLS = 96
 
@@ -73,7 +75,7 @@ def mend(cameras: Sequence[Camera], masks: Sequence[Bytes], points: Array) -> li
 
     `points` (n, 3) are tie points, of the object and of what is around it. Empty where no mask is wrong, or too many are.
     """
-    pixels = left_out(cameras, masks, points)
+    pixels = left_out(cameras, masks, points[:: -(-len(points) // MOST_POINTS) or 1])
     wrong = [i for i, p in enumerate(pixels) if len(p)]
     right = [i for i, p in enumerate(pixels) if not len(p)]
     if not wrong or len(wrong) > MOST_WRONG * len(cameras):

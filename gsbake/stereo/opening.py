@@ -34,13 +34,13 @@ SPREAD = 1.0
 AIR, UNKNOWN, UNKNOWN_SHARE = 0.65, 0.3, 0.2
 #: Cells under the hull up to which it is opened.
 DEEPEST = 6.0
-#: Openings of fewer cells are noise; of larger ones the new surface must have this share of the votes in the mean.
+#: Openings of fewer cells are noise, and left closed; of larger ones the new surface must have this share of the votes in the mean.
 LEAST_CELLS, BACKED = 8, 0.12
 
 
 @dataclass(frozen=True)
 class Opened:
-    """The opened hull, the share of the hull's cells taken away, and how many openings were made and refused."""
+    """The opened hull, the share of the hull's cells taken away, and how many openings were made and, for want of backing, refused."""
 
     hull: Hull
     share: float
@@ -124,18 +124,21 @@ def open_hull(hull: Hull, cameras: Sequence[Camera], depths: Sequence[Floats]) -
     label, _ = ndimage.label(free | outside)
     reached = free & np.isin(label, np.unique(label[outside]))
     label, count = ndimage.label(reached)
-    keep = np.zeros(count + 1, bool)
+    keep, refused = np.zeros(count + 1, bool), 0
     for number, box in enumerate(ndimage.find_objects(label), 1):
         wider = tuple(slice(max(0, s.start - 1), s.stop + 1) for s in box)
         piece = label[wider] == number
+        if piece.sum() < LEAST_CELLS:
+            continue
         bare = ndimage.binary_dilation(piece) & solid[wider] & ~reached[wider]
-        keep[number] = piece.sum() >= LEAST_CELLS and bare.any() and backing[wider][bare].mean() >= BACKED
+        keep[number] = bare.any() and backing[wider][bare].mean() >= BACKED
+        refused += not keep[number]
     carved = keep[label]
-    if not carved.any():
-        return Opened(hull, 0.0, 0, count)
+    if not carved.any() or carved[solid].all():  # nothing seen through, or nothing left
+        return Opened(hull, 0.0, 0, refused)
     # Distances in cells follow from how fast the share of air falls across a new surface: by about a quarter a cell.
     edge = np.where(ndimage.binary_dilation(carved), (through - AIR) * 4 * hull.cell, -np.inf)
     field = np.maximum(hull.field, edge)
     field[carved] = np.maximum(field[carved], 0.2 * hull.cell)
     opened = replace(hull, occupancy=field < 0, field=field.astype(np.float32))
-    return Opened(opened, float(carved.sum() / solid.sum()), int(keep.sum()), count - int(keep.sum()))
+    return Opened(opened, float(carved.sum() / solid.sum()), int(keep.sum()), refused)
