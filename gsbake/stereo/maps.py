@@ -40,9 +40,7 @@ class DepthMap:
 
     def depth(self) -> Floats:
         """z-depth (h, w), 0 = none."""
-        rho = inverse_depth(self.camera, self.plane)
-        good = (self.confidence > 0) & (rho > 0)
-        return np.where(good, 1 / np.where(good, rho, 1), 0).astype(np.float32)
+        return z_depth(self.camera, self.plane, self.confidence > 0)
 
     def save(self, path: Path) -> None:
         """Write depth and confidence as a NumPy archive."""
@@ -62,6 +60,13 @@ def inverse_depth(camera: Camera, plane: Floats) -> Floats:
     return np.asarray(plane[..., 0] * x[None, :] + plane[..., 1] * y[:, None] + plane[..., 2], np.float32)
 
 
+def z_depth(camera: Camera, plane: Floats, keep: NDArray[np.bool_]) -> Floats:
+    """z-depth (h, w) of planes (h, w, 3) where `keep` (h, w) says so and they lie before the camera, 0 elsewhere."""
+    rho = inverse_depth(camera, plane)
+    good = keep & (rho > 0)
+    return np.where(good, 1 / np.where(good, rho, 1), 0).astype(np.float32)
+
+
 def candidates(cost: Floats) -> NDArray[np.uint8]:
     """Pixels (h, w) whose match is worth asking other views about."""
     return (cost < WORST_COST).astype(np.uint8)
@@ -70,13 +75,6 @@ def candidates(cost: Floats) -> NDArray[np.uint8]:
 def confirmed(found: Agreement, least: int) -> NDArray[np.uint8]:
     """Pixels (h, w) with which at least `least` views agree and which few see through."""
     return ((found.agreeing >= least) & (found.through <= THROUGH_SHARE * found.agreeing)).astype(np.uint8)
-
-
-def shared_depth(camera: Camera, plane: Floats, found: Agreement, least: int) -> Floats:
-    """z-depth (h, w) of the planes (h, w, 3) with which `least` views agree, whoever else sees through them; 0 elsewhere."""
-    rho = inverse_depth(camera, plane)
-    good = (found.agreeing >= least) & (rho > 0)
-    return np.where(good, 1 / np.where(good, rho, 1), 0).astype(np.float32)
 
 
 def trusted(camera: Camera, cost: Floats, found: Agreement, least: int, hull: Hull | None) -> DepthMap:

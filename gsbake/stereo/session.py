@@ -18,7 +18,7 @@ from gsbake.stereo.agree import agreement
 from gsbake.stereo.bounds import depth_bounds, seed_depths
 from gsbake.stereo.cloud import StereoCloud
 from gsbake.stereo.fuse import fuse
-from gsbake.stereo.maps import DepthMap, candidates, confirmed, shared_depth, trusted
+from gsbake.stereo.maps import DepthMap, candidates, confirmed, trusted, z_depth
 from gsbake.stereo.neighbours import choose
 from gsbake.stereo.opening import Opened, open_hull
 from gsbake.stereo.photos import Photo, levels, load_photo
@@ -140,11 +140,11 @@ class StereoRun:
 
         def again(index: int) -> Any:
             found = ask(index, first)
-            depth = shared_depth(self.photos[index][-1].camera, self._planes(index).plane, found, least)
-            return confirmed(found, least), depth
+            shared = z_depth(self.photos[index][-1].camera, self._planes(index).plane, found.agreeing >= least)
+            return confirmed(found, least), shared
 
         answers = self.parallel(again, "confirming", MOST_ASKING)
-        second, self.shared = [good for good, _ in answers], [depth for _, depth in answers]
+        second, self.shared = [good for good, _ in answers], [shared for _, shared in answers]
 
         def last(index: int) -> DepthMap:
             return trusted(self.photos[index][-1].camera, self._planes(index).cost, ask(index, second), least, self.hull)

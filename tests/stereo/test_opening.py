@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from gsbake.capture.cameras import Camera
 from gsbake.capture.hull import Hull
-from gsbake.stereo.agree import Agreement
-from gsbake.stereo.maps import shared_depth
+from gsbake.stereo.maps import z_depth
 from gsbake.stereo.opening import count_votes, open_hull
 from tests.stereo.scenes import RADIUS, camera_at, sphere_depth
 
@@ -106,13 +105,11 @@ def test_without_depths_the_hull_stays() -> None:
     assert open_hull(hull, cameras, [np.zeros((c.height, c.width), np.float32) for c in cameras]).share == 0
 
 
-def test_shared_depths_are_those_that_enough_views_agree_with() -> None:
+def test_depths_of_planes_where_they_are_wanted() -> None:
     camera = camera_at(np.array([3.0, 0, 0]), "a", 4, 1)
     plane = np.zeros((1, 4, 3), np.float32)
     plane[..., 2] = [0.5, 0.5, 0.25, 0.0]
-    agreeing = np.array([[1, 2, 3, 4]], np.uint8)
-    found = Agreement(agreeing, np.full((1, 4), 9, np.uint8), plane, np.zeros((1, 4), np.float32))
-    assert shared_depth(camera, plane, found, 2).tolist() == [[0.0, 2.0, 4.0, 0.0]]
+    assert z_depth(camera, plane, np.array([[False, True, True, True]])).tolist() == [[0.0, 2.0, 4.0, 0.0]]
 
 
 def test_a_hull_comes_back_from_disk(tmp_path: Path) -> None:
