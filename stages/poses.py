@@ -48,7 +48,8 @@ def run(ctx: Context) -> dict[str, Any]:
     with ctx.part("undistortion"):
         pinholes = _undistort(ctx, ingest, cameras)
     with ctx.part("normalisation"):
-        extent = _extent(ctx, pinholes, points)
+        masks = _small_masks(ctx, pinholes)
+        extent = _extent(ctx, pinholes, masks, points)
     to_world = extent.similarity()
     to_unit = to_world.inverse()
     origin = "given" if given else "solved"
@@ -57,7 +58,7 @@ def run(ctx: Context) -> dict[str, Any]:
     if cloud is not None:
         write_cloud(ctx.out / "points.ply", cloud, colours if colours is not None else cloud * 0)
     with ctx.part("masks"):
-        _mend_masks(ctx, unit, cloud)
+        _mend_masks(ctx, [(camera.moved(to_unit), mask) for camera, mask in masks], cloud)
     with ctx.part("photos that add nothing"):
         unit, dropped = _drop_spare(ctx, entries, unit, cloud)
     CameraSet(tuple(unit), to_world, origin).save(ctx.out / "cameras.json")
@@ -80,31 +81,36 @@ def _settle_poses(ctx: Context, ingest: Path, photos: int) -> bool:
     return leave_out(ctx, "poses", known.exists(), evidence, "structure from motion left out", "poses solved from the photos")
 
 
-def _mend_masks(ctx: Context, cameras: Sequence[Camera], cloud: Any) -> None:
-    """Where tie points (unit frame) show that a mask leaves out a part of the object, put that part into its file."""
+def _mend_masks(ctx: Context, masks: Sequence[tuple[Camera, Any]], cloud: Any) -> None:
+    """Where tie points show that a mask leaves out a part of the object, put that part into its file; `masks` are small, with their cameras
+    in the unit frame, as is the `cloud`."""
     import cv2
     import numpy as np
 
-    from gsbake.capture.cameras import CameraSet
     from gsbake.capture.mending import mend
-    from gsbake.capture.posed import PosedPhotos
 
-    posed = PosedPhotos(ctx.out, CameraSet(tuple(cameras)))
-    if cloud is None or not posed.has_masks:
+    if cloud is None or any(mask is None for _, mask in masks):
         return
-    smaller = [posed.mask(i, _HULL_SIZE) for i in range(len(posed))]
-    mended = mend([camera for camera, _ in smaller], [mask for _, mask in smaller if mask is not None], cloud)
-    for one in mended:
-        mask = posed.mask(one.index)[1]
-        assert mask is not None  # as all have one
+    mended = mend([camera for camera, _ in masks], [mask for _, mask in masks], cloud)
+    names = [masks[one.index][0].name for one in mended]
+    for one, name in zip(mended, names, strict=True):
+        path = ctx.out / "masks" / f"{name}.png"
+        mask = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+        if mask is None:
+            raise FileNotFoundError(path)
         missing = cv2.resize(255 * one.missing.astype(np.uint8), mask.shape[::-1], interpolation=cv2.INTER_LINEAR)
-        whole = np.where(missing > 127, 255, mask).astype(np.uint8)
-        coded = cv2.imencode(".png", whole, [cv2.IMWRITE_PNG_COMPRESSION, _PNG_LEVEL])[1]
-        (ctx.out / "masks" / f"{cameras[one.index].name}.png").write_bytes(coded.tobytes())
+        _write_png(path, np.where(missing > 127, 255, mask).astype(np.uint8))
     if mended:
-        names = _some([cameras[one.index].name for one in mended])
         points = sum(one.points for one in mended)
-        ctx.decide("masks mended", f"{len(mended)} of {len(posed)}", f"they left out {points} points that nearly all others hold: {names}")
+        evidence = f"they left out {points} points that nearly all others hold: {_some(names)}"
+        ctx.decide("masks mended", f"{len(mended)} of {len(masks)}", evidence)
+
+
+def _write_png(path: Path, image: Any) -> None:
+    """Write 8-bit pixels (h, w) or (h, w, 3) in OpenCV's order, coded quickly."""
+    import cv2
+
+    path.write_bytes(cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, _PNG_LEVEL])[1].tobytes())
 
 
 def _drop_spare(ctx: Context, entries: Sequence[dict[str, Any]], cameras: list[Camera], cloud: Any) -> tuple[list[Camera], list[str]]:
@@ -328,9 +334,7 @@ def _undistort(ctx: Context, ingest: Path, cameras: Sequence[Camera]) -> list[Ca
                     image = cv2.imread(str(source), cv2.IMREAD_GRAYSCALE if is_mask else cv2.IMREAD_COLOR)
                     if image is None:
                         raise FileNotFoundError(source)
-                    flat_image = resample(np.asarray(image, np.uint8), tables, is_mask)
-                    coded = cv2.imencode(".png", flat_image, [cv2.IMWRITE_PNG_COMPRESSION, _PNG_LEVEL])[1]
-                    goal.write_bytes(coded.tobytes())
+                    _write_png(goal, resample(np.asarray(image, np.uint8), tables, is_mask))
                 return replace(target, name=camera.name, R=camera.R, t=camera.t)
 
             for result in pool.map(one, members):
@@ -340,18 +344,23 @@ def _undistort(ctx: Context, ingest: Path, cameras: Sequence[Camera]) -> list[Ca
     return [flat[c.name] for c in cameras]
 
 
-def _extent(ctx: Context, cameras: Sequence[Camera], points: Any) -> Extent:
-    """The ball around the object: from the visual hull when at least half of the photos have masks, else from what the cameras look at."""
+def _small_masks(ctx: Context, cameras: Sequence[Camera]) -> list[tuple[Camera, Any]]:
+    """Each photo's mask at the size that hulls are carved from, None where it has none, and its camera."""
     import cv2
 
     from gsbake.capture.cameras import CameraSet
-    from gsbake.capture.normalise import extent_from_masks, extent_from_view
     from gsbake.capture.posed import PosedPhotos
 
     posed = PosedPhotos(ctx.out, CameraSet(tuple(cameras)))
     cv2.setNumThreads(ctx.threads)
-    pairs = [posed.mask(i, _HULL_SIZE) for i in range(len(cameras))]
-    masked = [(camera, mask) for camera, mask in pairs if mask is not None]
+    return [posed.mask(i, _HULL_SIZE) for i in range(len(cameras))]
+
+
+def _extent(ctx: Context, cameras: Sequence[Camera], masks: Sequence[tuple[Camera, Any]], points: Any) -> Extent:
+    """The ball around the object: from the visual hull when at least half of the photos have masks, else from what the cameras look at."""
+    from gsbake.capture.normalise import extent_from_masks, extent_from_view
+
+    masked = [(camera, mask) for camera, mask in masks if mask is not None]
     if len(masked) >= max(3, 0.5 * len(cameras)):
         extent = extent_from_masks([c for c, _ in masked], [m for _, m in masked])
         if extent is not None:
