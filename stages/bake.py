@@ -385,7 +385,7 @@ def _save_mesh(ctx: Context, surface: Surface) -> None:
 
 STAGE = Stage(
     name="bake",
-    version=4,
+    version=5,
     title="Textures",
     run=run,
     needs=("poses", "refine", "mesh"),

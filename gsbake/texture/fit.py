@@ -3,15 +3,18 @@
 With the mesh, its atlas and the cameras fixed, each step shades the pixels of one photo (split sum, METHOD §6) with the texels' occlusion
 and takes an Adam step on texels and light:
 
-    Σ w |sRGB(shade) − photo| + tv · |∇ texture| + dark · mean base colour + metal · mean metallic + white · colourfulness of the light
+    Σ w ρ(sRGB(shade) − photo) + tv · |∇ texture| + dark · mean base colour + metal · mean metallic + white · colourfulness of the light
 
-The first term is robust (L1), so a misplaced reflection moves little. The others settle what photos under one light leave open:
+The first term is robust (pseudo-Huber: squares of small errors, large ones by themselves), so a misplaced reflection moves little; with
+plain |error| reflections a little off are passed over and the light ends too dim. The others settle what photos under one light leave open:
 neighbouring texels are alike; what a reflection explains is not paint (a small price on base colour, which also fixes the light's
 brightness); most things are not metal; most light is white.
 
 How rough the object is at the start decides which light is found: a surface taken for rough cannot show where the light comes from and its
 reflections end as paint; one taken for smooth blurs the light instead. So short trials from a few values compete on photos they were not
 fitted to, and the best goes on; from there every texel finds its own.
+
+How bright and how even the light is hardly shows in gradients, as paint makes up for either: twice it is searched for (`level`).
 
 Metals are looked for when the light is known well enough, and again when they have sharpened it (`metal`); those found are set, and the
 steps that follow may take it back.
@@ -35,17 +38,17 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from gsbake.light.colour import colourfulness, linear_to_srgb
+from gsbake.light.cubemap import solid_angles
 from gsbake.light.environment import EnvironmentLight
-from gsbake.light.shade import shade
-from gsbake.light.tables import LightTables
-from gsbake.texture.colour import decode
+from gsbake.texture.batch import BOUNCED, GLOW, Batch
 from gsbake.texture.emission import find_glow
+from gsbake.texture.level import find_level, graded
 from gsbake.texture.metal import Evidence, find_metals
 from gsbake.texture.pixels import Pixels
 from gsbake.texture.texels import Texels
@@ -67,14 +70,18 @@ BETAS, STILL = (0.9, 0.99), 2e-3
 BASE_RANGE = (0.01, 0.95)
 #: Shares of the steps after which metals are looked for, and the metallic that those found go on from.
 METALS_AT, METAL = (0.3, 0.55), 0.8
+#: Texels within about twice this many decide together whether they are metal.
+TOGETHER = 2.0
+#: Shares of the steps after which the light's level is searched for, with this many pixels of texels whose metallic is below this.
+LEVEL_AT, LEVEL_PIXELS, PAINT = (0.5, 0.75), 100_000, 0.3
 #: Share of the steps after which glowing regions are looked for: the light must be known.
 GLOW_AT = 0.5
 #: How much of the smoothness price base colour (three channels), roughness and metallic pay: print changes the colour alone.
 ALIKE = (1.0, 1.0, 1.0, 6.0, 4.0)
 #: Shadows and bounced light are renewed every so many steps.
 RENEWED = 25
-#: Columns of what is around a texel after its openness to this light and to an even one: irradiance / π from other texels, own light.
-BOUNCED, GLOW = slice(2, 5), slice(5, 8)
+#: Errors of sRGB values count by their square up to about the first, beyond by themselves; times the second.
+ROBUST, STEEP = 0.1, 1.5
 #: Share of the neighbouring pairs of texels that one step compares.
 COMPARED = 0.25
 
@@ -133,6 +140,7 @@ class MaterialFit:
         self._even = EVEN * (texels.size / 512) ** 2  # a slope per texel is steeper where texels are larger
         open_share = torch.as_tensor(np.ascontiguousarray(occlusion, np.float32))[:, None]
         self._around = torch.cat([open_share, open_share, torch.zeros(n, 6)], 1)
+        self._texels = texels
         self._place = np.column_stack([texels.index % texels.size, texels.index // texels.size]).astype(np.float64)
         self._visibility, self._bounce = visibility, bounce
         self._light = EnvironmentLight(light_size)
@@ -152,18 +160,22 @@ class MaterialFit:
         each: Callable[[int, int], None] | None = None,
         metals: bool = True,
         glow: bool = True,
+        level: bool = True,
     ) -> Fitted:
         """Fit to `photos` in `steps` steps of one photo each, in an order drawn from `seed`; `held` only tell how good it got.
 
-        Without `metals` none are looked for: in trials, and on things that do not shine. Without `glow` nothing glows.
+        Without `metals` none are looked for: in trials, and on things that do not shine. Without `glow` nothing glows, without `level` the
+        light's brightness is left to the steps.
         """
         generator = torch.Generator().manual_seed(seed)
-        batches = [_Batch.of(p, self._normal) for p in photos if len(p)]
+        batches = [Batch.of(p, self._normal) for p in photos if len(p)]
         order: list[int] = []
         found = glowing = 0
         for step in range(steps if batches else 0):
             if glow and step == int(GLOW_AT * steps):
                 glowing = self._set_glow(batches)
+            if level and step in {int(share * steps) for share in LEVEL_AT}:
+                self._set_level(batches, generator)
             if metals and step in {int(share * steps) for share in METALS_AT}:
                 found = self._set_metals(batches)
             if step % RENEWED == 0:
@@ -181,11 +193,12 @@ class MaterialFit:
         bend = self._bend.detach().numpy()
         return Fitted(values, bend, weight.numpy(), self._around[:, GLOW].numpy(), self._light, self.psnr(held), found, glowing)
 
-    def _step(self, batch: _Batch, decay: float, generator: torch.Generator) -> None:
+    def _step(self, batch: Batch, decay: float, generator: torch.Generator) -> None:
         values = torch.sigmoid(self._logits)
         shaded = batch.shade(values, self._bend, self._light.prefilter(), self._around)
         # Clamped, a reflection brighter than white has no gradient: where the photo shows none, it is misplaced rather than too bright.
-        error = (linear_to_srgb(shaded.clamp(0, 1)) - batch.colour).abs().mean(1)
+        error = linear_to_srgb(shaded.clamp(0, 1)) - batch.colour
+        error = STEEP * ((error.square() + ROBUST**2).sqrt() - ROBUST).mean(1)
         priors = self._priors
         loss = (error * batch.weight).mean()
         loss = loss + priors.dark * values[:, :3].mean() + priors.metal * values[:, 4].mean()
@@ -221,17 +234,54 @@ class MaterialFit:
             self._around[:, BOUNCED] = torch.as_tensor(self._visibility.bounced(irradiance.numpy(), reflectance.numpy()))
 
     @torch.no_grad()
-    def _set_metals(self, batches: list[_Batch]) -> int:
+    def _set_level(self, batches: list[Batch], generator: torch.Generator) -> None:
+        """Let the light go on as bright and as even as explains most, and paint as what reflects the same of it."""
+        values = torch.sigmoid(self._logits)
+        paint = (values[:, 4] < PAINT) & (self._around[:, GLOW].sum(1) == 0)
+        share = min(1.0, LEVEL_PIXELS / max(1, sum(len(b.weight) for b in batches)))
+        asked = paint & (torch.rand(len(paint), generator=generator) < share)
+        few = [part for b in batches if len((part := b.showing(asked)).weight)]
+        radiance, area = self._light.radiance().numpy(), solid_angles(self._light.size)
+
+        def under(brightness: NDArray[np.float64], contrast: float) -> list[Evidence]:
+            light = EnvironmentLight.from_radiance(graded(radiance, brightness, contrast, area))
+            around = self._around.clone()
+            if self._visibility is not None:
+                around[:, 0] = torch.as_tensor(self._visibility.openness(light.radiance().numpy()))
+            tables = light.prefilter()
+            return [b.evidence(self._bend, tables, around) for b in few]
+
+        found = find_level(under, values[:, 3].numpy())
+        pass
+        if found.gain <= 0:
+            return
+        before = self._light.prefilter().diffuse(self._normal) * self._around[:, :1]
+        self._light.raw.copy_(EnvironmentLight.from_radiance(graded(radiance, found.brightness, found.contrast, area)).raw)
+        self._adam_light.state.clear()
+        self._renew()
+        after = self._light.prefilter().diffuse(self._normal) * self._around[:, :1]
+        at = torch.nonzero(paint)[:, 0]
+        start = values[at].numpy()
+        start[:, :3] = np.clip(start[:, :3] * (before[at] / after[at].clamp_min(1e-6)).numpy(), *BASE_RANGE)
+        self._restart(at.numpy(), start)
+
+    @torch.no_grad()
+    def _set_metals(self, batches: list[Batch]) -> int:
         """Start texels that metal explains better anew, as that metal; how many they are."""
         tables = self._light.prefilter()
         own = torch.sigmoid(self._logits[:, 3]).numpy()
-        found = find_metals([batch.evidence(self._bend, tables, self._around) for batch in batches], own)
+        found = find_metals([b.evidence(self._bend, tables, self._around) for b in batches], own, self._blurred)
         start = np.column_stack([np.clip(found.base, *BASE_RANGE), found.roughness, np.full(len(found.texel), METAL)])
         self._restart(found.texel, start)
         return len(found.texel)
 
+    def _blurred(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """`values` (texels,) averaged over some texels around each, those outside the charts as 0."""
+        image = cv2.GaussianBlur(self._texels.image(values), (0, 0), TOGETHER)
+        return np.asarray(image.ravel()[self._texels.index], np.float64)
+
     @torch.no_grad()
-    def _set_glow(self, batches: list[_Batch]) -> int:
+    def _set_glow(self, batches: list[Batch]) -> int:
         """Give the regions that glow their light and start their paint anew from black; how many regions they are."""
         tables = self._light.prefilter()
         values = torch.sigmoid(self._logits).numpy()
@@ -253,7 +303,7 @@ class MaterialFit:
     @torch.no_grad()
     def psnr(self, photos: list[Pixels], values: Floats | None = None) -> float | None:
         """PSNR in dB over all pixels of `photos` (None without any) of the texels as they are, or with `values` (n, 5) instead."""
-        batches = [_Batch.of(p, self._normal) for p in photos if len(p)]
+        batches = [Batch.of(p, self._normal) for p in photos if len(p)]
         if not batches:
             return None
         shown, tables = torch.sigmoid(self._logits) if values is None else torch.as_tensor(values), self._light.prefilter()
@@ -275,7 +325,7 @@ def trial_roughness(
     judges, rest = few[::TRIAL_PHOTO], [p for i, p in enumerate(few) if i % TRIAL_PHOTO]
     found: dict[float, float] = {}
     for turn, roughness in enumerate(TRIALS):
-        score = make(roughness).run(rest, judges, TRIAL_STEPS, seed, metals=False, glow=False).held_out
+        score = make(roughness).run(rest, judges, TRIAL_STEPS, seed, metals=False, glow=False, level=False).held_out
         if score is not None:
             found[roughness] = score
         if each is not None:
@@ -289,58 +339,6 @@ def trial_cost(photos: list[Pixels], step: float) -> float:
         return 0.0
     pixels = sum(len(p) for p in photos) / len(photos)
     return len(TRIALS) * TRIAL_STEPS * step * min(1.0, TRIAL_PIXELS / max(1.0, pixels))
-
-
-@dataclass(frozen=True)
-class _Batch:
-    """One photo's pixels as tensors, with what does not change: their normals."""
-
-    texel: Tensor
-    share: Tensor
-    towards: Tensor
-    colour: Tensor
-    weight: Tensor
-    normal: Tensor
-
-    @classmethod
-    def of(cls, pixels: Pixels, normal: Tensor) -> _Batch:
-        texel, share = torch.as_tensor(pixels.texel), torch.as_tensor(pixels.share)
-        towards, colour, weight = (torch.as_tensor(x) for x in (pixels.towards, pixels.colour, pixels.weight))
-        return cls(texel, share, towards, colour, weight, _read(normal, texel, share))
-
-    def shade(self, values: Tensor, bend: Tensor, tables: LightTables, around: Tensor) -> Tensor:
-        """Linear colours (n, 3) of the pixels when the texels have `values` (texels, 5) and their surroundings are `around` (texels, 8)."""
-        g = _read(values, self.texel, self.share)
-        near = _read(around, self.texel, self.share)
-        return _lit(self._turned(bend), self.towards, g[:, :3], g[:, 3], g[:, 4], tables, near)
-
-    def evidence(self, bend: Tensor, tables: LightTables, around: Tensor) -> Evidence:
-        """The pixels for `find_metals`; each counts for the texel that has most of it."""
-        normal, near = self._turned(bend), _read(around, self.texel, self.share)
-        texel = self.texel.gather(1, self.share.argmax(1, keepdim=True))[:, 0]
-
-        def shaded(base: float, roughness: Floats, metallic: float) -> Floats:
-            n = len(texel)
-            constant = (torch.full((n, 3), base), torch.as_tensor(roughness)[texel], torch.full((n,), metallic))
-            return np.asarray(_lit(normal, self.towards, *constant, tables, near).numpy())
-
-        return Evidence(texel.numpy(), decode(self.colour.numpy()), self.weight.numpy(), shaded)
-
-    def _turned(self, bend: Tensor) -> Tensor:
-        """Normals (n, 3) of the pixels, of any length, when those of the texels have the `bend` (texels, 3)."""
-        return self.normal + _read(bend, self.texel, self.share)
-
-
-def _lit(normal: Tensor, towards: Tensor, albedo: Tensor, roughness: Tensor, metallic: Tensor, tables: LightTables, near: Tensor) -> Tensor:
-    """`shade` with the surroundings `near` (n, 8), see `BOUNCED` and `GLOW`."""
-    direct = shade(normal, towards, albedo, roughness, metallic, tables, near[:, 1], near[:, 0])
-    return direct + (1 - metallic)[:, None] * albedo * near[:, BOUNCED] + near[:, GLOW]
-
-
-def _read(values: Tensor, texel: Tensor, share: Tensor) -> Tensor:
-    """`values` (texels, c) read bilinearly at the four texels and shares (n, 4) of each pixel: (n, c)."""
-    first, *others = (values[texel[:, k]] * share[:, k, None] for k in range(4))
-    return sum(others, first)
 
 
 def _neighbours(texels: Texels) -> NDArray[np.int64]:

@@ -7,8 +7,9 @@ it gains a reflection. Seen through one light, though, either answer is linear i
 
 (METHOD §6), so for each of a few roughnesses the best b and what it leaves unexplained are sums over the texel's pixels. Errors are
 weighed by the slope of the sRGB curve at the photo's own colour: those of the eye, not of the lamp. A metal must reflect clearly more of
-every colour than the .04 of paint, or black gloss passes for a dark metal. Clean metals reflect a third or more (gold's blue is .34:
-Lagarde & de Rousiers, *Moving Frostbite to PBR*, 2014), but rusty, anodised and dirty ones, and many that artists painted, go down to .1.
+every colour than the .04 of paint, or black gloss passes for a dark metal. A texel has seen too few pixels to tell by itself: neighbours
+decide together, each with its own colour. Clean metals reflect a third or more (gold's blue is .34: Lagarde & de Rousiers, *Moving
+Frostbite to PBR*, 2014), but rusty, anodised and dirty ones, and many that artists painted, go down to .1.
 """
 
 from __future__ import annotations
@@ -27,11 +28,12 @@ ROUGHNESS = (0.1, 0.2, 0.35, 0.55)
 #: Least base colour of a metal, and of a clean one (its mean).
 DARKEST_METAL, CLEAN_METAL = 0.1, 0.3
 #: What the metal leaves unexplained must be below this share of what the paint leaves: for dark metals, which are rarer, and clean ones.
-CLEARLY = (0.7, 0.8)
+CLEARLY = (0.9, 1.0)
 #: Darkest linear colour that the slope of the sRGB curve is taken at.
 DIM = 0.02
-#: Texels with less weight of pixels than this are left alone.
-LEAST_WEIGHT = 0.3
+#: Texels with less weight of pixels than this are left alone, and those that fewer photos saw, or this share of what is around them: seen
+#: from few sides, paint under a light that is not quite right yet passes for metal.
+LEAST_WEIGHT, LEAST_PHOTOS, NEARBY = 0.3, 6, 0.05
 
 #: Shades pixels of one photo: (base colour 0 or 1, roughness (texels,), metallic 0 or 1) to linear colours (n, 3).
 Shader = Callable[[float, NDArray[np.float32], float], NDArray[np.float32]]
@@ -39,11 +41,13 @@ Shader = Callable[[float, NDArray[np.float32], float], NDArray[np.float32]]
 
 @dataclass(frozen=True)
 class Evidence:
-    """n pixels of one photo: the `texel` (n,) each shows, its linear `colour` (n, 3), `weight` (n,), and how to `shade` them."""
+    """n pixels of one photo: the `texel` (n,) each shows, its linear `colour` (n, 3), `weight` (n,), the `block` (n,) of
+    the photo it lies in, and how to `shade` them."""
 
     texel: NDArray[np.int64]
     colour: NDArray[np.float32]
     weight: NDArray[np.float32]
+    block: NDArray[np.int32]
     shade: Shader
 
 
@@ -88,8 +92,11 @@ class _Sums:
         return b, (self.squares - 2 * b * self.mixed + b * b * self.slopes).sum(1)
 
 
-def find_metals(photos: Sequence[Evidence], own: NDArray[np.float32], each: Callable[[], None] | None = None) -> Metals:
-    """The texels that are better explained as metal; `own` (texels,) is their present roughness, `each` is called now and then."""
+def find_metals(photos: Sequence[Evidence], own: NDArray[np.float32], around: Callable[[Floats], Floats] = lambda left: left) -> Metals:
+    """The texels that are better explained as metal; `own` (texels,) is their present roughness.
+
+    `around` sums what is left unexplained (texels,) over the neighbourhood that decides together: a texel by itself has seen too little.
+    """
     texels = len(own)
     weights = [by_eye(e) for e in photos]
     paint = np.full(texels, np.inf)
@@ -100,8 +107,6 @@ def find_metals(photos: Sequence[Evidence], own: NDArray[np.float32], each: Call
             for evidence, weight in zip(photos, weights, strict=True):
                 offset = evidence.shade(0.0, tried, metallic)
                 sums.add(evidence, weight, offset, evidence.shade(1.0, tried, metallic) - offset)
-            if each is not None:
-                each()
             if not metallic:
                 paint = np.minimum(paint, sums.best(0.0)[1])
                 continue
@@ -109,5 +114,7 @@ def find_metals(photos: Sequence[Evidence], own: NDArray[np.float32], each: Call
             better = left < metal
             metal[better], base[better], roughness[better] = left[better], b[better], tried[better]
     share = np.where(base.mean(1) < CLEAN_METAL, *CLEARLY)
-    chosen = np.flatnonzero((metal < share * paint) & (seen(photos, texels) > LEAST_WEIGHT))
+    sides = sum((around((np.bincount(e.texel, e.weight, texels) > 0).astype(np.float64)) > NEARBY for e in photos), np.zeros(texels, int))
+    known = (seen(photos, texels) > LEAST_WEIGHT) & (sides >= LEAST_PHOTOS)
+    chosen = np.flatnonzero(known & (around(metal) < share * around(paint)))
     return Metals(chosen, base[chosen], roughness[chosen])

@@ -28,6 +28,8 @@ GRAZING = (0.15, 0.4)
 BORDER = (1.5, 4.0)
 #: A depth step larger than this share of the object's diagonal is an edge; pixels within this many pixels of one count less.
 EDGE_STEP, EDGE_PIXELS = 0.015, 3.0
+#: About so many blocks side by side show the object in a photo.
+BLOCKS = 12
 
 
 @dataclass(frozen=True)
@@ -35,7 +37,7 @@ class Pixels:
     """n pixels of one photo.
 
     `texel` (n, 4) int64 indices into the texels and `share` (n, 4) their bilinear weights; `towards` (n, 3) unit vectors from the surface
-    to the camera; `colour` (n, 3) sRGB 0..1; `weight` (n,) 0..1.
+    to the camera; `colour` (n, 3) sRGB 0..1; `weight` (n,) 0..1; `block` (n,) which square block of the photo each lies in.
     """
 
     texel: NDArray[np.int64]
@@ -43,6 +45,7 @@ class Pixels:
     towards: Floats
     colour: Floats
     weight: Floats
+    block: NDArray[np.int32]
 
     def __len__(self) -> int:
         return len(self.weight)
@@ -50,7 +53,9 @@ class Pixels:
     def thinned(self, most: int) -> Pixels:
         """Every second, third … pixel, so that at most `most` are left."""
         step = max(1, -(-len(self) // most))
-        return Pixels(self.texel[::step], self.share[::step], self.towards[::step], self.colour[::step], self.weight[::step])
+        return Pixels(
+            self.texel[::step], self.share[::step], self.towards[::step], self.colour[::step], self.weight[::step], self.block[::step]
+        )
 
     def without_gain(self, gain: NDArray[Any]) -> Pixels:
         """The same pixels with a photo's `gain` (3,) of linear colour divided out."""
@@ -93,7 +98,9 @@ class PixelReader:
         at = pixel[chosen]
         weight = _ramp(inside.ravel()[at], *BORDER) * _ramp(cosine[chosen], *GRAZING) * beside[at]
         colour = rgb.reshape(-1, 3)[at].astype(np.float32) / 255
-        return Pixels(texel, share, towards[chosen].astype(np.float32), colour, weight.astype(np.float32))
+        side = max(1, int(np.sqrt(len(at)) / BLOCKS))
+        block = at // width // side * (width // side + 1) + at % width // side
+        return Pixels(texel, share, towards[chosen].astype(np.float32), colour, weight.astype(np.float32), block.astype(np.int32))
 
     def _taps(self, uv: NDArray[np.float64]) -> tuple[NDArray[np.int64], Floats]:
         """The four texels around each texture coordinate (n, 2) and their weights; texels off the charts take no part."""

@@ -50,7 +50,8 @@ def asked(base: NDArray[np.float32], glow: NDArray[np.float32], curve: float = 0
             return shaded(np.full((len(rough), 3), value, np.float32), rough, metallic, meshed)  # type: ignore[no-any-return]
 
         colour = shaded(base, own, 0.0, normal) + glow + rng.normal(scale=0.005, size=base.shape).astype(np.float32)
-        photos.append(Evidence(np.arange(len(base)), np.clip(colour, 0, 1).astype(np.float32), np.ones(len(base), np.float32), trial))
+        seen = np.clip(colour, 0, 1).astype(np.float32)
+        photos.append(Evidence(np.arange(len(base)), seen, np.ones(len(base), np.float32), np.zeros(len(base), np.int32), trial))
     return find_glow(photos, own, pairs(), PLACE)
 
 

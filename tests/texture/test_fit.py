@@ -77,7 +77,7 @@ class Scene:
             with torch.no_grad():
                 n_, paint_ = torch.as_tensor(normal, dtype=torch.float32), torch.as_tensor(paint, dtype=torch.float32)
                 linear = shade(n_, torch.as_tensor(blank.towards), paint_, torch.full((n,), roughness), torch.zeros(n), tables).numpy()
-            self.photos.append(Pixels(blank.texel, blank.share, blank.towards, encode(linear), blank.weight))
+            self.photos.append(replace(blank, colour=encode(linear)))
 
     def fit(self, roughness: float, priors: Priors = FREE) -> MaterialFit:
         n = len(self.texels)
@@ -174,7 +174,7 @@ def test_pixels_read_the_texture_where_the_ray_meets_it() -> None:
 
 def test_gain_is_divided_out_of_linear_colour() -> None:
     pixels = Pixels(np.zeros((1, 4), np.int64), np.full((1, 4), 0.25, np.float32), np.ones((1, 3), np.float32),
-                    encode(np.array([[0.4, 0.2, 0.1]])), np.ones(1, np.float32))  # fmt: skip
+                    encode(np.array([[0.4, 0.2, 0.1]])), np.ones(1, np.float32), np.zeros(1, np.int32))  # fmt: skip
     assert decode(pixels.without_gain(np.array([2.0, 1.0, 0.5])).colour) == pytest.approx(np.array([[0.2, 0.2, 0.2]]), abs=1e-5)
 
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from gsbake.light.environment import EnvironmentLight
 from gsbake.light.shade import shade
-from gsbake.texture.metal import DARKEST_METAL, Evidence, find_metals
+from gsbake.texture.metal import DARKEST_METAL, LEAST_PHOTOS, Evidence, find_metals
 
 TEXELS, PHOTOS = 60, 24
 
@@ -54,7 +54,7 @@ class Wall:
                 return self.colours(towards, np.full((TEXELS, 3), value, np.float32), rough, metal)
 
             colour = self.colours(towards, base, np.full(TEXELS, roughness, np.float32), metallic)
-            found.append(Evidence(np.arange(TEXELS), colour, np.ones(TEXELS, np.float32), shaded))
+            found.append(Evidence(np.arange(TEXELS), colour, np.ones(TEXELS, np.float32), np.zeros(TEXELS, np.int32), shaded))
         return found
 
 
@@ -91,3 +91,25 @@ def test_texels_hardly_seen_are_left_alone(wall: Wall) -> None:
     dim = [replace(e, weight=weight) for e in wall.photos(gold, 0.2, 1.0)]
     found = find_metals(dim, np.full(TEXELS, 0.2, np.float32))
     assert found.texel.min() == 5
+
+
+def test_what_few_photos_saw_is_left_alone(wall: Wall) -> None:
+    gold = np.tile(np.array([1.0, 0.77, 0.34], np.float32), (TEXELS, 1))
+    photos = wall.photos(gold, 0.2, 1.0)
+    own = np.full(TEXELS, 0.2, np.float32)
+    assert len(find_metals(photos[: LEAST_PHOTOS - 1], own).texel) == 0
+    assert len(find_metals(photos[:LEAST_PHOTOS], own).texel) == TEXELS
+
+
+def test_neighbours_decide_together(wall: Wall) -> None:
+    """One texel of metal among paint is outvoted, and one of paint among metal: the metal's own colour is kept."""
+    gold = np.tile(np.array([1.0, 0.77, 0.34], np.float32), (TEXELS, 1))
+    own = np.full(TEXELS, 0.2, np.float32)
+    metal, paint = wall.photos(gold, 0.2, 1.0), wall.photos(gold, 0.2, 0.0)
+
+    def all_alike(left: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.full(TEXELS, left.sum())
+
+    for few, many, found in ((metal, paint, 0), (paint, metal, TEXELS)):
+        mixed = [replace(m, colour=np.where(np.arange(TEXELS)[:, None] == 7, f.colour, m.colour)) for f, m in zip(few, many, strict=True)]
+        assert len(find_metals(mixed, own, all_alike).texel) == found

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -202,7 +204,7 @@ class Tray:
         n = len(blank)
         gloss = shade(torch.as_tensor(normal).float(), torch.as_tensor(blank.towards), torch.zeros(n, 3), torch.full((n,), 0.5),
                       torch.zeros(n), tables)  # type: ignore[arg-type]  # fmt: skip
-        return Pixels(blank.texel, blank.share, blank.towards, encode(colour + gloss.detach().numpy()), blank.weight)
+        return replace(blank, colour=encode(colour + gloss.detach().numpy()))
 
     def error(self, visibility: Visibility | None, bounce: bool) -> float:
         """Mean error of the fitted paint (sRGB) inside the box, brightness aside."""

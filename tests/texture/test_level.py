@@ -1,0 +1,123 @@
+"""The brightness, tint and contrast of a light found from what gloss reflects of it, with the paint unknown."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+
+from gsbake.light.cubemap import solid_angles
+from gsbake.light.environment import EnvironmentLight
+from gsbake.light.shade import shade
+from gsbake.texture.level import BRIGHTER, TINT, Level, find_level, graded
+from gsbake.texture.metal import Evidence
+
+Doubles = NDArray[np.float64]
+TEXELS, PHOTOS, SIZE = 400, 16, 16
+AREA = solid_angles(SIZE)
+
+
+def room(directions: Doubles) -> Doubles:
+    """A dim room with a window and a lamp."""
+    window = np.exp(8 * (directions @ np.array([0.8, 0.0, 0.6]) - 1))
+    lamp = np.exp(40 * (directions @ np.array([-0.6, 0.64, 0.48]) - 1))
+    return (0.15 + 3 * window + 6 * lamp)[:, None] * np.array([1.0, 0.9, 0.8])
+
+
+TRUE = EnvironmentLight.from_function(room, SIZE).radiance().detach().numpy()
+
+
+class Plastic:
+    """Texels of many paints and one gloss, seen from many sides; `off` degrees by which the normals that explain them are wrong."""
+
+    def __init__(self, off: float = 0.0, single: bool = False) -> None:
+        rng = np.random.default_rng(5)
+        self.normal = rng.normal(size=(TEXELS, 3))
+        self.normal /= np.linalg.norm(self.normal, axis=1, keepdims=True)
+        self.meshed = self.normal + np.radians(off) * rng.normal(size=(TEXELS, 3))
+        self.paint = rng.uniform(0.05, 0.6, (TEXELS, 3)).astype(np.float32)
+        self.roughness = np.full(TEXELS, 0.2, np.float32)
+        self.sides = []
+        for _ in range(PHOTOS):
+            side = rng.normal(size=3)
+            self.sides.append(side / np.linalg.norm(side))
+        self.single = single
+
+    def colours(self, normal: Doubles, side: Doubles, base: NDArray[np.float32], light: NDArray[np.float32]) -> NDArray[np.float32]:
+        tables = EnvironmentLight.from_radiance(light).prefilter()
+        n, v = (torch.as_tensor(x, dtype=torch.float32) for x in (normal, np.tile(side, (len(normal), 1))))
+        with torch.no_grad():
+            gloss = torch.full((len(normal),), 0.2)
+            return np.asarray(shade(n, v, torch.as_tensor(base), gloss, torch.zeros(len(normal)), tables).numpy())
+
+    def evidence(self, believed: NDArray[np.float32]) -> Callable[[Doubles, float], Sequence[Evidence]]:
+        """What `find_level` asks for when the light is `believed`."""
+        photos = []
+        for side in self.sides:
+            seen = np.flatnonzero(self.normal @ side > 0.2)
+            photos.append((side, seen, self.colours(self.normal[seen], side, self.paint[seen], TRUE)))
+
+        def under(brightness: Doubles, contrast: float) -> list[Evidence]:
+            light = graded(believed, brightness, contrast, AREA)
+            found = []
+            for side, seen, colour in photos:
+
+                def trial(value: float, rough: object, metallic: float, side=side, normal=self.meshed[seen]) -> NDArray[np.float32]:  # type: ignore[no-untyped-def]
+                    return self.colours(normal, side, np.full((len(normal), 3), value, np.float32), light)
+
+                # Blocks of pixels show texels that lie side by side, here those with normals alike.
+                order = np.argsort(np.argsort(self.normal[seen] @ np.array([0.3, 0.5, 0.8])))
+                block = order if self.single else order // 25
+                found.append(Evidence(seen, np.clip(colour, 0, 1), np.ones(len(seen), np.float32), block.astype(np.int32), trial))
+            return found
+
+        return under
+
+    def level(self, believed: NDArray[np.float32]) -> Level:
+        return find_level(self.evidence(believed), self.roughness)
+
+
+def mean(light: NDArray[np.float32]) -> Doubles:
+    return np.asarray((light * AREA[..., None]).sum((0, 1, 2)) / AREA.sum(), np.float64)
+
+
+def test_graded_light_has_the_brightness_and_the_contrast_asked_for() -> None:
+    assert np.allclose(graded(TRUE, np.ones(3), 1.0, AREA), TRUE, rtol=1e-5)
+    other = graded(TRUE, np.array([1.0, 2.0, 0.5]), 1.5, AREA)
+    assert mean(other) == pytest.approx(mean(TRUE) * [1.0, 2.0, 0.5], rel=1e-4)
+    ratio = np.log(other[0, 3, 4] / other[2, 8, 8]) / np.log(TRUE[0, 3, 4] / TRUE[2, 8, 8])
+    assert ratio == pytest.approx(1.5, rel=1e-4)
+
+
+def test_the_right_light_stays() -> None:
+    found = Plastic().level(TRUE)
+    assert np.allclose(found.brightness, 1) and found.contrast == 1 and found.gain == 0
+
+
+@pytest.mark.parametrize("factor", [1.7, 0.6])
+def test_a_light_too_bright_or_too_dim_comes_back(factor: float) -> None:
+    found = Plastic().level(graded(TRUE, np.full(3, factor), 1.0, AREA))
+    assert found.brightness * factor == pytest.approx(np.ones(3), rel=BRIGHTER - 1)
+    assert found.gain > 0.3
+
+
+def test_an_even_glow_that_paint_made_up_for_goes() -> None:
+    believed = np.asarray(TRUE + 0.4, np.float32)
+    found = Plastic().level(believed)
+    assert found.contrast > 1.3
+    level = graded(believed, found.brightness, found.contrast, AREA)
+    assert np.abs(np.log(mean(level) / mean(TRUE))).max() < 0.6 * np.abs(np.log(mean(believed) / mean(TRUE))).max()
+
+
+def test_one_colour_alone_is_found_out() -> None:
+    found = Plastic().level(graded(TRUE, np.array([1.0, 1.0, TINT]), 1.0, AREA))
+    assert found.brightness == pytest.approx(np.array([1, 1, 1 / TINT]))
+
+
+def test_reflections_a_little_off_do_not_ask_for_a_darker_light() -> None:
+    together, alone = Plastic(off=6), Plastic(off=6, single=True)
+    assert together.level(TRUE).brightness.mean() > 0.9
+    assert alone.level(TRUE).brightness.mean() < 0.9
