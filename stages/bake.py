@@ -319,6 +319,7 @@ def _fit_materials(
     leave_out(
         ctx, "view_dependence", diffuse, why, "reflections taken for broad, none tried", "reflections looked for", trial_cost(photos, spent)
     )
+    ctx.decide("level of the light", ", then ".join(map(str, fitted.levels)), "under which paint explains the photos best")
     ctx.decide("light of its own", f"{fitted.glowing} regions", "bright, ending at an edge, and the same whatever light falls on them")
     fitted.light.save(ctx.out / "light.safetensors")
     fine = coarse.detail(shown.values)

@@ -48,7 +48,7 @@ from gsbake.light.cubemap import solid_angles
 from gsbake.light.environment import EnvironmentLight
 from gsbake.texture.batch import BOUNCED, GLOW, Batch
 from gsbake.texture.emission import find_glow
-from gsbake.texture.level import find_level, graded
+from gsbake.texture.level import Level, find_level, graded
 from gsbake.texture.metal import Evidence, find_metals
 from gsbake.texture.pixels import Pixels
 from gsbake.texture.texels import Texels
@@ -100,7 +100,8 @@ class Priors:
 class Fitted:
     """`values` (n, 5): linear base colour, roughness, metallic of each texel; `bend` (n, 3) to be added to its unit normal; `weight` (n,):
     what all photos together say about it (in pixels); `glow` (n, 3): its own radiance; the `light` in the mesh's frame; PSNR in dB over the
-    pixels of held-out photos (None without any); texels last set to metal, regions that glow."""
+    pixels of held-out photos (None without any); texels last set to metal, regions that glow, and what the searches for the light's
+    level found."""
 
     values: Floats
     bend: Floats
@@ -110,6 +111,7 @@ class Fitted:
     held_out: float | None
     metals: int
     glowing: int
+    levels: tuple[Level, ...]
 
 
 class MaterialFit:
@@ -171,11 +173,12 @@ class MaterialFit:
         batches = [Batch.of(p, self._normal) for p in photos if len(p)]
         order: list[int] = []
         found = glowing = 0
+        levels: list[Level] = []
         for step in range(steps if batches else 0):
             if glow and step == int(GLOW_AT * steps):
                 glowing = self._set_glow(batches)
             if level and step in {int(share * steps) for share in LEVEL_AT}:
-                self._set_level(batches, generator)
+                levels.append(self._set_level(batches, generator))
             if metals and step in {int(share * steps) for share in METALS_AT}:
                 found = self._set_metals(batches)
             if step % RENEWED == 0:
@@ -190,8 +193,8 @@ class MaterialFit:
                 weight.index_add_(0, batch.texel[:, k], batch.share[:, k] * batch.weight)
         with torch.no_grad():
             values = torch.sigmoid(self._logits).numpy()
-        bend = self._bend.detach().numpy()
-        return Fitted(values, bend, weight.numpy(), self._around[:, GLOW].numpy(), self._light, self.psnr(held), found, glowing)
+        bend, own = self._bend.detach().numpy(), self._around[:, GLOW].numpy()
+        return Fitted(values, bend, weight.numpy(), own, self._light, self.psnr(held), found, glowing, tuple(levels))
 
     def _step(self, batch: Batch, decay: float, generator: torch.Generator) -> None:
         values = torch.sigmoid(self._logits)
@@ -234,13 +237,15 @@ class MaterialFit:
             self._around[:, BOUNCED] = torch.as_tensor(self._visibility.bounced(irradiance.numpy(), reflectance.numpy()))
 
     @torch.no_grad()
-    def _set_level(self, batches: list[Batch], generator: torch.Generator) -> None:
-        """Let the light go on as bright and as even as explains most, and paint as what reflects the same of it."""
+    def _set_level(self, batches: list[Batch], generator: torch.Generator) -> Level:
+        """Let the light go on as bright and as even as explains most, and paint as what reflects the same of it; what was found."""
         values = torch.sigmoid(self._logits)
         paint = (values[:, 4] < PAINT) & (self._around[:, GLOW].sum(1) == 0)
         share = min(1.0, LEVEL_PIXELS / max(1, sum(len(b.weight) for b in batches)))
         asked = paint & (torch.rand(len(paint), generator=generator) < share)
         few = [part for b in batches if len((part := b.showing(asked)).weight)]
+        if not few:
+            return Level(np.ones(3), 1.0, 0.0)
         radiance, area = self._light.radiance().numpy(), solid_angles(self._light.size)
 
         def under(brightness: NDArray[np.float64], contrast: float) -> list[Evidence]:
@@ -252,9 +257,8 @@ class MaterialFit:
             return [b.evidence(self._bend, tables, around) for b in few]
 
         found = find_level(under, values[:, 3].numpy())
-        pass
         if found.gain <= 0:
-            return
+            return found
         before = self._light.prefilter().diffuse(self._normal) * self._around[:, :1]
         self._light.raw.copy_(EnvironmentLight.from_radiance(graded(radiance, found.brightness, found.contrast, area)).raw)
         self._adam_light.state.clear()
@@ -264,6 +268,7 @@ class MaterialFit:
         start = values[at].numpy()
         start[:, :3] = np.clip(start[:, :3] * (before[at] / after[at].clamp_min(1e-6)).numpy(), *BASE_RANGE)
         self._restart(at.numpy(), start)
+        return found
 
     @torch.no_grad()
     def _set_metals(self, batches: list[Batch]) -> int:

@@ -53,6 +53,10 @@ class Level:
     contrast: float
     gain: float
 
+    def __str__(self) -> str:
+        red, green, blue = self.brightness
+        return f"{red:.2f} {green:.2f} {blue:.2f} times as bright at contrast {self.contrast:.2f} ({self.gain:.1%} less unexplained)"
+
 
 def graded(radiance: NDArray[Any], brightness: NDArray[Any], contrast: float, area: NDArray[Any]) -> NDArray[np.float32]:
     """The light `radiance` (6, s, s, 3) with its mean over the sphere, texels weighted by their solid angles `area` (6, s, s), times

@@ -101,6 +101,14 @@ def test_paint_and_roughness_come_back(glossy: Scene) -> None:
     assert fitted.held_out is not None and fitted.held_out > 22
 
 
+def test_an_object_of_metal_alone_keeps_its_light(glossy: Scene) -> None:
+    fit = glossy.fit(0.2)
+    with torch.no_grad():
+        fit._logits[:, 4] = 3.0
+    fitted = fit.run(glossy.photos, [], 4, 0, metals=False, glow=False)
+    assert len(fitted.levels) > 0 and all(level.gain == 0 for level in fitted.levels)
+
+
 def test_a_lamp_on_the_ball_is_told_from_paint(glossy: Scene) -> None:
     lamp = glossy.normal @ np.array([0.5, -0.8, 0.33]) > 0.88
     light = np.array([0.0, 0.5, 0.9], np.float32)

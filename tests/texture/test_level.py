@@ -102,6 +102,7 @@ def test_a_light_too_bright_or_too_dim_comes_back(factor: float) -> None:
     found = Plastic().level(graded(TRUE, np.full(3, factor), 1.0, AREA))
     assert found.brightness * factor == pytest.approx(np.ones(3), rel=BRIGHTER - 1)
     assert found.gain > 0.3
+    assert f"({found.gain:.1%} less unexplained)" in str(found)
 
 
 def test_an_even_glow_that_paint_made_up_for_goes() -> None:
