@@ -68,6 +68,8 @@ FLAT, EVEN = 0.1, 60.0
 BETAS, STILL = (0.9, 0.99), 2e-3
 #: Logits start within this range of base colour.
 BASE_RANGE = (0.01, 0.95)
+#: Darkest base colour that paint goes on from when the light's level has changed.
+DARK_PAINT = 1e-3
 #: Shares of the steps after which metals are looked for, and the metallic that those found go on from.
 METALS_AT, METAL = (0.3, 0.55), 0.8
 #: Texels within about twice this many decide together whether they are metal.
@@ -266,7 +268,7 @@ class MaterialFit:
         after = self._light.prefilter().diffuse(self._normal) * self._around[:, :1]
         at = torch.nonzero(paint)[:, 0]
         start = values[at].numpy()
-        start[:, :3] = np.clip(start[:, :3] * (before[at] / after[at].clamp_min(1e-6)).numpy(), *BASE_RANGE)
+        start[:, :3] = np.clip(start[:, :3] * (before[at] / after[at].clamp_min(1e-6)).numpy(), DARK_PAINT, BASE_RANGE[1])
         self._restart(at.numpy(), start)
         return found
 
