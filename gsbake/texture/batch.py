@@ -43,24 +43,28 @@ class Batch:
         texel, share = torch.as_tensor(pixels.texel), torch.as_tensor(pixels.share)
         towards, colour, weight = (torch.as_tensor(x) for x in (pixels.towards, pixels.colour, pixels.weight))
         block = torch.as_tensor(pixels.block)
-        return cls(texel, share, towards, colour, weight, block, read(normal, texel, share))
+        return cls(texel, share, towards, colour, weight, block, _read(normal, texel, share))
 
     def shade(self, values: Tensor, bend: Tensor, tables: LightTables, around: Tensor) -> Tensor:
         """Linear colours (n, 3) of the pixels when the texels have `values` (texels, 5) and their surroundings are `around` (texels, 8)."""
-        g = read(values, self.texel, self.share)
-        near = read(around, self.texel, self.share)
+        g = _read(values, self.texel, self.share)
+        near = _read(around, self.texel, self.share)
         return _lit(self._turned(bend), self.towards, g[:, :3], g[:, 3], g[:, 4], tables, near)
+
+    @property
+    def foremost(self) -> Tensor:
+        """The texel (n,) that has most of each pixel."""
+        return self.texel.gather(1, self.share.argmax(1, keepdim=True))[:, 0]
 
     def showing(self, asked: Tensor) -> Batch:
         """The pixels most of which is a texel that is `asked` (texels,) for."""
-        keep = asked[self.texel.gather(1, self.share.argmax(1, keepdim=True))[:, 0]]
+        keep = asked[self.foremost]
         parts = (self.texel, self.share, self.towards, self.colour, self.weight, self.block, self.normal)
         return Batch(*(x[keep] for x in parts))
 
     def evidence(self, bend: Tensor, tables: LightTables, around: Tensor) -> Evidence:
-        """The pixels for `find_metals`; each counts for the texel that has most of it."""
-        normal, near = self._turned(bend), read(around, self.texel, self.share)
-        texel = self.texel.gather(1, self.share.argmax(1, keepdim=True))[:, 0]
+        """The pixels for searches over all photos; each counts for the texel that has most of it."""
+        normal, near, texel = self._turned(bend), _read(around, self.texel, self.share), self.foremost
 
         def shaded(base: float, roughness: Floats, metallic: float) -> Floats:
             n = len(texel)
@@ -71,7 +75,7 @@ class Batch:
 
     def _turned(self, bend: Tensor) -> Tensor:
         """Normals (n, 3) of the pixels, of any length, when those of the texels have the `bend` (texels, 3)."""
-        return self.normal + read(bend, self.texel, self.share)
+        return self.normal + _read(bend, self.texel, self.share)
 
 
 def _lit(normal: Tensor, towards: Tensor, albedo: Tensor, roughness: Tensor, metallic: Tensor, tables: LightTables, near: Tensor) -> Tensor:
@@ -80,7 +84,7 @@ def _lit(normal: Tensor, towards: Tensor, albedo: Tensor, roughness: Tensor, met
     return direct + (1 - metallic)[:, None] * albedo * near[:, BOUNCED] + near[:, GLOW]
 
 
-def read(values: Tensor, texel: Tensor, share: Tensor) -> Tensor:
+def _read(values: Tensor, texel: Tensor, share: Tensor) -> Tensor:
     """`values` (texels, c) read bilinearly at the four texels and shares (n, 4) of each pixel: (n, c)."""
     first, *others = (values[texel[:, k]] * share[:, k, None] for k in range(4))
     return sum(others, first)

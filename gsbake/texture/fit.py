@@ -250,8 +250,11 @@ class MaterialFit:
             return Level(np.ones(3), 1.0, 0.0)
         radiance, area = self._light.radiance().numpy(), solid_angles(self._light.size)
 
+        def regraded(brightness: NDArray[np.float64], contrast: float) -> EnvironmentLight:
+            return EnvironmentLight.from_radiance(graded(radiance, brightness, contrast, area))
+
         def under(brightness: NDArray[np.float64], contrast: float) -> list[Evidence]:
-            light = EnvironmentLight.from_radiance(graded(radiance, brightness, contrast, area))
+            light = regraded(brightness, contrast)
             around = self._around.clone()
             if self._visibility is not None:
                 around[:, 0] = torch.as_tensor(self._visibility.openness(light.radiance().numpy()))
@@ -262,7 +265,7 @@ class MaterialFit:
         if found.gain <= 0:
             return found
         before = self._light.prefilter().diffuse(self._normal) * self._around[:, :1]
-        self._light.raw.copy_(EnvironmentLight.from_radiance(graded(radiance, found.brightness, found.contrast, area)).raw)
+        self._light.raw.copy_(regraded(found.brightness, found.contrast).raw)
         self._adam_light.state.clear()
         self._renew()
         after = self._light.prefilter().diffuse(self._normal) * self._around[:, :1]
