@@ -13,14 +13,13 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+    from gsbake.capture.cameras import Camera
     from gsbake.surface.raycast import RayCaster
     from gsbake.texture.normals import Detail
     from gsbake.texture.pixels import Pixels
     from gsbake.texture.project import Blended
     from gsbake.texture.surface import Surface
 
-#: Occlusion is smooth: it is traced on at most this many texels along the edge and enlarged.
-OCCLUSION_SIZE = 1024
 #: Rays for occlusion start this share of the diagonal above the surface; the result is averaged within this many texels.
 OFFSET, REACH = 0.002, 3.0
 #: Held-out photos count this much: they fill only what no other photo saw, so that figures taken on them stay honest.
@@ -158,37 +157,19 @@ def _detail(ctx: Context, surface: Surface) -> tuple[tuple[RayCaster, NDArray[np
 
 def _occlusion(ctx: Context, surface: Surface, dense: tuple[RayCaster, NDArray[np.float64]], detail: Detail) -> NDArray[np.float32]:
     """Open share of the hemisphere per texel (n,), traced on the dense surface where there is one."""
-    import cv2
     import numpy as np
 
-    from gsbake.texture.flood import flood
-    from gsbake.texture.normals import find_detail
-    from gsbake.texture.occlusion import occlusion, smoothed
-    from gsbake.texture.texels import rasterise
+    from gsbake.texture.openness import open_share
 
-    rays, size = ctx.settings.bake.occlusion_rays, surface.texels.size
+    rays = ctx.settings.bake.occlusion_rays
     if rays == 0:
         return np.ones(len(surface.texels), np.float32)
-    texels = surface.texels
-    if size > OCCLUSION_SIZE:
-        texels = rasterise(surface.atlas.uv, surface.atlas.faces, OCCLUSION_SIZE)
-        facing = texels.interpolate(surface.normal, surface.atlas.faces)
-        detail = find_detail(texels.interpolate(surface.position, surface.atlas.faces), facing, *dense, surface.diagonal)
 
     def each(done: int, total: int) -> None:
         ctx.check_stop()
         ctx.progress(done, total, "occlusion")
 
-    value = np.ones(len(texels), np.float32)
-    for mine, caster in ((detail.found, dense[0]), (~detail.found, surface.caster)):
-        if mine.any():
-            value[mine] = occlusion(detail.position[mine], detail.normal[mine], caster, rays, OFFSET * surface.diagonal, each)
-    value = smoothed(texels, value, detail.position, detail.normal, reach=REACH * surface.texel * size / texels.size)
-    if texels is surface.texels:
-        return value
-    image = flood(texels.image(value), texels.covered(), rim=2)[..., 0]
-    large = cv2.resize(image, (size, size), interpolation=cv2.INTER_LINEAR)
-    return np.asarray(large.ravel()[surface.texels.index], np.float32)
+    return open_share(surface, dense, detail, rays, OFFSET * surface.diagonal, REACH, each)
 
 
 def _project_photos(ctx: Context, surface: Surface) -> Blended:
@@ -267,6 +248,7 @@ def _fit_materials(
     from gsbake.texture.fit import TRIALS, MaterialFit, Priors, trial_cost, trial_roughness
     from gsbake.texture.pixels import PixelReader
     from gsbake.texture.plainer import plainer
+    from gsbake.texture.sharpen import sharp_metals
     from gsbake.texture.visibility import Visibility
 
     settings = ctx.settings.bake
@@ -281,12 +263,14 @@ def _fit_materials(
     watch = MeshWatch(surface.at[some], surface.facing[some], surface.caster, surface.diagonal)
     photos: list[Pixels] = []
     held: list[Pixels] = []
+    shot: list[Camera] = []
     for index in range(len(posed)):
         ctx.check_stop()
         view = posed.view(index, settings.fit_size)
         watch.add(view)
         pixels = reader.read(view.camera, view.rgb, view.mask).thinned(MOST_PIXELS)
         (held if index in aside else photos).append(pixels.without_gain(shown.gains[index]))
+        shot += [] if index in aside else [view.camera]
 
     def each(done: int, total: int) -> None:
         ctx.check_stop()
@@ -324,8 +308,12 @@ def _fit_materials(
     fitted.light.save(ctx.out / "light.safetensors")
     fine = coarse.detail(shown.values)
     judges = held if any(map(len, held)) else photos
-    values = coarse.up(plainer(fitted.values, fitted.weight, fitted.metals, partial(fit.psnr, judges), partial(leave_out, ctx)))
+    metals = int(fitted.metal.sum())
+    plain = plainer(fitted.values, fitted.weight, metals, partial(fit.psnr, judges), partial(leave_out, ctx))
+    values = coarse.up(plain)
     values[:, :3] *= fine
+    if metals and plain[:, 4].any():
+        values = sharp_metals(surface, coarse, fit, fitted.metal, plain[:, 3], values, list(zip(photos, shot, strict=True)))
     if fitted.glowing:
         values = np.concatenate([values, coarse.up(fitted.glow) * fine], 1)
     known = coarse.up(fitted.weight[:, None])[:, 0] > LEAST_SEEN * (coarse.edge / footprint) ** 2
@@ -333,7 +321,7 @@ def _fit_materials(
         "fit_psnr": fitted.held_out,
         "fit_pixels": sum(map(len, photos)),
         "fit_texels": len(coarse.texels),
-        "fit_metal_texels": fitted.metals,
+        "fit_metal_texels": metals,
         "fit_glowing_regions": fitted.glowing,
     }
     turned = detail.normal + np.where(known[:, None], coarse.up(fitted.bend), 0)
@@ -386,7 +374,7 @@ def _save_mesh(ctx: Context, surface: Surface) -> None:
 
 STAGE = Stage(
     name="bake",
-    version=5,
+    version=6,
     title="Textures",
     run=run,
     needs=("poses", "refine", "mesh"),

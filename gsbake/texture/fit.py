@@ -38,7 +38,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -46,6 +45,7 @@ from numpy.typing import NDArray
 from gsbake.light.colour import colourfulness, linear_to_srgb
 from gsbake.light.cubemap import solid_angles
 from gsbake.light.environment import EnvironmentLight
+from gsbake.texture.alike import Alike
 from gsbake.texture.batch import BOUNCED, GLOW, Batch
 from gsbake.texture.emission import find_glow
 from gsbake.texture.level import Level, find_level, graded
@@ -70,10 +70,9 @@ BETAS, STILL = (0.9, 0.99), 2e-3
 BASE_RANGE = (0.01, 0.95)
 #: Darkest base colour that paint goes on from when the light's level has changed.
 DARK_PAINT = 1e-3
-#: Shares of the steps after which metals are looked for, and the metallic that those found go on from.
-METALS_AT, METAL = (0.3, 0.55), 0.8
-#: Texels within about twice this many decide together whether they are metal.
-TOGETHER = 2.0
+#: Shares of the steps after which metals are looked for, and the metallic that those found go on from; those that end below `STAYED`
+#: were taken back.
+METALS_AT, METAL, STAYED = (0.3, 0.55, 0.8), 0.8, 0.3
 #: Shares of the steps after which the light's level is searched for, with this many pixels of texels whose metallic is below this.
 LEVEL_AT, LEVEL_PIXELS, PAINT = (0.5, 0.75), 100_000, 0.3
 #: Share of the steps after which glowing regions are looked for: the light must be known.
@@ -102,8 +101,8 @@ class Priors:
 class Fitted:
     """`values` (n, 5): linear base colour, roughness, metallic of each texel; `bend` (n, 3) to be added to its unit normal; `weight` (n,):
     what all photos together say about it (in pixels); `glow` (n, 3): its own radiance; the `light` in the mesh's frame; PSNR in dB over the
-    pixels of held-out photos (None without any); texels last set to metal, regions that glow, and what the searches for the light's
-    level found."""
+    pixels of held-out photos (None without any); `metal` (n,) the texels last found to be metal that stayed it; regions that glow, and what
+    the searches for the light's level found."""
 
     values: Floats
     bend: Floats
@@ -111,7 +110,7 @@ class Fitted:
     glow: Floats
     light: EnvironmentLight
     held_out: float | None
-    metals: int
+    metal: NDArray[np.bool_]
     glowing: int
     levels: tuple[Level, ...]
 
@@ -144,7 +143,7 @@ class MaterialFit:
         self._even = EVEN * (texels.size / 512) ** 2  # a slope per texel is steeper where texels are larger
         open_share = torch.as_tensor(np.ascontiguousarray(occlusion, np.float32))[:, None]
         self._around = torch.cat([open_share, open_share, torch.zeros(n, 6)], 1)
-        self._texels = texels
+        self._like = Alike(texels, base)
         self._place = np.column_stack([texels.index % texels.size, texels.index // texels.size]).astype(np.float64)
         self._visibility, self._bounce = visibility, bounce
         self._light = EnvironmentLight(light_size)
@@ -174,7 +173,7 @@ class MaterialFit:
         generator = torch.Generator().manual_seed(seed)
         batches = [Batch.of(p, self._normal) for p in photos if len(p)]
         order: list[int] = []
-        found = glowing = 0
+        metal, glowing = np.zeros(len(self._logits), bool), 0
         levels: list[Level] = []
         for step in range(steps if batches else 0):
             if glow and step == int(GLOW_AT * steps):
@@ -182,7 +181,7 @@ class MaterialFit:
             if level and step in {int(share * steps) for share in LEVEL_AT}:
                 levels.append(self._set_level(batches, generator))
             if metals and step in {int(share * steps) for share in METALS_AT}:
-                found = self._set_metals(batches)
+                metal = self._set_metals(batches)
             if step % RENEWED == 0:
                 self._renew()
             order = order or torch.randperm(len(batches), generator=generator).tolist()
@@ -196,7 +195,8 @@ class MaterialFit:
         with torch.no_grad():
             values = torch.sigmoid(self._logits).numpy()
         bend, own = self._bend.detach().numpy(), self._around[:, GLOW].numpy()
-        return Fitted(values, bend, weight.numpy(), own, self._light, self.psnr(held), found, glowing, tuple(levels))
+        metal &= values[:, 4] > STAYED
+        return Fitted(values, bend, weight.numpy(), own, self._light, self.psnr(held), metal, glowing, tuple(levels))
 
     def _step(self, batch: Batch, decay: float, generator: torch.Generator) -> None:
         values = torch.sigmoid(self._logits)
@@ -276,19 +276,14 @@ class MaterialFit:
         return found
 
     @torch.no_grad()
-    def _set_metals(self, batches: list[Batch]) -> int:
-        """Start texels that metal explains better anew, as that metal; how many they are."""
+    def _set_metals(self, batches: list[Batch]) -> NDArray[np.bool_]:
+        """Start texels that metal explains better anew, as that metal; which (n,) they are."""
         tables = self._light.prefilter()
         own = torch.sigmoid(self._logits[:, 3]).numpy()
-        found = find_metals([b.evidence(self._bend, tables, self._around) for b in batches], own, self._blurred)
+        found = find_metals([b.evidence(self._bend, tables, self._around) for b in batches], own, self._like)
         start = np.column_stack([np.clip(found.base, *BASE_RANGE), found.roughness, np.full(len(found.texel), METAL)])
         self._restart(found.texel, start)
-        return len(found.texel)
-
-    def _blurred(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """`values` (texels,) averaged over some texels around each, those outside the charts as 0."""
-        image = cv2.GaussianBlur(self._texels.image(values), (0, 0), TOGETHER)
-        return np.asarray(image.ravel()[self._texels.index], np.float64)
+        return np.isin(np.arange(len(own)), found.texel)
 
     @torch.no_grad()
     def _set_glow(self, batches: list[Batch]) -> int:
@@ -309,6 +304,13 @@ class MaterialFit:
         for moment in self._adam.state[self._logits].values():
             if moment.shape == self._logits.shape:
                 moment[at] = 0
+
+    @torch.no_grad()
+    def showing(self, pixels: Pixels, asked: NDArray[np.bool_]) -> tuple[NDArray[np.int64], Evidence]:
+        """Which (m,) of the `pixels` show mostly texels that are `asked` (n,) for, and these as evidence under the light found."""
+        batch, there = Batch.of(pixels, self._normal), torch.as_tensor(asked)
+        rows = torch.nonzero(there[batch.foremost])[:, 0]
+        return rows.numpy(), batch.showing(there).evidence(self._bend, self._light.prefilter(), self._around)
 
     @torch.no_grad()
     def psnr(self, photos: list[Pixels], values: Floats | None = None) -> float | None:

@@ -5,11 +5,13 @@ it gains a reflection. Seen through one light, though, either answer is linear i
 
     paint: shade = b · E(n) + L(d) · (.04 A + B)        metal: shade = b · L(d) A + L(d) B
 
-(METHOD §6), so for each of a few roughnesses the best b and what it leaves unexplained are sums over the texel's pixels. Errors are
-weighed by the slope of the sRGB curve at the photo's own colour: those of the eye, not of the lamp. A metal must reflect clearly more of
-every colour than the .04 of paint, or black gloss passes for a dark metal. A texel has seen too few pixels to tell by itself: neighbours
-decide together, each with its own colour. Clean metals reflect a third or more (gold's blue is .34: Lagarde & de Rousiers, *Moving
-Frostbite to PBR*, 2014), but rusty, anodised and dirty ones, and many that artists painted, go down to .1.
+(METHOD §6), so for each of a few roughnesses the best b follows from sums over the texel's pixels, weighed by the slope of the sRGB curve
+at the photo's own colour: errors are those of the eye, not of the lamp. What that b leaves unexplained is then measured as a photo would
+show it, clipped at white and robust: a lamp in a mirror is no brighter than white paper, and where the reflection is a little off one
+pixel must not outweigh the others. A metal must reflect clearly more of every colour than the .04 of paint, or black gloss passes for
+a dark metal. A texel has seen too few pixels to tell by itself: neighbours that look alike decide together (`alike`), each with its own
+colour. Clean metals reflect a third or more (gold's blue is .34: Lagarde & de Rousiers, *Moving Frostbite to PBR*, 2014), but rusty,
+anodised and dirty ones, and many that artists painted, go down to .1.
 """
 
 from __future__ import annotations
@@ -21,6 +23,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from gsbake.texture.colour import encode
+
 Floats = NDArray[np.float64]
 
 #: Roughnesses tried beside a texel's own.
@@ -29,6 +33,8 @@ ROUGHNESS = (0.1, 0.2, 0.35, 0.55)
 DARKEST_METAL, CLEAN_METAL = 0.1, 0.3
 #: What the metal leaves unexplained must be below this share of what the paint leaves: for dark metals, which are rarer, and clean ones.
 CLEARLY = (0.9, 1.0)
+#: Pixels brighter than this (linear) do not say how much is reflected; errors of sRGB values beyond about the second count by themselves.
+WHITE, ROBUST = 0.95, 0.1
 #: Darkest linear colour that the slope of the sRGB curve is taken at.
 DIM = 0.02
 #: Texels with less weight of pixels than this are left alone, and those that fewer photos saw, or this share of what is around them: seen
@@ -56,6 +62,11 @@ def by_eye(evidence: Evidence) -> NDArray[np.float32]:
     return np.asarray(evidence.weight[:, None] * np.maximum(evidence.colour, DIM) ** (-7 / 6), np.float32)
 
 
+def told(evidence: Evidence) -> NDArray[np.float32]:
+    """`by_eye` of what is not clipped at white."""
+    return by_eye(evidence) * (evidence.colour < WHITE)
+
+
 def seen(photos: Sequence[Evidence], texels: int) -> Floats:
     """Weight (texels,) of all pixels that show each texel."""
     out = np.zeros(texels)
@@ -73,44 +84,68 @@ class Metals:
     roughness: Floats
 
 
+@dataclass(frozen=True)
+class Line:
+    """A photo's pixels as lines in the base colour: shade = b · `slope` + `offset`, both (n, 3)."""
+
+    slope: NDArray[np.float32]
+    offset: NDArray[np.float32]
+
+    @classmethod
+    def of(cls, evidence: Evidence, roughness: NDArray[np.float32], metallic: float) -> Line:
+        """The lines of all pixels of `evidence` at the `roughness` (texels,) and this `metallic`."""
+        offset = evidence.shade(0.0, roughness, metallic)
+        return cls(evidence.shade(1.0, roughness, metallic) - offset, offset)
+
+    def error(self, colour: NDArray[np.float32], base: NDArray[Any]) -> NDArray[np.float32]:
+        """Errors (n, 3) of sRGB values, clipped at white, of pixels of linear `colour` (n, 3) that show `base` (n, 3)."""
+        return np.asarray(encode(np.clip(base * self.slope + self.offset, 0, 1)) - encode(colour))
+
+    def unexplained(self, evidence: Evidence, base: Floats) -> Floats:
+        """Weighted robust errors (texels,) with `base` (texels, 3)."""
+        error = self.error(evidence.colour, base[evidence.texel])
+        robust = (np.sqrt(error**2 + ROBUST**2) - ROBUST).sum(1)
+        return np.asarray(np.bincount(evidence.texel, evidence.weight * robust, len(base)), np.float64)
+
+
 class _Sums:
     """What the pixels of each texel say about b in shade = b · slope + offset, least squares."""
 
     def __init__(self, texels: int) -> None:
-        self.slopes, self.mixed, self.squares = (np.zeros((texels, 3)) for _ in range(3))
+        self.slopes, self.mixed = np.zeros((texels, 3)), np.zeros((texels, 3))
 
-    def add(self, evidence: Evidence, weight: NDArray[Any], offset: NDArray[Any], slope: NDArray[Any]) -> None:
-        rest = evidence.colour - offset
+    def add(self, evidence: Evidence, weight: NDArray[Any], line: Line) -> None:
+        rest = evidence.colour - line.offset
         for k in range(3):
-            w, a, d = weight[:, k], slope[:, k], rest[:, k]
-            for total, value in ((self.slopes, w * a * a), (self.mixed, w * a * d), (self.squares, w * d * d)):
+            w, a, d = weight[:, k], line.slope[:, k], rest[:, k]
+            for total, value in ((self.slopes, w * a * a), (self.mixed, w * a * d)):
                 total[:, k] += np.bincount(evidence.texel, value, len(total))
 
-    def best(self, darkest: float) -> tuple[Floats, Floats]:
-        """b (texels, 3) within [darkest, 1] and the weighted squares (texels,) it leaves."""
-        b = np.clip(self.mixed / np.maximum(self.slopes, 1e-12), darkest, 1.0)
-        return b, (self.squares - 2 * b * self.mixed + b * b * self.slopes).sum(1)
+    def best(self, darkest: float) -> Floats:
+        """b (texels, 3) within [darkest, 1]."""
+        return np.clip(self.mixed / np.maximum(self.slopes, 1e-12), darkest, 1.0)
 
 
 def find_metals(photos: Sequence[Evidence], own: NDArray[np.float32], around: Callable[[Floats], Floats] = lambda left: left) -> Metals:
     """The texels that are better explained as metal; `own` (texels,) is their present roughness.
 
-    `around` sums what is left unexplained (texels,) over the neighbourhood that decides together: a texel by itself has seen too little.
+    `around` averages what is left unexplained (texels,) over the neighbours that decide together: a texel by itself has seen too little.
     """
     texels = len(own)
-    weights = [by_eye(e) for e in photos]
-    paint = np.full(texels, np.inf)
-    metal, base, roughness = np.full(texels, np.inf), np.zeros((texels, 3)), np.zeros(texels)
+    weights = [told(e) for e in photos]
+    paint, metal = np.full(texels, np.inf), np.full(texels, np.inf)
+    base, roughness = np.zeros((texels, 3)), np.zeros(texels)
     for tried in (own, *(np.full(texels, r, np.float32) for r in ROUGHNESS)):
-        for metallic in (0.0, 1.0):
+        for metallic, darkest in ((0.0, 0.0), (1.0, DARKEST_METAL)):
+            lines = [Line.of(evidence, tried, metallic) for evidence in photos]
             sums = _Sums(texels)
-            for evidence, weight in zip(photos, weights, strict=True):
-                offset = evidence.shade(0.0, tried, metallic)
-                sums.add(evidence, weight, offset, evidence.shade(1.0, tried, metallic) - offset)
+            for evidence, weight, line in zip(photos, weights, lines, strict=True):
+                sums.add(evidence, weight, line)
+            b = sums.best(darkest)
+            left = sum((line.unexplained(evidence, b) for evidence, line in zip(photos, lines, strict=True)), np.zeros(texels))
             if not metallic:
-                paint = np.minimum(paint, sums.best(0.0)[1])
+                paint = np.minimum(paint, left)
                 continue
-            b, left = sums.best(DARKEST_METAL)
             better = left < metal
             metal[better], base[better], roughness[better] = left[better], b[better], tried[better]
     share = np.where(base.mean(1) < CLEAN_METAL, *CLEARLY)

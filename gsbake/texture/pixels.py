@@ -1,13 +1,14 @@
 """What the photos show of the texture, pixel by pixel: each pixel's texels, view direction, colour and weight.
 
 A ray through each pixel's centre meets the mesh once; from then on a photo is a list of bilinear texture reads, and fitting a texture to
-photos needs no rasteriser. Pixels near a mask's border, near depth edges and at grazing views count less: there a small error of shape
+photos needs no rasteriser. Where a texture is finer than the photos, a pixel is an average of several texels instead, found by rays
+spread over it (`samples`). Pixels near a mask's border, near depth edges and at grazing views count less: there a small error of shape
 shows another part of the surface.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import cv2
@@ -30,6 +31,8 @@ BORDER = (1.5, 4.0)
 EDGE_STEP, EDGE_PIXELS = 0.015, 3.0
 #: About so many blocks side by side show the object in a photo.
 BLOCKS = 12
+#: Where in a pixel the rays of an average go, in pixels from its centre: the corners of a turned square, no two in one row or column.
+SAMPLES = ((-0.17, -0.5), (0.5, -0.17), (0.17, 0.5), (-0.5, 0.17))
 
 
 @dataclass(frozen=True)
@@ -37,7 +40,8 @@ class Pixels:
     """n pixels of one photo.
 
     `texel` (n, 4) int64 indices into the texels and `share` (n, 4) their bilinear weights; `towards` (n, 3) unit vectors from the surface
-    to the camera; `colour` (n, 3) sRGB 0..1; `weight` (n,) 0..1; `block` (n,) which square block of the photo each lies in.
+    to the camera; `colour` (n, 3) sRGB 0..1; `weight` (n,) 0..1; `block` (n,) which square block of the photo each lies in; `pixel` (n,)
+    flat row-major index in the photo.
     """
 
     texel: NDArray[np.int64]
@@ -46,6 +50,7 @@ class Pixels:
     colour: Floats
     weight: Floats
     block: NDArray[np.int32]
+    pixel: NDArray[np.int64]
 
     def __len__(self) -> int:
         return len(self.weight)
@@ -53,9 +58,7 @@ class Pixels:
     def thinned(self, most: int) -> Pixels:
         """Every second, third … pixel, so that at most `most` are left."""
         step = max(1, -(-len(self) // most))
-        return Pixels(
-            self.texel[::step], self.share[::step], self.towards[::step], self.colour[::step], self.weight[::step], self.block[::step]
-        )
+        return Pixels(*(getattr(self, field.name)[::step] for field in fields(self)))
 
     def without_gain(self, gain: NDArray[Any]) -> Pixels:
         """The same pixels with a photo's `gain` (3,) of linear colour divided out."""
@@ -100,7 +103,22 @@ class PixelReader:
         colour = rgb.reshape(-1, 3)[at].astype(np.float32) / 255
         side = max(1, int(np.sqrt(len(at)) / BLOCKS))
         block = at // width // side * (width // side + 1) + at % width // side
-        return Pixels(texel, share, towards[chosen].astype(np.float32), colour, weight.astype(np.float32), block.astype(np.int32))
+        return Pixels(texel, share, towards[chosen].astype(np.float32), colour, weight.astype(np.float32), block.astype(np.int32), at)
+
+    def samples(self, camera: Camera, pixel: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+        """The texels (n, len(SAMPLES)) that rays spread over each `pixel` (n,) meet, and which of these rays met it at the same depth."""
+        column, row = pixel % camera.width + 0.5 - camera.cx, pixel // camera.width + 0.5 - camera.cy
+        texel = np.zeros((len(pixel), len(SAMPLES)), np.int64)
+        distance = np.full((len(pixel), len(SAMPLES)), np.inf, np.float32)
+        for k, (dx, dy) in enumerate(SAMPLES):
+            rays = np.stack([(column + dx) / camera.fx, (row + dy) / camera.fy, np.ones(len(pixel))], 1) @ camera.R
+            hits = self._caster.first_hit(camera.centre[None], rays)
+            uv = np.einsum("nk,nkd->nd", hits.bary, self._uv[self._caster.faces[np.maximum(hits.face, 0)]])
+            x, y = np.clip((uv * self._size).astype(np.int64), 0, self._size - 1).T
+            slot = self._slot[y * self._size + x]
+            met = hits.hit & (slot >= 0)
+            texel[:, k], distance[met, k] = np.maximum(slot, 0), hits.distance[met]
+        return texel, distance < distance.min(1, keepdims=True) + EDGE_STEP * self._diagonal
 
     def _taps(self, uv: NDArray[np.float64]) -> tuple[NDArray[np.int64], Floats]:
         """The four texels around each texture coordinate (n, 2) and their weights; texels off the charts take no part."""

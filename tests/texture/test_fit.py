@@ -17,7 +17,7 @@ from gsbake.surface.raycast import RayCaster
 from gsbake.texture.coarse import Coarse
 from gsbake.texture.colour import decode, encode
 from gsbake.texture.fit import TRIAL_PHOTO, MaterialFit, Priors, trial_roughness
-from gsbake.texture.pixels import PixelReader, Pixels
+from gsbake.texture.pixels import SAMPLES, PixelReader, Pixels
 from gsbake.texture.texels import Texels, rasterise
 
 SIZE = 64
@@ -180,9 +180,24 @@ def test_pixels_read_the_texture_where_the_ray_meets_it() -> None:
     assert len(pixels.thinned(100)) <= 100
 
 
+def test_samples_lie_inside_their_pixels() -> None:
+    mesh, uv = ball()
+    texels = rasterise(uv, mesh.faces, 512)
+    at = texels.interpolate(np.asarray(mesh.vertices), mesh.faces)
+    camera = cameras(1, 120)[0]
+    reader = PixelReader(RayCaster(mesh.vertices, mesh.faces, 1), uv, texels, 2.0)
+    pixel = reader.read(camera, np.zeros((120, 120, 3), np.uint8), None).pixel
+    texel, counts = reader.samples(camera, pixel)
+    assert texel.shape == counts.shape == (len(pixel), len(SAMPLES)) and counts.mean() > 0.9
+    for k, (dx, dy) in enumerate(SAMPLES):
+        seen, _ = camera.project(at[texel[:, k]])
+        expected = np.stack([pixel % 120, pixel // 120], 1) + 0.5 + (dx, dy)
+        assert np.abs(seen - expected)[counts[:, k]].max() < 0.5  # half a texel, which is up to a pixel where the ball is seen frontally
+
+
 def test_gain_is_divided_out_of_linear_colour() -> None:
     pixels = Pixels(np.zeros((1, 4), np.int64), np.full((1, 4), 0.25, np.float32), np.ones((1, 3), np.float32),
-                    encode(np.array([[0.4, 0.2, 0.1]])), np.ones(1, np.float32), np.zeros(1, np.int32))  # fmt: skip
+                    encode(np.array([[0.4, 0.2, 0.1]])), np.ones(1, np.float32), np.zeros(1, np.int32), np.zeros(1, np.int64))  # fmt: skip
     assert decode(pixels.without_gain(np.array([2.0, 1.0, 0.5])).colour) == pytest.approx(np.array([[0.2, 0.2, 0.2]]), abs=1e-5)
 
 

@@ -1,0 +1,152 @@
+"""Base colour of metals at the full texture, finer than the photos' pixels: a linear problem once light and roughness are known.
+
+Metal grilles, meshes and engravings have patterns of a pixel or two, bright metal beside black holes. A fit at texels of a pixel mixes both
+and shows grey. What a photo shows of a metal is a straight line in its base colour, though, so with the light found each pixel says
+
+    colour − offset = slope · mean of b over the texels that the pixel covers,
+
+and all pixels of all photos together say more than one pixel per texel. The sum of weighted squares (errors as the eye sees them, those far
+off counted less) is brought down in simultaneous steps (SIRT), which stay in [0, 1] and close to where they started where no pixel looks.
+
+Paint is left as it was fitted: what photos of paint show hangs on its diffuse shading, which the fit at a pixel knows as well, and what
+reflections leave over would end as stains.
+
+Goldlücke & Cremers, *Superresolution texture maps for multiview reconstruction*, ICCV 2009 (a texture finer than the photos, each pixel the
+mean of what it covers); Gilbert, *Iterative methods for the three-dimensional reconstruction of an object from projections*, 1972 (SIRT).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+import scipy.sparse
+from numpy.typing import NDArray
+
+from gsbake.capture.cameras import Camera
+from gsbake.texture.coarse import Coarse
+from gsbake.texture.fit import MaterialFit
+from gsbake.texture.metal import DARKEST_METAL, ROBUST, Evidence, Line, told
+from gsbake.texture.pixels import PixelReader, Pixels
+from gsbake.texture.surface import Surface
+from gsbake.texture.texels import Texels
+
+Floats = NDArray[np.float32]
+
+#: Steps of the solver, and how many of them go by before pixels far off count less.
+STEPS, PLAIN = 15, 5
+#: Pull towards the start, as a share of what the median texel is asked by the pixels.
+STAY = 0.001
+#: A place is metal where about so many texels around it are, by this share: what the pattern of a grille leaves out belongs to it.
+PATTERN, SHARE = 2.0, 0.35
+#: Hue is averaged over about so many texels: patterns are of bright and dark, and one lamp's reflection a little off is of one colour.
+HUE = 4.0
+#: Reflectance of what is no metal, seen head-on.
+GLOSS = 0.04
+
+
+@dataclass(frozen=True)
+class Seen:
+    """m pixels of one photo: the texels (m, k) each is an average of and which of them `counts` (m, k), their `evidence`, and what they
+    show as a `line` in a metal's base colour."""
+
+    texel: NDArray[np.int64]
+    counts: NDArray[np.bool_]
+    evidence: Evidence
+    line: Line
+
+
+def metal_places(texels: Texels, metal: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Where (n,) the texels around are mostly `metal` (n,)."""
+    share = cv2.GaussianBlur(texels.image(metal.astype(np.float32))[..., 0], (0, 0), PATTERN)
+    return np.asarray(share.ravel()[texels.index] > SHARE)
+
+
+def sharpened(values: Floats, texels: Texels, place: NDArray[np.bool_], photos: Sequence[Seen]) -> Floats:
+    """`values` (n, 5) of `texels` (linear base colour, roughness, metallic) with the base colour of metals solved in `place` (n,).
+
+    What turns out darker than any metal is paint in a metal's pattern: a hole.
+    """
+    column = np.cumsum(place) - 1
+    parts = []
+    for seen in photos:
+        counts = seen.counts & place[seen.texel]
+        enough = 2 * counts.sum(1) > counts.shape[1]
+        row, k = np.nonzero(counts[enough])
+        share = (1 / counts.sum(1)[enough][row]).astype(np.float32)
+        mean = scipy.sparse.csr_matrix((share, (row, column[seen.texel[enough][row, k]])), shape=(int(enough.sum()), int(place.sum())))
+        line = Line(seen.line.slope[enough], seen.line.offset[enough])
+        parts.append(_Part(mean, seen.evidence.colour[enough], told(seen.evidence)[enough], line))
+    base = _of_calm_hue(_solved(parts, values[place, :3]), texels, place)
+    hole = base.mean(1) < DARKEST_METAL
+    out = values.copy()
+    out[place, :3] = np.where(hole[:, None], np.maximum(base - GLOSS, 0), base)
+    out[place, 4] = ~hole
+    return out
+
+
+def _of_calm_hue(base: Floats, texels: Texels, place: NDArray[np.bool_]) -> Floats:
+    """`base` (t, 3) of the `texels` in `place` (n,), each as bright as it is, but of the mean hue of those around."""
+    image = np.zeros((len(place), 3), np.float32)
+    image[place] = base
+    around = cv2.GaussianBlur(texels.image(image), (0, 0), HUE).reshape(-1, 3)[texels.index[place]]
+    return np.asarray(np.clip(around * (base.mean(1) / np.maximum(around.mean(1), 1e-6))[:, None], 0, 1))
+
+
+@dataclass(frozen=True)
+class _Part:
+    """One photo's share of the problem: the matrix (m, t) that averages t texels for its m pixels, their linear `colour` (m, 3), `weight`
+    (m, 3) and `line`."""
+
+    mean: Any
+    colour: Floats
+    weight: Floats
+    line: Line
+
+    def asks(self, base: Floats, robust: bool) -> tuple[Floats, Floats]:
+        """How far each texel (t, 3) is asked to go from `base` (t, 3), and with what weight."""
+        shown = np.asarray(self.mean @ base)
+        use = self.weight
+        if robust:
+            use = np.asarray(use / np.maximum(np.abs(self.line.error(self.colour, shown)) / ROBUST, 1), np.float32)
+        rest = self.colour - self.line.offset - self.line.slope * shown
+        return self.mean.T @ (use * self.line.slope * rest), self.mean.T @ (use * self.line.slope**2)
+
+
+def _solved(parts: Sequence[_Part], start: Floats) -> Floats:
+    """Base colours (t, 3) in [0, 1] near `start` under which pixels show what their photos do."""
+    base = start.copy()
+    for step in range(STEPS):
+        pull, asked = np.zeros_like(start), np.zeros_like(start)
+        for part in parts:
+            towards, weight = part.asks(base, step >= PLAIN)
+            pull += towards
+            asked += weight
+        stay = STAY * np.median(asked[asked > 0]) if (asked > 0).any() else 1.0
+        base = np.asarray(np.clip(base + (pull + stay * (start - base)) / (asked + stay), 0, 1), np.float32)
+    return base
+
+
+def sharp_metals(
+    surface: Surface,
+    coarse: Coarse,
+    fit: MaterialFit,
+    metal: NDArray[np.bool_],
+    roughness: Floats,
+    values: Floats,
+    photos: Sequence[tuple[Pixels, Camera]],
+) -> Floats:
+    """`values` (n, 5) of the surface's texels with the base colour of what the `fit` found to be metal solved anew.
+
+    `metal` (m,) and `roughness` (m,) belong to the `coarse` texels; `photos` are the pixels it was fitted to, with their cameras.
+    """
+    place = metal_places(coarse.texels, metal)
+    reader = PixelReader(surface.whole, surface.atlas.uv, surface.texels, surface.diagonal)
+    seen = []
+    for pixels, camera in photos:
+        rows, evidence = fit.showing(pixels, place)
+        seen.append(Seen(*reader.samples(camera, pixels.pixel[rows]), evidence, Line.of(evidence, roughness, 1.0)))
+    return sharpened(values, surface.texels, coarse.up(place[:, None].astype(np.float32))[:, 0] > 0.5, seen)

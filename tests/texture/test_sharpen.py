@@ -1,0 +1,112 @@
+"""Base colour of metals finer than the photos' pixels."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.optimize import lsq_linear
+
+from gsbake.texture.metal import Evidence, Line, told
+from gsbake.texture.sharpen import HUE, Seen, metal_places, sharpened
+from gsbake.texture.texels import Texels
+
+SIZE = 32
+GOLD = np.array([0.9, 0.7, 0.4], np.float32)
+
+
+def everywhere() -> Texels:
+    n = SIZE * SIZE
+    return Texels(SIZE, np.arange(n), np.zeros(n, np.int32), np.zeros((n, 3), np.float32), np.ones(n, bool))
+
+
+def photos(base: NDArray[np.float32], count: int = 30, noise: float = 0.0) -> list[Seen]:
+    """Photos whose pixels are the means of squares of 3 x 3 texels, each photo with a grid and a reflection of its own."""
+    rng = np.random.default_rng(5)
+    out = []
+    for _ in range(count):
+        x, y = (rng.integers(0, 3) + 3 * np.arange(SIZE // 3 - 1) for _ in range(2))
+        corner = (y[:, None] * SIZE + x).ravel()
+        texel = (corner[:, None] + np.array([i * SIZE + j for i in range(3) for j in range(3)])).astype(np.int64)
+        slope = np.repeat(rng.uniform(0.1, 0.9, (len(corner), 1)), 3, 1).astype(np.float32)
+        offset = np.full_like(slope, 0.02)
+        colour = slope * base[texel].mean(1) + offset + rng.normal(scale=noise, size=slope.shape)
+        seen = Evidence(texel[:, 4], colour.astype(np.float32), np.ones(len(corner), np.float32), np.zeros(len(corner), np.int32), never)
+        out.append(Seen(texel, np.ones(texel.shape, bool), seen, Line(slope, offset)))
+    return out
+
+
+def never(base: float, roughness: NDArray[np.float32], metallic: float) -> NDArray[np.float32]:
+    raise AssertionError("the lines are known")
+
+
+def test_a_grille_finer_than_the_pixels_comes_back() -> None:
+    texels = everywhere()
+    column, row = texels.index % SIZE, texels.index // SIZE
+    hole = (column % 6 < 3) & (row % 6 < 3)
+    truth = np.where(hole[:, None], 0.0, GOLD).astype(np.float32)
+    values = np.tile(np.array([0.4, 0.4, 0.4, 0.2, 0.8], np.float32), (len(texels), 1))
+    place = np.ones(len(texels), bool)
+    out = sharpened(values, texels, place, photos(truth, 60, 0.002))
+    inner = (np.minimum(column, row) > 3) & (np.maximum(column, row) < SIZE - 5)
+    before, after = (np.abs(x[inner, :3] - truth[inner]).mean() for x in (values, out))
+    assert after < 0.15 * before
+    assert (out[inner & hole, 4] == 0).all() and (out[inner & ~hole, 4] == 1).all()
+    np.testing.assert_array_equal(out[:, 3], values[:, 3])
+
+
+def test_the_steps_approach_bounded_least_squares() -> None:
+    """One value per row of texels in the middle channel, against SciPy's solver."""
+    rng = np.random.default_rng(0)
+    texels = everywhere()
+    n = len(texels)
+    truth = np.repeat(np.repeat(rng.uniform(0.2, 0.9, n // 16), 16)[:, None], 3, 1).astype(np.float32)
+    seen = photos(truth, 40)
+    values = np.concatenate([np.full((n, 3), 0.5, np.float32), np.zeros((n, 1), np.float32), np.ones((n, 1), np.float32)], 1)
+    out = sharpened(values, texels, np.ones(n, bool), seen)
+    rows, right = [], []
+    for photo in seen:
+        weight = np.sqrt(told(photo.evidence)[:, 1])
+        matrix = np.zeros((len(weight), n))
+        np.put_along_axis(matrix, photo.texel, 1 / 9, 1)
+        rows.append(matrix * (weight * photo.line.slope[:, 1])[:, None])
+        right.append(weight * (photo.evidence.colour - photo.line.offset)[:, 1])
+    best = lsq_linear(np.concatenate(rows), np.concatenate(right), (0, 1)).x
+    covered = np.abs(np.concatenate(rows)).sum(0) > 1
+
+    def left(base: NDArray[np.floating]) -> float:
+        return float(np.square(np.concatenate(rows) @ base - np.concatenate(right)).sum())
+
+    assert covered.mean() > 0.8
+    assert left(out[:, 1]) < 0.05 * left(values[:, 1])
+    assert left(best) < left(out[:, 1])
+
+
+def test_hue_comes_from_around_and_brightness_stays() -> None:
+    texels = everywhere()
+    rng = np.random.default_rng(1)
+    bright = rng.uniform(0.3, 0.8, (len(texels), 1))
+    stained = (bright * GOLD / GOLD.mean() * rng.uniform(0.8, 1.2, (len(texels), 3))).clip(0, 1).astype(np.float32)
+    values = np.concatenate([stained, np.full((len(texels), 1), 0.2), np.ones((len(texels), 1))], 1).astype(np.float32)
+    out = sharpened(values, texels, np.ones(len(texels), bool), [])[:, :3]
+    inner = np.minimum(texels.index % SIZE, texels.index // SIZE) > HUE
+    hue = out[inner] / out[inner].mean(1, keepdims=True)
+    assert hue.std(0).max() < 0.3 * (stained[inner] / stained[inner].mean(1, keepdims=True)).std(0).max()
+    assert np.abs(out - stained).mean(1)[inner].mean() < 0.08
+    np.testing.assert_allclose(out[inner].mean(1), stained[inner].mean(1), atol=0.05)
+
+
+def test_paint_is_left_alone() -> None:
+    texels = everywhere()
+    values = np.random.default_rng(2).uniform(0.2, 0.8, (len(texels), 5)).astype(np.float32)
+    place = texels.index % SIZE < SIZE // 2
+    out = sharpened(values, texels, place, photos(np.full((len(texels), 3), 0.7, np.float32)))
+    np.testing.assert_array_equal(out[~place], values[~place])
+    assert np.abs(out[place, :3] - 0.7).mean() < 0.15
+
+
+@pytest.mark.parametrize(("share", "place"), [(0.6, True), (0.1, False)])
+def test_a_pattern_is_one_place(share: float, place: bool) -> None:
+    texels = everywhere()
+    metal = np.random.default_rng(3).uniform(size=len(texels)) < share
+    assert (metal_places(texels, metal).mean() > 0.9) == place
