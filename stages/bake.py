@@ -313,7 +313,7 @@ def _fit_materials(
     values = coarse.up(plain)
     values[:, :3] *= fine
     if metals and plain[:, 4].any():
-        values = sharp_metals(surface, coarse, fit, fitted.metal, plain[:, 3], values, list(zip(photos, shot, strict=True)))
+        values = sharp_metals(surface, coarse, fit, fitted.metal, plain, values, list(zip(photos, shot, strict=True)))
     if fitted.glowing:
         values = np.concatenate([values, coarse.up(fitted.glow) * fine], 1)
     known = coarse.up(fitted.weight[:, None])[:, 0] > LEAST_SEEN * (coarse.edge / footprint) ** 2

@@ -1,7 +1,7 @@
 """Base colour of metals at the full texture, finer than the photos' pixels: a linear problem once light and roughness are known.
 
 Metal grilles, meshes and engravings have patterns of a pixel or two, bright metal beside black holes. A fit at texels of a pixel mixes both
-and shows grey. What a photo shows of a metal is a straight line in its base colour, though, so with the light found each pixel says
+and shows grey. What a photo shows is a straight line in the base colour, though, so with the light found each pixel says
 
     colour − offset = slope · mean of b over the texels that the pixel covers,
 
@@ -51,7 +51,7 @@ GLOSS = 0.04
 @dataclass(frozen=True)
 class Seen:
     """m pixels of one photo: the texels (m, k) each is an average of and which of them `counts` (m, k), their `evidence`, and what they
-    show as a `line` in a metal's base colour."""
+    show as a `line` in the base colour there."""
 
     texel: NDArray[np.int64]
     counts: NDArray[np.bool_]
@@ -84,7 +84,7 @@ def sharpened(values: Floats, texels: Texels, place: NDArray[np.bool_], photos: 
     hole = base.mean(1) < DARKEST_METAL
     out = values.copy()
     out[place, :3] = np.where(hole[:, None], np.maximum(base - GLOSS, 0), base)
-    out[place, 4] = ~hole
+    out[place, 4] *= ~hole
     return out
 
 
@@ -135,18 +135,20 @@ def sharp_metals(
     coarse: Coarse,
     fit: MaterialFit,
     metal: NDArray[np.bool_],
-    roughness: Floats,
+    fitted: Floats,
     values: Floats,
     photos: Sequence[tuple[Pixels, Camera]],
 ) -> Floats:
     """`values` (n, 5) of the surface's texels with the base colour of what the `fit` found to be metal solved anew.
 
-    `metal` (m,) and `roughness` (m,) belong to the `coarse` texels; `photos` are the pixels it was fitted to, with their cameras.
+    `metal` (m,) and the values `fitted` (m, 5) belong to the `coarse` texels; `photos` are the pixels they are fitted to, with cameras.
     """
     place = metal_places(coarse.texels, metal)
     reader = PixelReader(surface.whole, surface.atlas.uv, surface.texels, surface.diagonal)
     seen = []
     for pixels, camera in photos:
         rows, evidence = fit.showing(pixels, place)
-        seen.append(Seen(*reader.samples(camera, pixels.pixel[rows]), evidence, Line.of(evidence, roughness, 1.0)))
+        paint, pure = (Line.of(evidence, fitted[:, 3], metallic) for metallic in (0.0, 1.0))
+        line = paint.towards(pure, fitted[evidence.texel, 4])
+        seen.append(Seen(*reader.samples(camera, pixels.pixel[rows]), evidence, line))
     return sharpened(values, surface.texels, coarse.up(place[:, None].astype(np.float32))[:, 0] > 0.5, seen)
