@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy.optimize import lsq_linear
 
 from gsbake.texture.metal import Evidence, Line, told
-from gsbake.texture.sharpen import HUE, Seen, metal_places, sharpened
+from gsbake.texture.sharpen import CLEARLY, HUE, Seen, metal_places, sharpened, unexplained
 from gsbake.texture.texels import Texels
 
 SIZE = 32
@@ -20,9 +20,9 @@ def everywhere() -> Texels:
     return Texels(SIZE, np.arange(n), np.zeros(n, np.int32), np.zeros((n, 3), np.float32), np.ones(n, bool))
 
 
-def photos(base: NDArray[np.float32], count: int = 30, noise: float = 0.0) -> list[Seen]:
+def photos(base: NDArray[np.float32], count: int = 30, noise: float = 0.0, seed: int = 5) -> list[Seen]:
     """Photos whose pixels are the means of squares of 3 x 3 texels, each photo with a grid and a reflection of its own."""
-    rng = np.random.default_rng(5)
+    rng = np.random.default_rng(seed)
     out = []
     for _ in range(count):
         x, y = (rng.integers(0, 3) + 3 * np.arange(SIZE // 3 - 1) for _ in range(2))
@@ -53,6 +53,21 @@ def test_a_grille_finer_than_the_pixels_comes_back() -> None:
     assert after < 0.15 * before
     assert (out[inner & hole, 4] == 0).all() and (out[inner & ~hole, 4] == values[0, 4]).all()
     np.testing.assert_array_equal(out[:, 3], values[:, 3])
+
+
+@pytest.mark.parametrize(("pattern", "gains"), [(True, True), (False, False)])
+def test_other_photos_tell_whether_it_was_worth_it(pattern: bool, gains: bool) -> None:
+    """A grille gains where no photo that it was solved for looks; even metal in noisy photos does not."""
+    texels = everywhere()
+    column, row = texels.index % SIZE, texels.index // SIZE
+    hole = (column % 6 < 3) & (row % 6 < 3) & pattern
+    truth = np.where(hole[:, None], 0.0, GOLD).astype(np.float32)
+    values = np.tile(np.append(truth.mean(0), [0.2, 0.8]).astype(np.float32), (len(texels), 1))
+    place = np.ones(len(texels), bool)
+    out = sharpened(values, texels, place, photos(truth, 20, 0.05))
+    others = photos(truth, 6, 0.05, seed=6)
+    before, after = unexplained(values, place, others), unexplained(out, place, others)
+    assert (after < CLEARLY * before) == gains
 
 
 def test_the_steps_approach_bounded_least_squares() -> None:
