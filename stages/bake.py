@@ -263,14 +263,14 @@ def _fit_materials(
     watch = MeshWatch(surface.at[some], surface.facing[some], surface.caster, surface.diagonal)
     photos: list[Pixels] = []
     held: list[Pixels] = []
-    shot: dict[bool, list[Camera]] = {True: [], False: []}
+    shot: list[Camera] = []
     for index in range(len(posed)):
         ctx.check_stop()
         view = posed.view(index, settings.fit_size)
         watch.add(view)
         pixels = reader.read(view.camera, view.rgb, view.mask).thinned(MOST_PIXELS)
         (held if index in aside else photos).append(pixels.without_gain(shown.gains[index]))
-        shot[index in aside].append(view.camera)
+        shot += [] if index in aside else [view.camera]
 
     def each(done: int, total: int) -> None:
         ctx.check_stop()
@@ -313,10 +313,7 @@ def _fit_materials(
     values = coarse.up(plain)
     values[:, :3] *= fine
     if metals and plain[:, 4].any():
-        taken, others = (list(zip(some, shot[kind], strict=True)) for some, kind in ((photos, False), (held, True)))
-        if any(map(len, held)):
-            values, sharp, why = sharp_metals(surface, coarse, fit, fitted.metal, plain, values, taken, others)
-            ctx.decide("base colour of metals", "solved at the full texture" if sharp else "as fitted", why)
+        values = sharp_metals(surface, coarse, fit, fitted.metal, plain[:, 3], values, list(zip(photos, shot, strict=True)))
     if fitted.glowing:
         values = np.concatenate([values, coarse.up(fitted.glow) * fine], 1)
     known = coarse.up(fitted.weight[:, None])[:, 0] > LEAST_SEEN * (coarse.edge / footprint) ** 2

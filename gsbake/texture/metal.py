@@ -97,11 +97,6 @@ class Line:
         offset = evidence.shade(0.0, roughness, metallic)
         return cls(evidence.shade(1.0, roughness, metallic) - offset, offset)
 
-    def towards(self, other: Line, share: NDArray[Any]) -> Line:
-        """The lines of materials that are `other` by a `share` (n,): shading is linear in metallic as well."""
-        there = np.asarray(share, np.float32)[:, None]
-        return Line(self.slope + there * (other.slope - self.slope), self.offset + there * (other.offset - self.offset))
-
     def error(self, colour: NDArray[np.float32], base: NDArray[Any]) -> NDArray[np.float32]:
         """Errors (n, 3) of sRGB values, clipped at white, of pixels of linear `colour` (n, 3) that show `base` (n, 3)."""
         return np.asarray(encode(np.clip(base * self.slope + self.offset, 0, 1)) - encode(colour))

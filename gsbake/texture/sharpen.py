@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from gsbake.capture.cameras import Camera
 from gsbake.texture.coarse import Coarse
-from gsbake.texture.fit import METAL, MaterialFit
+from gsbake.texture.fit import MaterialFit
 from gsbake.texture.metal import DARKEST_METAL, ROBUST, Evidence, Line, told
 from gsbake.texture.pixels import PixelReader, Pixels
 from gsbake.texture.surface import Surface
@@ -44,8 +44,9 @@ STAY = 0.001
 PATTERN, SHARE = 2.0, 0.35
 #: Hue is averaged over about so many texels: patterns are of bright and dark, and one lamp's reflection a little off is of one colour.
 HUE = 4.0
-#: Held-out photos must be shown this much better by what was solved: metal without a pattern finer than a pixel gains nothing but noise.
-CLEARLY = 0.95
+#: What was solved counts where holes are between these shares of the texels around, about so many: metal without holes, and what is nothing
+#: but a hole, were fitted as well and have less noise.
+HOLES, AROUND = (0.1, 0.6), 12.0
 #: Reflectance of what is no metal, seen head-on.
 GLOSS = 0.04
 
@@ -53,7 +54,7 @@ GLOSS = 0.04
 @dataclass(frozen=True)
 class Seen:
     """m pixels of one photo: the texels (m, k) each is an average of and which of them `counts` (m, k), their `evidence`, and what they
-    show as a `line` in the base colour there."""
+    show as a `line` in a metal's base colour."""
 
     texel: NDArray[np.int64]
     counts: NDArray[np.bool_]
@@ -68,16 +69,28 @@ def metal_places(texels: Texels, metal: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 
 def sharpened(values: Floats, texels: Texels, place: NDArray[np.bool_], photos: Sequence[Seen]) -> Floats:
-    """`values` (n, 5) of `texels` (linear base colour, roughness, metallic) with the base colour of metals solved in `place` (n,).
+    """`values` (n, 5) of `texels` (linear base colour, roughness, metallic) with the base colour of metals that have holes solved in
+    `place` (n,).
 
-    What turns out darker than any metal is paint in a metal's pattern: a hole.
+    What turns out darker than any metal is paint in a metal's pattern: a hole. The rest of the pattern is metal alone.
     """
     base = _of_calm_hue(_solved(_parts(photos, place), values[place, :3]), texels, place)
     hole = base.mean(1) < DARKEST_METAL
+    kept = _patterned(texels, place, hole)
+    there = np.flatnonzero(place)[kept]
     out = values.copy()
-    out[place, :3] = np.where(hole[:, None], np.maximum(base - GLOSS, 0), base)
-    out[place, 4] *= ~hole
+    out[there, :3] = np.where(hole[:, None], np.maximum(base - GLOSS, 0), base)[kept]
+    out[there, 4] = ~hole[kept]
     return out
+
+
+def _patterned(texels: Texels, place: NDArray[np.bool_], hole: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Which of the t texels in `place` (n,) have bright metal and holes (t,) around them, both."""
+    both = np.zeros((len(place), 2), np.float32)
+    both[place, 0], both[place, 1] = hole, 1
+    around = cv2.GaussianBlur(texels.image(both), (0, 0), AROUND).reshape(-1, 2)[texels.index[place]]
+    share = around[:, 0] / np.maximum(around[:, 1], 1e-6)
+    return np.asarray((share > HOLES[0]) & (share < HOLES[1]))
 
 
 def _of_calm_hue(base: Floats, texels: Texels, place: NDArray[np.bool_]) -> Floats:
@@ -95,7 +108,6 @@ class _Part:
 
     mean: Any
     colour: Floats
-    counts: Floats
     weight: Floats
     line: Line
 
@@ -119,19 +131,10 @@ def _parts(photos: Sequence[Seen], place: NDArray[np.bool_]) -> list[_Part]:
         row, k = np.nonzero(counts[enough])
         share = (1 / counts.sum(1)[enough][row]).astype(np.float32)
         mean = scipy.sparse.csr_matrix((share, (row, column[seen.texel[enough][row, k]])), shape=(int(enough.sum()), int(place.sum())))
+        e = seen.evidence
         line = Line(seen.line.slope[enough], seen.line.offset[enough])
-        parts.append(_Part(mean, seen.evidence.colour[enough], seen.evidence.weight[enough], told(seen.evidence)[enough], line))
+        parts.append(_Part(mean, e.colour[enough], told(e)[enough], line))
     return parts
-
-
-def unexplained(values: Floats, place: NDArray[np.bool_], photos: Sequence[Seen]) -> float:
-    """Mean robust error of sRGB values that the base colours of `values` (n, 5) in `place` (n,) leave in the `photos`."""
-    left = total = 0.0
-    for part in _parts(photos, place):
-        error = part.line.error(part.colour, part.mean @ values[place, :3])
-        left += float((part.counts * (np.sqrt(error**2 + ROBUST**2) - ROBUST).mean(1)).sum())
-        total += float(part.counts.sum())
-    return left / max(total, 1e-12)
 
 
 def _solved(parts: Sequence[_Part], start: Floats) -> Floats:
@@ -153,39 +156,18 @@ def sharp_metals(
     coarse: Coarse,
     fit: MaterialFit,
     metal: NDArray[np.bool_],
-    fitted: Floats,
+    roughness: Floats,
     values: Floats,
     photos: Sequence[tuple[Pixels, Camera]],
-    judges: Sequence[tuple[Pixels, Camera]],
-) -> tuple[Floats, bool, str]:
-    """`values` (n, 5) of the surface's texels with the base colour of what the `fit` found to be metal solved anew, where that shows the
-    photos that are `judges` clearly better; whether it does, and the evidence.
+) -> Floats:
+    """`values` (n, 5) of the surface's texels with the base colour solved anew where the `fit` found metal and the metal has holes.
 
-    What stayed as metallic as metals start in the fit, or more, is then all metal.
-    `metal` (m,) and the values `fitted` (m, 5) belong to the `coarse` texels; `photos` are the pixels they are fitted to, with cameras.
+    `metal` (m,) and `roughness` (m,) belong to the `coarse` texels; `photos` are the pixels they are fitted to, with cameras.
     """
     place = metal_places(coarse.texels, metal)
-    inside = coarse.up(place[:, None].astype(np.float32))[:, 0] > 0.5
     reader = PixelReader(surface.whole, surface.atlas.uv, surface.texels, surface.diagonal)
-
-    def seen(some: Sequence[tuple[Pixels, Camera]], materials: Floats) -> list[Seen]:
-        out = []
-        for pixels, camera in some:
-            rows, evidence = fit.showing(pixels, place)
-            paint, pure = (Line.of(evidence, materials[:, 3], metallic) for metallic in (0.0, 1.0))
-            line = paint.towards(pure, materials[evidence.texel, 4])
-            out.append(Seen(*reader.samples(camera, pixels.pixel[rows]), evidence, line))
-        return out
-
-    pure = _purer(fitted, place)
-    sharp = sharpened(_purer(values, inside), surface.texels, inside, seen(photos, pure))
-    before, after = unexplained(values, inside, seen(judges, fitted)), unexplained(sharp, inside, seen(judges, pure))
-    better = after < CLEARLY * before
-    return sharp if better else values, better, f"metals are off by {after:.4f} in held-out photos with it, by {before:.4f} without"
-
-
-def _purer(values: Floats, place: NDArray[np.bool_]) -> Floats:
-    """`values` (n, 5) with what is as metallic in `place` (n,) as metals start in the fit taken for metal alone."""
-    out = values.copy()
-    out[place, 4] = np.minimum(out[place, 4] / METAL, 1)
-    return out
+    seen = []
+    for pixels, camera in photos:
+        rows, evidence = fit.showing(pixels, place)
+        seen.append(Seen(*reader.samples(camera, pixels.pixel[rows]), evidence, Line.of(evidence, roughness, 1.0)))
+    return sharpened(values, surface.texels, coarse.up(place[:, None].astype(np.float32))[:, 0] > 0.5, seen)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from gsbake.light.environment import EnvironmentLight
 from gsbake.light.shade import shade
-from gsbake.texture.metal import DARKEST_METAL, LEAST_PHOTOS, Evidence, Line, find_metals
+from gsbake.texture.metal import DARKEST_METAL, LEAST_PHOTOS, Evidence, find_metals
 
 TEXELS, PHOTOS = 60, 24
 
@@ -113,16 +113,6 @@ def test_neighbours_decide_together(wall: Wall) -> None:
     for few, many, found in ((metal, paint, 0), (paint, metal, TEXELS)):
         mixed = [replace(m, colour=np.where(np.arange(TEXELS)[:, None] == 7, f.colour, m.colour)) for f, m in zip(few, many, strict=True)]
         assert len(find_metals(mixed, own, all_alike).texel) == found
-
-
-def test_what_a_half_metal_shows_lies_on_the_line_between_paint_and_metal(wall: Wall) -> None:
-    rough = np.full(TEXELS, 0.3, np.float32)
-    evidence = wall.photos(np.full((TEXELS, 3), 0.5, np.float32), 0.3, 0.0)[0]
-    paint, pure = (Line.of(evidence, rough, metallic) for metallic in (0.0, 1.0))
-    half = paint.towards(pure, np.full(TEXELS, 0.4))
-    base = np.random.default_rng(0).uniform(0.1, 0.9, (TEXELS, 3)).astype(np.float32)
-    shown = wall.colours(wall.towards[0], base, rough, 0.4)
-    np.testing.assert_allclose(half.slope * base + half.offset, shown, rtol=1e-4, atol=1e-5)
 
 
 def test_what_is_clipped_at_white_does_not_hide_a_metal(wall: Wall) -> None:
