@@ -8,8 +8,8 @@ and shows grey. What a photo shows is a straight line in the base colour, though
 and all pixels of all photos together say more than one pixel per texel. The sum of weighted squares (errors as the eye sees them, those far
 off counted less) is brought down in simultaneous steps (SIRT), which stay in [0, 1] and close to where they started where no pixel looks.
 
-Paint is left as it was fitted: what photos of paint show hangs on its diffuse shading, which the fit at a pixel knows as well, and what
-reflections leave over would end as stains.
+Metal without holes is left as it was fitted: it has no such pattern, and what is solved has more noise. So is paint: what photos of paint
+show hangs on its diffuse shading, which the fit at a pixel knows as well, and what reflections leave over would end as stains.
 
 Goldlücke & Cremers, *Superresolution texture maps for multiview reconstruction*, ICCV 2009 (a texture finer than the photos, each pixel the
 mean of what it covers); Gilbert, *Iterative methods for the three-dimensional reconstruction of an object from projections*, 1972 (SIRT).
@@ -64,8 +64,7 @@ class Seen:
 
 def metal_places(texels: Texels, metal: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Where (n,) the texels around are mostly `metal` (n,)."""
-    share = cv2.GaussianBlur(texels.image(metal.astype(np.float32))[..., 0], (0, 0), PATTERN)
-    return np.asarray(share.ravel()[texels.index] > SHARE)
+    return np.asarray(_around(texels, metal[:, None], PATTERN)[:, 0] > SHARE)
 
 
 def sharpened(values: Floats, texels: Texels, place: NDArray[np.bool_], photos: Sequence[Seen]) -> Floats:
@@ -84,11 +83,17 @@ def sharpened(values: Floats, texels: Texels, place: NDArray[np.bool_], photos: 
     return out
 
 
+def _around(texels: Texels, values: NDArray[Any], width: float) -> Floats:
+    """`values` (n, c) averaged over about `width` texels around each; those outside the charts count as 0."""
+    image = cv2.GaussianBlur(texels.image(values), (0, 0), width)
+    return np.asarray(image.reshape(texels.size**2, -1)[texels.index])
+
+
 def _patterned(texels: Texels, place: NDArray[np.bool_], hole: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Which of the t texels in `place` (n,) have bright metal and holes (t,) around them, both."""
     both = np.zeros((len(place), 2), np.float32)
     both[place, 0], both[place, 1] = hole, 1
-    around = cv2.GaussianBlur(texels.image(both), (0, 0), AROUND).reshape(-1, 2)[texels.index[place]]
+    around = _around(texels, both, AROUND)[place]
     share = around[:, 0] / np.maximum(around[:, 1], 1e-6)
     return np.asarray((share > HOLES[0]) & (share < HOLES[1]))
 
@@ -97,14 +102,14 @@ def _of_calm_hue(base: Floats, texels: Texels, place: NDArray[np.bool_]) -> Floa
     """`base` (t, 3) of the `texels` in `place` (n,), each as bright as it is, but of the mean hue of those around."""
     image = np.zeros((len(place), 3), np.float32)
     image[place] = base
-    around = cv2.GaussianBlur(texels.image(image), (0, 0), HUE).reshape(-1, 3)[texels.index[place]]
+    around = _around(texels, image, HUE)[place]
     return np.asarray(np.clip(around * (base.mean(1) / np.maximum(around.mean(1), 1e-6))[:, None], 0, 1))
 
 
 @dataclass(frozen=True)
 class _Part:
-    """One photo's share of the problem: the matrix (m, t) that averages t texels for its m pixels, their linear `colour` (m, 3), what they
-    `counts` (m,) for, `weight` (m, 3) by eye, and `line`."""
+    """One photo's share of the problem: the matrix (m, t) that averages t texels for its m pixels, their linear `colour` (m, 3), `weight`
+    (m, 3) and `line`."""
 
     mean: Any
     colour: Floats
