@@ -278,6 +278,7 @@ def _fit_materials(
 
     priors = Priors(settings.smooth_prior, settings.dark_prior, settings.metal_prior, settings.white_prior)
     normal, occlusion, base = (coarse.down(x) for x in (detail.normal, open_share[:, None], shown.values))
+    at = coarse.texels.interpolate(surface.position, surface.atlas.faces)
 
     seen = None
     if settings.visibility in ("directional", "bounce") and settings.occlusion_rays:
@@ -288,7 +289,7 @@ def _fit_materials(
 
     def start(roughness: float) -> MaterialFit:
         light_size, bounce = ctx.settings.splat.env_size, settings.visibility == "bounce"
-        return MaterialFit(coarse.texels, normal, occlusion[:, 0], base, light_size, priors, roughness, seen, bounce)
+        return MaterialFit(coarse.texels, at, normal, occlusion[:, 0], base, light_size, priors, roughness, seen, bounce)
 
     diffuse, why = looks_diffuse(*watch.changes())
     matte = wanted(ctx, "view_dependence", diffuse)
@@ -374,7 +375,7 @@ def _save_mesh(ctx: Context, surface: Surface) -> None:
 
 STAGE = Stage(
     name="bake",
-    version=6,
+    version=7,
     title="Textures",
     run=run,
     needs=("poses", "refine", "mesh"),

@@ -8,9 +8,10 @@ left of the light without the gloss, and the fit gives E; in every connected reg
 
 Such a region must end at an edge: a part that glows is a part, whereas a band of like brightness on shaded paint is not.
 
-E is smoothed to a plane over the region first: normals of a mesh tremble, and a trembling E would flatten the slope of any paint. Only
-what paint could hardly be is asked at all: left / E near or above 1, for energy is conserved and paints paler than snow do not exist
-(Lagarde & de Rousiers, *Moving Frostbite to PBR*, 2014, give .8 as the most). A flat lamp under even light stays paint: nothing tells.
+E is smoothed first, to what changes evenly from one end of the region to the other: normals of a mesh tremble, and a trembling E would
+flatten the slope of any paint. Only what paint could hardly be is asked at all: left / E near or above 1, for energy is conserved and
+paints paler than snow do not exist (Lagarde & de Rousiers, *Moving Frostbite to PBR*, 2014, give .8 as the most). A flat lamp under even
+light stays paint: nothing tells.
 """
 
 from __future__ import annotations
@@ -54,8 +55,8 @@ class Glow:
 
 
 def find_glow(photos: Sequence[Evidence], own: NDArray[np.float32], pairs: NDArray[np.int64], place: NDArray[Any]) -> Glow:
-    """The texels that glow; `own` (n,) is their present roughness, `pairs` (p, 2) the neighbouring ones, `place` (n, 2) where each lies in
-    the texture."""
+    """The texels that glow; `own` (n,) is their present roughness, `pairs` (p, 2) the neighbouring ones, `place` (n, 3) where each
+    lies on the surface."""
     left, irradiance = _left(photos, own)
     peak = left.max(1)
     pairs = pairs[(seen(photos, len(own)) > LEAST_WEIGHT)[pairs].all(1)]
@@ -107,7 +108,7 @@ def _core(brightness: Floats) -> NDArray[np.bool_]:
 
 
 def _glows(left: Floats, irradiance: Floats, place: NDArray[Any]) -> bool:
-    """Whether a region of m texels with light `left` (m, 3) under `irradiance` / π (m, 3) at `place` (m, 2) glows."""
+    """Whether a region of m texels with light `left` (m, 3) under `irradiance` / π (m, 3) at `place` (m, 3) glows."""
     paint = np.median(left / np.maximum(irradiance, 1e-6), 0).max()
     if not paint > PALEST:
         return False

@@ -36,6 +36,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -50,6 +51,7 @@ from gsbake.texture.batch import BOUNCED, GLOW, Batch
 from gsbake.texture.emission import find_glow
 from gsbake.texture.level import Level, find_level, graded
 from gsbake.texture.metal import Evidence, find_metals
+from gsbake.texture.neighbours import neighbours
 from gsbake.texture.pixels import Pixels
 from gsbake.texture.texels import Texels
 from gsbake.texture.visibility import Visibility
@@ -121,6 +123,7 @@ class MaterialFit:
     def __init__(
         self,
         texels: Texels,
+        at: NDArray[Any],
         normal: NDArray[Any],
         occlusion: NDArray[Any],
         base: NDArray[Any],
@@ -130,9 +133,9 @@ class MaterialFit:
         visibility: Visibility | None = None,
         bounce: bool = True,
     ) -> None:
-        """`normal` (n, 3) unit normals of the n texels in the mesh's frame, `occlusion` (n,) their open share, `base` (n, 3) linear colours
-        and `roughness` to start from; `light_size` is the edge of the environment cube map. With `visibility` shadows
-        follow the light, with `bounce` texels light each other as well."""
+        """The n texels lie `at` (n, 3) with unit normals `normal` (n, 3), both in the mesh's frame; `occlusion` (n,) is their open share,
+        `base` (n, 3) linear colours and `roughness` what they start from; `light_size` is the edge of the environment cube map. With
+        `visibility` shadows follow the light, with `bounce` texels light each other as well."""
         n = len(texels)
         logits = torch.zeros(n, 5)
         logits[:, :3] = torch.logit(torch.as_tensor(np.clip(base, *BASE_RANGE), dtype=torch.float32))
@@ -143,13 +146,12 @@ class MaterialFit:
         self._even = EVEN * (texels.size / 512) ** 2  # a slope per texel is steeper where texels are larger
         open_share = torch.as_tensor(np.ascontiguousarray(occlusion, np.float32))[:, None]
         self._around = torch.cat([open_share, open_share, torch.zeros(n, 6)], 1)
-        self._like = Alike(texels, base)
-        self._place = np.column_stack([texels.index % texels.size, texels.index // texels.size]).astype(np.float64)
+        self._texels, self._at, self._shown = texels, np.asarray(at, np.float64), base
         self._visibility, self._bounce = visibility, bounce
         self._light = EnvironmentLight(light_size)
         self._priors = priors
         self._alike = torch.tensor(ALIKE)
-        self._pairs = torch.as_tensor(_neighbours(texels))
+        self._pairs = torch.as_tensor(neighbours(texels, at, normal))
         self._adam = torch.optim.Adam([self._logits.requires_grad_()], lr=RATE, betas=BETAS, eps=STILL)
         self._adam_bend = torch.optim.Adam([self._bend], lr=RATE_BEND, betas=BETAS, eps=STILL)
         self._adam_light = torch.optim.Adam([self._light.raw], lr=RATE_LIGHT, betas=BETAS)
@@ -275,6 +277,11 @@ class MaterialFit:
         self._restart(at.numpy(), start)
         return found
 
+    @cached_property
+    def _like(self) -> Alike:
+        """Averages over texels that look alike; a trial never asks for them."""
+        return Alike(self._texels, self._pairs.numpy(), self._shown)
+
     @torch.no_grad()
     def _set_metals(self, batches: list[Batch]) -> NDArray[np.bool_]:
         """Start texels that metal explains better anew, as that metal; which (n,) they are."""
@@ -290,7 +297,7 @@ class MaterialFit:
         """Give the regions that glow their light and start their paint anew from black; how many regions they are."""
         tables = self._light.prefilter()
         values = torch.sigmoid(self._logits).numpy()
-        found = find_glow([b.evidence(self._bend, tables, self._around) for b in batches], values[:, 3], self._pairs.numpy(), self._place)
+        found = find_glow([b.evidence(self._bend, tables, self._around) for b in batches], values[:, 3], self._pairs.numpy(), self._at)
         self._around[torch.as_tensor(found.texel), GLOW] = torch.as_tensor(found.radiance, dtype=torch.float32)
         black = values[found.texel]
         black[:, :3], black[:, 4] = BASE_RANGE[0], METALLIC
@@ -352,17 +359,3 @@ def trial_cost(photos: list[Pixels], step: float) -> float:
     pixels = sum(len(p) for p in photos) / len(photos)
     return len(TRIALS) * TRIAL_STEPS * step * min(1.0, TRIAL_PIXELS / max(1.0, pixels))
 
-
-def _neighbours(texels: Texels) -> NDArray[np.int64]:
-    """Pairs (m, 2) of texels side by side in the texture, in a fixed mixed order."""
-    size = texels.size
-    slot = np.full((size, size), -1, np.int64)
-    slot.ravel()[texels.index] = np.arange(len(texels))
-    pairs = []
-    for a, b in ((slot[:, :-1], slot[:, 1:]), (slot[:-1], slot[1:])):
-        both = (a >= 0) & (b >= 0)
-        pairs.append(np.stack([a[both], b[both]], 1))
-    out = np.concatenate(pairs)
-    blocks = np.array_split(out, max(1, len(out) // 256))
-    np.random.default_rng(0).shuffle(blocks)
-    return np.concatenate(blocks) if blocks else out

@@ -10,8 +10,8 @@ at the photo's own colour: errors are those of the eye, not of the lamp. What th
 show it, clipped at white and robust: a lamp in a mirror is no brighter than white paper, and where the reflection is a little off one
 pixel must not outweigh the others. A metal must reflect clearly more of every colour than the .04 of paint, or black gloss passes for
 a dark metal. A texel has seen too few pixels to tell by itself: neighbours that look alike decide together (`alike`), each with its own
-colour. Clean metals reflect a third or more (gold's blue is .34: Lagarde & de Rousiers, *Moving Frostbite to PBR*, 2014), but rusty,
-anodised and dirty ones, and many that artists painted, go down to .1.
+colour, and what most of them are all of them are. Clean metals reflect a third or more (gold's blue is .34: Lagarde & de Rousiers,
+*Moving Frostbite to PBR*, 2014), but rusty, anodised and dirty ones, and many that artists painted, go down to .1.
 """
 
 from __future__ import annotations
@@ -33,6 +33,9 @@ ROUGHNESS = (0.1, 0.2, 0.35, 0.55)
 DARKEST_METAL, CLEAN_METAL = 0.1, 0.3
 #: What the metal leaves unexplained must be below this share of what the paint leaves: for dark metals, which are rarer, and clean ones.
 CLEARLY = (0.9, 1.0)
+#: So much of what looks alike around a texel must be metal, or the texel is paint as well; and the other way round: a place that one lamp's
+#: misplaced reflection spoils goes with its surroundings.
+MOST = 0.5
 #: Pixels brighter than this (linear) do not say how much is reflected; errors of sRGB values beyond about the second count by themselves.
 WHITE, ROBUST = 0.95, 0.1
 #: Darkest linear colour that the slope of the sRGB curve is taken at.
@@ -126,6 +129,11 @@ class _Sums:
         return np.clip(self.mixed / np.maximum(self.slopes, 1e-12), darkest, 1.0)
 
 
+def as_around(better: NDArray[np.bool_], known: NDArray[np.bool_], around: Callable[[Floats], Floats]) -> NDArray[np.bool_]:
+    """Which of the texels that are `known` (n,) are metal if each is what most known ones `around` it are, by `better` (n,)."""
+    return np.asarray(known & (around((better & known).astype(np.float64)) > MOST * around(known.astype(np.float64))))
+
+
 def find_metals(photos: Sequence[Evidence], own: NDArray[np.float32], around: Callable[[Floats], Floats] = lambda left: left) -> Metals:
     """The texels that are better explained as metal; `own` (texels,) is their present roughness.
 
@@ -148,8 +156,10 @@ def find_metals(photos: Sequence[Evidence], own: NDArray[np.float32], around: Ca
                 continue
             better = left < metal
             metal[better], base[better], roughness[better] = left[better], b[better], tried[better]
-    share = np.where(base.mean(1) < CLEAN_METAL, *CLEARLY)
     sides = sum((around((np.bincount(e.texel, e.weight, texels) > 0).astype(np.float64)) > NEARBY for e in photos), np.zeros(texels, int))
     known = (seen(photos, texels) > LEAST_WEIGHT) & (sides >= LEAST_PHOTOS)
-    chosen = np.flatnonzero(known & (around(metal) < share * around(paint)))
+    count = np.maximum(around(known.astype(np.float64)), 1e-9)
+    share = np.where(around(np.where(known, base.mean(1), 0.0)) / count < CLEAN_METAL, *CLEARLY)
+    better = np.asarray(around(metal) < share * around(paint))
+    chosen = np.flatnonzero(as_around(better, known, around))
     return Metals(chosen, base[chosen], roughness[chosen])

@@ -8,8 +8,10 @@ and shows grey. What a photo shows is a straight line in the base colour, though
 and all pixels of all photos together say more than one pixel per texel. The sum of weighted squares (errors as the eye sees them, those far
 off counted less) is brought down in simultaneous steps (SIRT), which stay in [0, 1] and close to where they started where no pixel looks.
 
-Metal without holes is left as it was fitted: it has no such pattern, and what is solved has more noise. So is paint: what photos of paint
-show hangs on its diffuse shading, which the fit at a pixel knows as well, and what reflections leave over would end as stains.
+Where the metal turns out to have holes it is solved a second time, with what a grille is: bars of one metal and nothing between them. From
+step to step every texel is drawn, in the end as strongly as by the pixels, to the nearer of the two. Metal without holes is left as it was
+fitted: it has no such pattern, and what is solved has more noise. So is paint: what photos of paint show hangs on its diffuse shading,
+which the fit at a pixel knows as well, and what reflections leave over would end as stains.
 
 Goldlücke & Cremers, *Superresolution texture maps for multiview reconstruction*, ICCV 2009 (a texture finer than the photos, each pixel the
 mean of what it covers); Gilbert, *Iterative methods for the three-dimensional reconstruction of an object from projections*, 1972 (SIRT).
@@ -17,7 +19,7 @@ mean of what it covers); Gilbert, *Iterative methods for the three-dimensional r
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -47,6 +49,9 @@ HUE = 4.0
 #: What was solved counts where holes are between these shares of the texels around, about so many: metal without holes, and what is nothing
 #: but a hole, were fitted as well and have less noise.
 HOLES, AROUND = (0.1, 0.6), 12.0
+#: Steps before a grille's texels are drawn to metal or hole. Which of the two: hole where darker than this share of the metal, whose colour
+#: is the mean of the brighter texels around weighed by this power of their brightness (photos blur bars as well).
+UNDRAWN, NEARER, BRIGHTER = 3, 0.4, 8
 #: Reflectance of what is no metal, seen head-on.
 GLOSS = 0.04
 
@@ -74,12 +79,19 @@ def sharpened(values: Floats, texels: Texels, place: NDArray[np.bool_], photos: 
     What turns out darker than any metal is paint in a metal's pattern: a hole. The rest of the pattern is metal alone.
     """
     base = _of_calm_hue(_solved(_parts(photos, place), values[place, :3]), texels, place)
+    grille = place.copy()
+    grille[place] = _patterned(texels, place, base.mean(1) < DARKEST_METAL)
+    if not grille.any():
+        return values
+
+    def bars_or_holes(base: Floats) -> Floats:
+        return _nearer(base, texels, grille)
+
+    base = _of_calm_hue(_solved(_parts(photos, grille), values[grille, :3], bars_or_holes), texels, grille)
     hole = base.mean(1) < DARKEST_METAL
-    kept = _patterned(texels, place, hole)
-    there = np.flatnonzero(place)[kept]
     out = values.copy()
-    out[there, :3] = np.where(hole[:, None], np.maximum(base - GLOSS, 0), base)[kept]
-    out[there, 4] = ~hole[kept]
+    out[grille, :3] = np.where(hole[:, None], np.maximum(base - GLOSS, 0), base)
+    out[grille, 4] = ~hole
     return out
 
 
@@ -104,6 +116,21 @@ def _of_calm_hue(base: Floats, texels: Texels, place: NDArray[np.bool_]) -> Floa
     image[place] = base
     around = _around(texels, image, HUE)[place]
     return np.asarray(np.clip(around * (base.mean(1) / np.maximum(around.mean(1), 1e-6))[:, None], 0, 1))
+
+
+def _nearer(base: Floats, texels: Texels, place: NDArray[np.bool_]) -> Floats:
+    """For each texel of `base` (t, 3) in `place` (n,) the colour (t, 3) of the metal around it, or black where that is nearer."""
+
+    def mean(of: NDArray[Any]) -> Floats:
+        weighed = np.zeros((len(place), 4), np.float32)
+        weighed[place, :3], weighed[place, 3] = base * of[:, None], of
+        around = _around(texels, weighed, AROUND)[place]
+        return np.asarray(around[:, :3] / np.maximum(around[:, 3:], 1e-6))
+
+    brightness = base.mean(1)
+    brighter = brightness > mean(np.ones(len(base))).mean(1)
+    metal = mean(brighter * brightness**BRIGHTER)
+    return np.asarray(np.where((brightness > NEARER * metal.mean(1))[:, None], metal, 0), np.float32)
 
 
 @dataclass(frozen=True)
@@ -142,8 +169,9 @@ def _parts(photos: Sequence[Seen], place: NDArray[np.bool_]) -> list[_Part]:
     return parts
 
 
-def _solved(parts: Sequence[_Part], start: Floats) -> Floats:
-    """Base colours (t, 3) in [0, 1] near `start` under which pixels show what their photos do."""
+def _solved(parts: Sequence[_Part], start: Floats, likely: Callable[[Floats], Floats] | None = None) -> Floats:
+    """Base colours (t, 3) in [0, 1] near `start` under which pixels show what their photos do; drawn more and more to what is `likely`,
+    given the present ones, where that is said."""
     base = start.copy()
     for step in range(STEPS):
         pull, asked = np.zeros_like(start), np.zeros_like(start)
@@ -151,8 +179,12 @@ def _solved(parts: Sequence[_Part], start: Floats) -> Floats:
             towards, weight = part.asks(base, step >= PLAIN)
             pull += towards
             asked += weight
-        stay = STAY * np.median(asked[asked > 0]) if (asked > 0).any() else 1.0
-        base = np.asarray(np.clip(base + (pull + stay * (start - base)) / (asked + stay), 0, 1), np.float32)
+        usual = np.median(asked[asked > 0]) if (asked > 0).any() else 1.0
+        pull, asked = pull + STAY * usual * (start - base), asked + STAY * usual
+        if likely is not None and step >= UNDRAWN:
+            drawn = usual * (step + 1 - UNDRAWN) / (STEPS - UNDRAWN)
+            pull, asked = pull + drawn * (likely(base) - base), asked + drawn
+        base = np.asarray(np.clip(base + pull / asked, 0, 1), np.float32)
     return base
 
 

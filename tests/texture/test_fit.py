@@ -81,7 +81,7 @@ class Scene:
 
     def fit(self, roughness: float, priors: Priors = FREE) -> MaterialFit:
         n = len(self.texels)
-        return MaterialFit(self.texels, self.normal, np.ones(n), np.full((n, 3), 0.3), 16, priors, roughness)
+        return MaterialFit(self.texels, self.normal, self.normal, np.ones(n), np.full((n, 3), 0.3), 16, priors, roughness)
 
 
 @pytest.fixture(scope="module")
@@ -129,7 +129,7 @@ def test_wrong_normals_bend_towards_what_reflections_show(glossy: Scene) -> None
     n, truth = len(glossy.texels), glossy.normal
     lean = 0.15 * np.sin(3 * truth[:, 2:]) * np.array([0.3, -0.5, 0.8])
     wrong = (truth + lean) / np.linalg.norm(truth + lean, axis=1, keepdims=True)
-    fit = MaterialFit(glossy.texels, wrong, np.ones(n), np.full((n, 3), 0.3), 16, FREE, 0.2)
+    fit = MaterialFit(glossy.texels, truth, wrong, np.ones(n), np.full((n, 3), 0.3), 16, FREE, 0.2)
     fitted = fit.run(glossy.photos, [], 300, 0)
     known = fitted.weight > 0.3
     bent = wrong + fitted.bend

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from gsbake.light.environment import EnvironmentLight
 from gsbake.light.shade import shade
-from gsbake.texture.metal import DARKEST_METAL, LEAST_PHOTOS, Evidence, find_metals
+from gsbake.texture.metal import DARKEST_METAL, LEAST_PHOTOS, Evidence, as_around, find_metals
 
 TEXELS, PHOTOS = 60, 24
 
@@ -113,6 +113,15 @@ def test_neighbours_decide_together(wall: Wall) -> None:
     for few, many, found in ((metal, paint, 0), (paint, metal, TEXELS)):
         mixed = [replace(m, colour=np.where(np.arange(TEXELS)[:, None] == 7, f.colour, m.colour)) for f, m in zip(few, many, strict=True)]
         assert len(find_metals(mixed, own, all_alike).texel) == found
+
+
+def test_a_spoiled_place_goes_with_its_surroundings() -> None:
+    place = np.arange(40)
+    kernel = np.exp(-np.abs(place[:, None] - place) / 3.0)
+    better = (place >= 20) & (place != 30) | (place == 8)
+    known = place != 35
+    found = as_around(better, known, lambda x: kernel @ x)
+    np.testing.assert_array_equal(np.flatnonzero(found), [*range(20, 35), *range(36, 40)])
 
 
 def test_what_is_clipped_at_white_does_not_hide_a_metal(wall: Wall) -> None:

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy.optimize import lsq_linear
 
 from gsbake.texture.metal import Evidence, Line, told
-from gsbake.texture.sharpen import HUE, Seen, _of_calm_hue, _parts, _solved, metal_places, sharpened
+from gsbake.texture.sharpen import HUE, Seen, _nearer, _of_calm_hue, _parts, _solved, metal_places, sharpened
 from gsbake.texture.texels import Texels
 
 SIZE = 32
@@ -106,6 +106,31 @@ def test_metal_without_holes_and_paint_are_left_alone() -> None:
     out = sharpened(values, texels, place, photos(pierced.astype(np.float32)))
     np.testing.assert_array_equal(out[~place], values[~place])
     assert (out[place] != values[place]).mean() > 0.5
+
+
+def test_noise_is_drawn_to_metal_or_hole() -> None:
+    texels = everywhere()
+    column, row = texels.index % SIZE, texels.index // SIZE
+    hole = (column % 6 < 3) & (row % 6 < 3)
+    truth = np.where(hole[:, None], 0.0, GOLD).astype(np.float32)
+    everything = np.ones(len(texels), bool)
+    values = np.tile(np.array([0.4, 0.4, 0.4, 0.2, 0.8], np.float32), (len(texels), 1))
+    seen = photos(truth, 30, 0.08)
+    alone = _solved(_parts(seen, everything), values[:, :3])
+    drawn = sharpened(values, texels, everything, seen)[:, :3]
+    inner = (np.minimum(column, row) > 3) & (np.maximum(column, row) < SIZE - 5)
+    before, after = (np.abs(x[inner] - truth[inner]).mean() for x in (alone, drawn))
+    assert after < 0.7 * before
+
+
+def test_what_is_nearer_is_the_metal_around_or_black() -> None:
+    texels = everywhere()
+    column, row = texels.index % SIZE, texels.index // SIZE
+    hole = (column % 6 < 3) & (row % 6 < 3)
+    shown = np.where(hole[:, None], 0.15 * GOLD, 0.9 * GOLD).astype(np.float32)
+    out = _nearer(shown, texels, np.ones(len(texels), bool))
+    assert (out[hole] == 0).all()
+    np.testing.assert_allclose(out[~hole], np.tile(0.9 * GOLD, (int((~hole).sum()), 1)), rtol=0.02)
 
 
 @pytest.mark.parametrize(("share", "place"), [(0.6, True), (0.1, False)])

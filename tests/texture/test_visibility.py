@@ -211,7 +211,7 @@ class Tray:
         texels = self.box.texels
         ambient = np.ones(len(texels)) if visibility is None else visibility.openness(WHITE)
         start = np.full((len(texels), 3), 0.4)
-        fit = MaterialFit(texels, self.box.normal, ambient, start, 16, Priors(), 0.5, visibility, bounce)
+        fit = MaterialFit(texels, self.box.at, self.box.normal, ambient, start, 16, Priors(), 0.5, visibility, bounce)
         fitted = fit.run(self.photos, [], 120, 0)
         known = fitted.weight > 0.3
         gain = (fitted.values[known, :3] * self.paint[known]).sum(0) / (fitted.values[known, :3] ** 2).sum(0)
