@@ -128,8 +128,8 @@ def _nearer(base: Floats, texels: Texels, place: NDArray[np.bool_]) -> Floats:
         return np.asarray(around[:, :3] / np.maximum(around[:, 3:], 1e-6))
 
     brightness = base.mean(1)
-    brighter = brightness > mean(np.ones(len(base))).mean(1)
-    metal = mean(brighter * brightness**BRIGHTER)
+    ratio = brightness / np.maximum(mean(np.ones(len(base))).mean(1), 1e-6)
+    metal = mean((ratio > 1) * ratio**BRIGHTER)
     return np.asarray(np.where((brightness > NEARER * metal.mean(1))[:, None], metal, 0), np.float32)
 
 

@@ -14,7 +14,7 @@ from gsbake.texture.metal import Evidence
 
 SIDE, PHOTOS, ROUGH = 32, 8, 0.3
 ROWS, COLUMNS = (x.ravel() for x in np.mgrid[:SIDE, :SIDE])
-PLACE = np.column_stack([COLUMNS, ROWS]).astype(np.float64)
+PLACE = np.column_stack([COLUMNS, ROWS, np.zeros(SIDE * SIDE)]).astype(np.float64)
 #: The patch of the wall that is asked about; the rest is black paint.
 PATCH = (np.abs(ROWS - SIDE / 2) < 8) & (np.abs(COLUMNS - SIDE / 2) < 8)
 LAMP = np.array([0.01, 0.46, 0.85], np.float32)

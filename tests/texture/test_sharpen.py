@@ -123,14 +123,15 @@ def test_noise_is_drawn_to_metal_or_hole() -> None:
     assert after < 0.7 * before
 
 
-def test_what_is_nearer_is_the_metal_around_or_black() -> None:
+@pytest.mark.parametrize("bright", [0.9, 0.15])
+def test_what_is_nearer_is_the_metal_around_or_black(bright: float) -> None:
     texels = everywhere()
     column, row = texels.index % SIZE, texels.index // SIZE
     hole = (column % 6 < 3) & (row % 6 < 3)
-    shown = np.where(hole[:, None], 0.15 * GOLD, 0.9 * GOLD).astype(np.float32)
+    shown = np.where(hole[:, None], 0.15 * bright * GOLD, bright * GOLD).astype(np.float32)
     out = _nearer(shown, texels, np.ones(len(texels), bool))
     assert (out[hole] == 0).all()
-    np.testing.assert_allclose(out[~hole], np.tile(0.9 * GOLD, (int((~hole).sum()), 1)), rtol=0.02)
+    np.testing.assert_allclose(out[~hole], np.tile(bright * GOLD, (int((~hole).sum()), 1)), rtol=0.02)
 
 
 @pytest.mark.parametrize(("share", "place"), [(0.6, True), (0.1, False)])
