@@ -358,4 +358,3 @@ def trial_cost(photos: list[Pixels], step: float) -> float:
         return 0.0
     pixels = sum(len(p) for p in photos) / len(photos)
     return len(TRIALS) * TRIAL_STEPS * step * min(1.0, TRIAL_PIXELS / max(1.0, pixels))
-
