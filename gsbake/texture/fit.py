@@ -12,7 +12,8 @@ brightness); most things are not metal; most light is white.
 
 How rough the object is at the start decides which light is found: a surface taken for rough cannot show where the light comes from and its
 reflections end as paint; one taken for smooth blurs the light instead. So short trials from a few values compete on photos they were not
-fitted to, and the best goes on; from there every texel finds its own.
+fitted to, and the best goes on; from there every texel finds its own. Where two are close, both are fitted in full and held-out photos
+choose.
 
 How bright and how even the light is hardly shows in gradients, as paint makes up for either: twice it is searched for (`level`).
 
@@ -34,7 +35,7 @@ together in this way; occlusion per texel and the view-wise weights are what a f
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -60,6 +61,9 @@ Floats = NDArray[np.float32]
 
 #: Roughness of all texels that trials start from, and their steps, pixels of a photo and every how many-th photo judges them.
 TRIALS, TRIAL_STEPS, TRIAL_PIXELS, TRIAL_PHOTO = (0.2, 0.45, 0.8), 100, 15_000, 5
+#: Starts that a trial leaves less than this behind the best (dB) are fitted in full as well: 100 steps find a blurred light sooner than a
+#: sharp one, and so favour smooth starts.
+RIVAL = 1.0
 #: Metallic that every texel starts from.
 METALLIC = 0.05
 #: Adam's rates of the texels' logits, of the light and of the normals' bends; all decay to a tenth.
@@ -350,6 +354,12 @@ def trial_roughness(
         if each is not None:
             each(turn + 1, len(TRIALS))
     return found
+
+
+def rivals(trials: Mapping[float, float]) -> list[float]:
+    """The roughnesses of `trials` (PSNR in dB of each) that a whole fit must tell apart, best first."""
+    order = sorted(trials, key=lambda roughness: -trials[roughness])
+    return [roughness for roughness in order if trials[roughness] > trials[order[0]] - RIVAL]
 
 
 def trial_cost(photos: list[Pixels], step: float) -> float:
