@@ -246,6 +246,7 @@ def _fit_materials(
     from gsbake.surface.watch import PLACES, MeshWatch
     from gsbake.texture.coarse import Coarse
     from gsbake.texture.fit import TRIALS, MaterialFit, Priors, rivals, trial_cost, trial_roughness
+    from gsbake.texture.neighbours import neighbours
     from gsbake.texture.pixels import PixelReader
     from gsbake.texture.plainer import plainer
     from gsbake.texture.sharpen import sharp_metals
@@ -279,6 +280,7 @@ def _fit_materials(
     priors = Priors(settings.smooth_prior, settings.dark_prior, settings.metal_prior, settings.white_prior)
     normal, occlusion, base = (coarse.down(x) for x in (detail.normal, open_share[:, None], shown.values))
     at = coarse.texels.interpolate(surface.position, surface.atlas.faces)
+    pairs = neighbours(coarse.texels, at, normal)
 
     seen = None
     if settings.visibility in ("directional", "bounce") and settings.occlusion_rays:
@@ -289,7 +291,7 @@ def _fit_materials(
 
     def start(roughness: float) -> MaterialFit:
         light_size, bounce = ctx.settings.splat.env_size, settings.visibility == "bounce"
-        return MaterialFit(coarse.texels, at, normal, occlusion[:, 0], base, light_size, priors, roughness, seen, bounce)
+        return MaterialFit(coarse.texels, at, pairs, normal, occlusion[:, 0], base, light_size, priors, roughness, seen, bounce)
 
     diffuse, why = looks_diffuse(*watch.changes())
     matte = wanted(ctx, "view_dependence", diffuse)

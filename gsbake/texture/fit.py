@@ -52,7 +52,6 @@ from gsbake.texture.batch import BOUNCED, GLOW, Batch
 from gsbake.texture.emission import find_glow
 from gsbake.texture.level import Level, find_level, graded
 from gsbake.texture.metal import Evidence, find_metals
-from gsbake.texture.neighbours import neighbours
 from gsbake.texture.pixels import Pixels
 from gsbake.texture.texels import Texels
 from gsbake.texture.visibility import Visibility
@@ -128,6 +127,7 @@ class MaterialFit:
         self,
         texels: Texels,
         at: NDArray[Any],
+        pairs: NDArray[np.int64],
         normal: NDArray[Any],
         occlusion: NDArray[Any],
         base: NDArray[Any],
@@ -137,9 +137,10 @@ class MaterialFit:
         visibility: Visibility | None = None,
         bounce: bool = True,
     ) -> None:
-        """The n texels lie `at` (n, 3) with unit normals `normal` (n, 3), both in the mesh's frame; `occlusion` (n,) is their open share,
-        `base` (n, 3) linear colours and `roughness` what they start from; `light_size` is the edge of the environment cube map. With
-        `visibility` shadows follow the light, with `bounce` texels light each other as well."""
+        """The n texels lie `at` (n, 3) with unit normals `normal` (n, 3), both in the mesh's frame; `pairs` (m, 2) of them are neighbours,
+        mixed as `gsbake.texture.neighbours` does; `occlusion` (n,) is their open share, `base` (n, 3) linear colours and `roughness` what
+        they start from; `light_size` is the edge of the environment cube map. With `visibility` shadows follow the light, with `bounce`
+        texels light each other as well."""
         n = len(texels)
         logits = torch.zeros(n, 5)
         logits[:, :3] = torch.logit(torch.as_tensor(np.clip(base, *BASE_RANGE), dtype=torch.float32))
@@ -155,7 +156,7 @@ class MaterialFit:
         self._light = EnvironmentLight(light_size)
         self._priors = priors
         self._alike = torch.tensor(ALIKE)
-        self._pairs = torch.as_tensor(neighbours(texels, at, normal))
+        self._pairs = torch.as_tensor(pairs)
         self._adam = torch.optim.Adam([self._logits.requires_grad_()], lr=RATE, betas=BETAS, eps=STILL)
         self._adam_bend = torch.optim.Adam([self._bend], lr=RATE_BEND, betas=BETAS, eps=STILL)
         self._adam_light = torch.optim.Adam([self._light.raw], lr=RATE_LIGHT, betas=BETAS)

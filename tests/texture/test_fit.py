@@ -17,6 +17,7 @@ from gsbake.surface.raycast import RayCaster
 from gsbake.texture.coarse import Coarse
 from gsbake.texture.colour import decode, encode
 from gsbake.texture.fit import RIVAL, TRIAL_PHOTO, MaterialFit, Priors, rivals, trial_roughness
+from gsbake.texture.neighbours import neighbours
 from gsbake.texture.pixels import SAMPLES, PixelReader, Pixels
 from gsbake.texture.texels import Texels, rasterise
 
@@ -81,7 +82,8 @@ class Scene:
 
     def fit(self, roughness: float, priors: Priors = FREE) -> MaterialFit:
         n = len(self.texels)
-        return MaterialFit(self.texels, self.normal, self.normal, np.ones(n), np.full((n, 3), 0.3), 16, priors, roughness)
+        pairs = neighbours(self.texels, self.normal, self.normal)
+        return MaterialFit(self.texels, self.normal, pairs, self.normal, np.ones(n), np.full((n, 3), 0.3), 16, priors, roughness)
 
 
 @pytest.fixture(scope="module")
@@ -129,7 +131,8 @@ def test_wrong_normals_bend_towards_what_reflections_show(glossy: Scene) -> None
     n, truth = len(glossy.texels), glossy.normal
     lean = 0.15 * np.sin(3 * truth[:, 2:]) * np.array([0.3, -0.5, 0.8])
     wrong = (truth + lean) / np.linalg.norm(truth + lean, axis=1, keepdims=True)
-    fit = MaterialFit(glossy.texels, truth, wrong, np.ones(n), np.full((n, 3), 0.3), 16, FREE, 0.2)
+    pairs = neighbours(glossy.texels, truth, wrong)
+    fit = MaterialFit(glossy.texels, truth, pairs, wrong, np.ones(n), np.full((n, 3), 0.3), 16, FREE, 0.2)
     fitted = fit.run(glossy.photos, [], 300, 0)
     known = fitted.weight > 0.3
     bent = wrong + fitted.bend

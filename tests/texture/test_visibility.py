@@ -17,6 +17,7 @@ from gsbake.light.shade import shade
 from gsbake.surface.raycast import RayCaster
 from gsbake.texture.colour import encode
 from gsbake.texture.fit import MaterialFit, Priors
+from gsbake.texture.neighbours import neighbours
 from gsbake.texture.pixels import PixelReader, Pixels
 from gsbake.texture.texels import Texels, rasterise
 from gsbake.texture.visibility import Visibility, directions
@@ -211,7 +212,8 @@ class Tray:
         texels = self.box.texels
         ambient = np.ones(len(texels)) if visibility is None else visibility.openness(WHITE)
         start = np.full((len(texels), 3), 0.4)
-        fit = MaterialFit(texels, self.box.at, self.box.normal, ambient, start, 16, Priors(), 0.5, visibility, bounce)
+        pairs = neighbours(texels, self.box.at, self.box.normal)
+        fit = MaterialFit(texels, self.box.at, pairs, self.box.normal, ambient, start, 16, Priors(), 0.5, visibility, bounce)
         fitted = fit.run(self.photos, [], 120, 0)
         known = fitted.weight > 0.3
         gain = (fitted.values[known, :3] * self.paint[known]).sum(0) / (fitted.values[known, :3] ** 2).sum(0)
