@@ -381,7 +381,7 @@ def _save_mesh(ctx: Context, surface: Surface) -> None:
 
 STAGE = Stage(
     name="bake",
-    version=8,
+    version=9,
     title="Textures",
     run=run,
     needs=("poses", "refine", "mesh"),

@@ -69,7 +69,8 @@ def run(ctx: Context) -> dict[str, Any]:
         ctx.decide(
             "hull opened at",
             f"{opened.made} places",
-            f"photos see through {100 * opened.share:.1f} % of its cells onto a surface behind, at {opened.refused} other places onto none",
+            f"photos see through {100 * opened.share:.1f} % of its cells onto a surface behind, "
+            f"at {opened.refused} other places onto none, at {opened.holed} against silhouettes",
         )
     (ctx.out / "depth").mkdir()
     for one in maps:
@@ -96,7 +97,7 @@ def run(ctx: Context) -> dict[str, Any]:
 
 STAGE = Stage(
     name="stereo",
-    version=2,
+    version=3,
     title="Multi-view stereo",
     run=run,
     needs=("poses",),

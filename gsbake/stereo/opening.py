@@ -5,7 +5,11 @@ matched to a depth that one or two other photos share, and most of those lie beh
 a ray whose depth is farther speaks for air, one whose depth is here for a surface, and what lies behind a depth says nothing
 (Hernández, Vogiatzis & Cipolla, *Probabilistic visibility for multi-view stereo*, CVPR 2007, as plain counts). Air that is connected to the
 outside is taken away, but only where the surface that this lays bare has votes of its own: mirror images lie behind a glossy surface
-too, but at another place for every photo.
+too, but mostly at another place for every photo.
+
+Where they do agree (a smooth black handle mirrors the same lamp to many photos), silhouettes tell: every ray through the hull meets the
+object, so what is taken must leave something on each (Laurentini, *The visual hull concept*, PAMI 1994, whose hull is the largest such
+shape). A real hollow does, a dent in what bulges is missed in the photos that see it from the side.
 """
 
 from __future__ import annotations
@@ -36,16 +40,21 @@ AIR, UNKNOWN, UNKNOWN_SHARE = 0.65, 0.3, 0.2
 DEEPEST = 6.0
 #: Openings of fewer cells are noise, and left closed; of larger ones the new surface must have this share of the votes in the mean.
 LEAST_CELLS, BACKED = 8, 0.12
+#: A cell bears silhouettes when without the opening so many photos would see through the hull there: masks of single photos err. Openings
+#: with more than this share of such cells stay closed: real hollows have up to .03 of them, false ones a tenth to two thirds.
+LEAST_SEEN, BEARING = 2, 0.1
 
 
 @dataclass(frozen=True)
 class Opened:
-    """The opened hull, the share of the hull's cells taken away, and how many openings were made and, for want of backing, refused."""
+    """The opened hull, the share of the hull's cells taken away, and how many openings were made, for want of backing refused, and refused
+    because silhouettes would have got holes."""
 
     hull: Hull
     share: float
     made: int
     refused: int
+    holed: int
 
 
 @nb.njit(fastmath=FAST, error_model="numpy", nogil=True, cache=True)
@@ -80,6 +89,52 @@ def _count(
                         surface[i, j, k] += np.float32(1)
 
 
+@nb.njit(fastmath=FAST, error_model="numpy", nogil=True, cache=True)
+def _see_through(cells: Any, left: Any, lower: Any, cell: float, sizes: Any, lenses: Any, poses: Any, centres: Any, out: Any) -> None:
+    """Kernel of `seen_through`; rays are followed from the cell both ways in steps of half a cell."""
+    n0, n1, n2 = left.shape
+    for m in range(cells.shape[0]):
+        i, j, k = cells[m, 0] + 0.5, cells[m, 1] + 0.5, cells[m, 2] + 0.5
+        x, y, z = lower[0] + i * cell, lower[1] + j * cell, lower[2] + k * cell
+        for v in range(poses.shape[0]):
+            p, lens = poses[v], lenses[v]
+            here = p[2, 0] * x + p[2, 1] * y + p[2, 2] * z + p[2, 3]
+            if not here > 1e-6:
+                continue
+            across = lens[0] * (p[0, 0] * x + p[0, 1] * y + p[0, 2] * z + p[0, 3]) / here + lens[2]
+            down = lens[1] * (p[1, 0] * x + p[1, 1] * y + p[1, 2] * z + p[1, 3]) / here + lens[3]
+            if not (across >= 0 and down >= 0 and across < sizes[v, 0] and down < sizes[v, 1]):
+                continue
+            dx, dy, dz = x - centres[v, 0], y - centres[v, 1], z - centres[v, 2]
+            step = 0.5 / np.sqrt(dx * dx + dy * dy + dz * dz)
+            dx, dy, dz = dx * step, dy * step, dz * step
+            met = False
+            for _ in range(2):
+                a, b, c = i + dx, j + dy, k + dz
+                while not met and a >= 0 and b >= 0 and c >= 0 and a < n0 and b < n1 and c < n2:
+                    met = left[np.int64(a), np.int64(b), np.int64(c)]
+                    a, b, c = a + dx, b + dy, c + dz
+                dx, dy, dz = -dx, -dy, -dz
+            if not met:
+                out[m] += 1
+
+
+def seen_through(cells: NDArray[np.int64], left: NDArray[np.bool_], hull: Hull, cameras: Sequence[Camera]) -> NDArray[np.int64]:
+    """In how many photos (m,) the ray through a cell of the hull, `cells` (m, 3), meets none of the cells that are `left` (n, n, n)."""
+    out = np.zeros(len(cells), np.int64)
+    if len(cells) and cameras:
+        centres = np.array([c.centre for c in cameras], float)
+        _see_through(cells, left, np.asarray(hull.lower, float), float(hull.cell), *_pinholes(cameras), centres, out)
+    return out
+
+
+def _pinholes(cameras: Sequence[Camera]) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
+    """Sizes (v, 2) as width, height, lenses (v, 4) as fx, fy, cx, cy and poses (v, 3, 4), world to camera, for kernels."""
+    sizes = np.array([(c.width, c.height) for c in cameras], np.int64)
+    lenses = np.array([(c.fx, c.fy, c.cx, c.cy) for c in cameras], float)
+    return sizes, lenses, np.array([np.concatenate([c.R, c.t[:, None]], 1) for c in cameras], float)
+
+
 def count_votes(hull: Hull, cameras: Sequence[Camera], depths: Sequence[Floats]) -> tuple[Floats, Floats]:
     """For each cell (n, n, n) in or next to the hull how many depths lie behind it (air) and within half a cell of it (surface).
 
@@ -88,6 +143,7 @@ def count_votes(hull: Hull, cameras: Sequence[Camera], depths: Sequence[Floats])
     air, surface = np.zeros(hull.field.shape, np.float32), np.zeros(hull.field.shape, np.float32)
     if not cameras:
         return air, surface
+    sizes, lenses, poses = _pinholes(cameras)
     _count(
         hull.field,
         np.asarray(hull.lower, float),
@@ -95,9 +151,9 @@ def count_votes(hull: Hull, cameras: Sequence[Camera], depths: Sequence[Floats])
         BAND * float(hull.cell),
         np.concatenate([np.asarray(d, np.float32).ravel() for d in depths]),
         np.concatenate([[0], np.cumsum([d.size for d in depths])[:-1]]).astype(np.int64),
-        np.array([(c.width, c.height) for c in cameras], np.int64),
-        np.array([(c.fx, c.fy, c.cx, c.cy) for c in cameras], float),
-        np.array([np.concatenate([c.R, c.t[:, None]], 1) for c in cameras], float),
+        sizes,
+        lenses,
+        poses,
         air,
         surface,
     )
@@ -115,7 +171,7 @@ def open_hull(hull: Hull, cameras: Sequence[Camera], depths: Sequence[Floats]) -
     outside = ~solid
     doubted = solid & (air > AIR * (air + surface))
     if not doubted.any():
-        return Opened(hull, 0.0, 0, 0)
+        return Opened(hull, 0.0, 0, 0, 0)
     total = air + surface + max(UNKNOWN, UNKNOWN_SHARE * float(np.median((air + surface)[doubted])))
     through, backing = air / total, surface / total
     free = solid & (through > AIR) & (hull.field > -DEEPEST * hull.cell)
@@ -133,12 +189,24 @@ def open_hull(hull: Hull, cameras: Sequence[Camera], depths: Sequence[Floats]) -
         bare = ndimage.binary_dilation(piece) & solid[wider] & ~reached[wider]
         keep[number] = bare.any() and backing[wider][bare].mean() >= BACKED
         refused += not keep[number]
+    holed = _holed(label, keep, hull, cameras)
+    keep &= ~holed
     carved = keep[label]
     if not carved.any() or carved[solid].all():  # nothing seen through, or nothing left
-        return Opened(hull, 0.0, 0, refused)
+        return Opened(hull, 0.0, 0, refused, int(holed.sum()))
     # Distances in cells follow from how fast the share of air falls across a new surface: by about a quarter a cell.
     edge = np.where(ndimage.binary_dilation(carved), (through - AIR) * 4 * hull.cell, -np.inf)
     field = np.maximum(hull.field, edge)
     field[carved] = np.maximum(field[carved], 0.2 * hull.cell)
     opened = replace(hull, occupancy=field < 0, field=field.astype(np.float32))
-    return Opened(opened, float(carved.sum() / solid.sum()), int(keep.sum()), refused)
+    return Opened(opened, float(carved.sum() / solid.sum()), int(keep.sum()), refused, int(holed.sum()))
+
+
+def _holed(label: NDArray[np.int32], keep: NDArray[np.bool_], hull: Hull, cameras: Sequence[Camera]) -> NDArray[np.bool_]:
+    """Which openings (k,) of those to `keep` (k,) silhouettes speak against; `label` (n, n, n) says which a cell belongs to."""
+    taken = keep[label]
+    cells = np.argwhere(taken)
+    through = seen_through(cells, (hull.field < 0) & ~taken, hull, cameras) >= LEAST_SEEN
+    owner = label[tuple(cells.T)]
+    bearing = np.bincount(owner, through, len(keep))
+    return np.asarray(bearing > BEARING * np.bincount(owner, minlength=len(keep)))

@@ -79,7 +79,7 @@ DARK_PAINT = 1e-3
 #: were taken back.
 METALS_AT, METAL, STAYED = (0.3, 0.55, 0.8), 0.8, 0.3
 #: Shares of the steps after which the light's level is searched for, with this many pixels of texels whose metallic is below this.
-LEVEL_AT, LEVEL_PIXELS, PAINT = (0.5, 0.75), 100_000, 0.3
+LEVEL_AT, LEVEL_PIXELS, PAINT = (0.35, 0.5, 0.65, 0.8), 100_000, 0.3
 #: Share of the steps after which glowing regions are looked for: the light must be known.
 GLOW_AT = 0.5
 #: How much of the smoothness price base colour (three channels), roughness and metallic pay: print changes the colour alone.

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from gsbake.capture.cameras import Camera
 from gsbake.capture.hull import Hull
 from gsbake.stereo.maps import z_depth
-from gsbake.stereo.opening import count_votes, open_hull
+from gsbake.stereo.opening import count_votes, open_hull, seen_through
 from tests.stereo.scenes import RADIUS, camera_at, sphere_depth
 
 Array = NDArray[np.float64]
@@ -96,6 +96,32 @@ def test_mirror_images_open_nothing() -> None:
     opened = open_hull(hull, cameras, depths)
     assert opened.made == 0 and opened.refused >= 1 and opened.share == 0
     assert opened.hull is hull
+
+
+def test_what_silhouettes_speak_against_stays() -> None:
+    # A mirror image that all photos agree on: a ball within the ball. Every depth speaks for it, only the outlines do not.
+    hull, cameras = ball(), views()
+    smaller = [Camera(**{**vars(c), "t": c.t / 0.8}) for c in cameras]
+    depths = [(0.8 * sphere_depth(c)).astype(np.float32) for c in smaller]
+    opened = open_hull(hull, cameras, depths)
+    assert opened.made == 0 and opened.holed >= 1 and opened.hull is hull
+
+
+def test_a_ray_is_seen_through_where_nothing_is_left_on_it() -> None:
+    hull = ball()
+    middle = np.array([[CELLS // 2, CELLS // 2, CELLS // 2]])
+    camera = camera_at(np.array([3.0, 0, 0]), "a", 110, 95)
+    left = np.zeros(hull.field.shape, bool)
+    assert seen_through(middle, left, hull, [camera, camera]).tolist() == [2]
+    for along in (5, CELLS - 5):  # before it and behind it
+        left[:] = False
+        left[along, CELLS // 2 - 1 : CELLS // 2 + 2, CELLS // 2 - 1 : CELLS // 2 + 2] = True
+        assert seen_through(middle, left, hull, [camera]).tolist() == [0]
+    left[:] = False
+    left[:, : CELLS // 2 - 4] = True  # beside it
+    assert seen_through(middle, left, hull, [camera]).tolist() == [1]
+    away = camera_at(np.array([3.0, 0, 0]), "b", 4, 4)
+    assert seen_through(np.array([[CELLS // 2, 0, 0]]), left, hull, [away]).tolist() == [0]  # outside the frame: not known
 
 
 def test_without_depths_the_hull_stays() -> None:
