@@ -197,7 +197,9 @@ def _project_photos(ctx: Context, surface: Surface) -> Blended:
         blender.add(view.camera, linear, weights, HELD_OUT_WEIGHT if index in aside else 1.0)
         ctx.progress(index + 1, len(posed), "photos onto the texture")
     blended = blender.result(solve_exposure=asked)
-    steady, evidence = constant_exposure(blended.gains, None if tied is None else tied.spread()) if asked else (True, "not measured")
+    steady, evidence = True, "not measured"
+    if asked:
+        steady, evidence = constant_exposure(blended.gains, blended.explained, None if tied is None else tied.spread())
     if leave_out(ctx, "exposure", steady, evidence, "exposure taken as constant", "exposure equalised") and (blended.gains != 1).any():
         blended = blender.result()
     return blended

@@ -92,8 +92,9 @@ def fuse(values: Codes, weights: Floats, views: NDArray[np.int16], gains: Floats
     return out, seen, confidence
 
 
-def solve_gains(values: Codes, weights: Floats, views: NDArray[np.int16], count: int) -> Floats:
-    """Gain (count, c) of each view against the others, its geometric mean 1, from texels that several views share.
+def solve_gains(values: Codes, weights: Floats, views: NDArray[np.int16], count: int) -> tuple[Floats, float]:
+    """Gain (count, c) of each view against the others, its geometric mean 1, from texels that several views share; and the share of the
+    views' differences there (mean of absolute logarithms) that goes with the gains.
 
     Alternates between each texel's weighted median and each view's median ratio to it, in logarithms.
     """
@@ -102,7 +103,7 @@ def solve_gains(values: Codes, weights: Floats, views: NDArray[np.int16], count:
     chosen = several[:: max(1, len(several) // GAIN_TEXELS)]
     gains = np.zeros((count, channels))
     if len(chosen) < 100:
-        return np.ones((count, channels), np.float32)
+        return np.ones((count, channels), np.float32), 0.0
     linear = (values[chosen] / 65535.0) ** 2
     usable = (weights[chosen] > 0) & (linear > 0.004).all(2) & (linear < 0.96).all(2)
     logs = np.where(usable[..., None], np.log(np.maximum(linear, 1e-4)), np.nan)
@@ -110,7 +111,7 @@ def solve_gains(values: Codes, weights: Floats, views: NDArray[np.int16], count:
     enough = usable.sum(1) >= 3
     logs, usable, view = logs[enough], usable[enough], view[enough]
     if len(logs) < 100:
-        return np.ones((count, channels), np.float32)
+        return np.ones((count, channels), np.float32), 0.0
     for _ in range(GAIN_ROUNDS):
         centre = np.nanmedian(logs - gains[view], axis=1, keepdims=True)
         ratio = logs - centre
@@ -120,4 +121,10 @@ def solve_gains(values: Codes, weights: Floats, views: NDArray[np.int16], count:
             if len(mine):
                 gains[v] = np.median(mine, axis=0) * len(mine) / (len(mine) + 50)
         gains -= gains.mean(0)
-    return np.exp(np.clip(gains, -1.5, 1.5)).astype(np.float32)
+
+    def differing(logs: NDArray[np.float64]) -> float:
+        return float(np.nanmean(np.abs(logs - np.nanmedian(logs, axis=1, keepdims=True))))
+
+    gains = np.clip(gains, -1.5, 1.5)
+    explained = 1 - differing(logs - gains[view]) / max(differing(logs), 1e-9)
+    return np.exp(gains).astype(np.float32), max(0.0, explained)

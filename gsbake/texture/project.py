@@ -45,6 +45,7 @@ class Blended:
     views: NDArray[np.int32]
     confidence: Floats
     gains: Floats  # (views, c) factor that was divided out of each view
+    explained: float = 0.0  # share of the views' differences that went with the gains
 
     @property
     def seen(self) -> NDArray[np.bool_]:
@@ -96,11 +97,11 @@ class ProjectionBlender:
     def result(self, solve_exposure: bool = False) -> Blended:
         """Fuse what was added. `solve_exposure` first divides a gain per view and channel out (for photos, not for materials)."""
         channels = self._values.shape[2]
-        gains = np.ones((max(self._count, 1), channels), np.float32)
+        gains, explained = np.ones((max(self._count, 1), channels), np.float32), 0.0
         if solve_exposure and self._count > 1:
-            gains = solve_gains(self._values, self._weights, self._view, self._count)
+            gains, explained = solve_gains(self._values, self._weights, self._view, self._count)
         values, views, confidence = fuse(self._values, self._weights, self._view, gains)
-        return Blended(values, views, confidence, gains)
+        return Blended(values, views, confidence, gains, explained)
 
     def _filtered(self, camera: Camera, picture: Floats, mask: Floats) -> tuple[Camera, Floats, Floats]:
         """The view reduced by an area filter when its pixels are much finer than texels: sampling it at points would alias."""

@@ -10,7 +10,7 @@ import trimesh
 
 from gsbake.surface.raycast import RayCaster
 from gsbake.texture.fit import TRIAL_PIXELS, TRIAL_STEPS, TRIALS, trial_cost
-from gsbake.texture.needed import STEADY, TIED, constant_exposure, normals_agree
+from gsbake.texture.needed import SHARED, STEADY, TIED, constant_exposure, normals_agree
 from gsbake.texture.normals import find_detail, vertex_normals
 
 
@@ -18,7 +18,7 @@ from gsbake.texture.normals import find_detail, vertex_normals
 def test_exposure_is_constant_up_to_what_view_dependence_shows(gain: float, steady: bool) -> None:
     gains = np.ones((5, 3))
     gains[2, 1] = gain
-    holds, evidence = constant_exposure(gains)
+    holds, evidence = constant_exposure(gains, 0.5)
     assert holds is steady and f"{max(gain, 1 / gain):.2f}x" in evidence
 
 
@@ -26,8 +26,16 @@ def test_exposure_is_constant_up_to_what_view_dependence_shows(gain: float, stea
 def test_tie_points_have_the_last_word_on_shining_things(tied: float | None, steady: bool) -> None:
     gains = np.ones((5, 3))
     gains[3] = 1.6
-    assert constant_exposure(gains, tied)[0] is steady
-    assert constant_exposure(np.ones((5, 3)), tied)[0]
+    assert constant_exposure(gains, 0.5, tied)[0] is steady
+    assert constant_exposure(np.ones((5, 3)), 0.5, tied)[0]
+
+
+@pytest.mark.parametrize(("explained", "steady"), [(SHARED - 0.02, True), (SHARED + 0.02, False)])
+def test_gains_that_explain_little_are_reflections(explained: float, steady: bool) -> None:
+    gains = np.ones((5, 3))
+    gains[3] = 1.6
+    holds, evidence = constant_exposure(gains, explained)
+    assert holds is steady and f"{100 * explained:.0f} % of their differences" in evidence
 
 
 def agreement(light: int, ripple: float) -> tuple[bool, str]:

@@ -65,11 +65,24 @@ def test_highlights_and_exposures_fall_away(sphere: RayCaster) -> None:
         blender.add(camera(d), photo(camera(d), highlight=0.5, gain=gain))
     solved = blender.result(solve_exposure=True)
     assert solved.seen.all()
+    assert solved.explained > 0.5
     assert np.abs(np.log(solved.gains[:, 0] / gains)).max() < 0.02
     error = np.abs(solved.values - paint(p)).max(1)
     assert np.median(error) < 0.004 and np.quantile(error, 0.98) < 0.015
     plain = blender.result(solve_exposure=False)
     assert np.median(np.abs(plain.values - paint(p)).max(1)) > 0.01
+
+
+def test_reflections_are_no_exposures(sphere: RayCaster) -> None:
+    """Four times brighter at one place from each side: gains of up to a tenth are found, but they explain little."""
+    p = points()
+    blender = ProjectionBlender(p, p, sphere, 3, 0.02)
+    for d in directions(30):
+        shown = photo(camera(d))
+        y, x = np.mgrid[0:SIZE, 0:SIZE] / SIZE - 0.5
+        lobe = 1 + 3 * np.exp(-((x - 0.1 * d[0]) ** 2 + (y - 0.1 * d[1]) ** 2) / 0.01)
+        blender.add(camera(d), np.clip(0.2 * shown * lobe[..., None], 0, 1).astype(np.float32))
+    assert blender.result(solve_exposure=True).explained < 0.1
 
 
 def test_surround_never_reaches_the_surface(sphere: RayCaster) -> None:
