@@ -78,8 +78,9 @@ DARK_PAINT = 1e-3
 #: Shares of the steps after which metals are looked for, and the metallic that those found go on from; those that end below `STAYED`
 #: were taken back.
 METALS_AT, METAL, STAYED = (0.3, 0.55, 0.8), 0.8, 0.3
-#: Shares of the steps after which the light's level is searched for, with this many pixels of texels whose metallic is below this.
-LEVEL_AT, LEVEL_PIXELS, PAINT = (0.35, 0.5, 0.65, 0.8), 100_000, 0.3
+#: Shares of the steps after which the light's level is searched for, with this many pixels of texels whose metallic is below this; the
+#: light's tint only in the first ones: under matt paint, which hardly tells, it drifts.
+LEVEL_AT, LEVEL_PIXELS, PAINT, TINTED = (0.35, 0.5, 0.65, 0.8), 100_000, 0.3, 2
 #: Share of the steps after which glowing regions are looked for: the light must be known.
 GLOW_AT = 0.5
 #: How much of the smoothness price base colour (three channels), roughness and metallic pay: print changes the colour alone.
@@ -186,7 +187,7 @@ class MaterialFit:
             if glow and step == int(GLOW_AT * steps):
                 glowing = self._set_glow(batches)
             if level and step in {int(share * steps) for share in LEVEL_AT}:
-                levels.append(self._set_level(batches, generator))
+                levels.append(self._set_level(batches, generator, len(levels) < TINTED))
             if metals and step in {int(share * steps) for share in METALS_AT}:
                 metal = self._set_metals(batches)
             if step % RENEWED == 0:
@@ -246,7 +247,7 @@ class MaterialFit:
             self._around[:, BOUNCED] = torch.as_tensor(self._visibility.bounced(irradiance.numpy(), reflectance.numpy()))
 
     @torch.no_grad()
-    def _set_level(self, batches: list[Batch], generator: torch.Generator) -> Level:
+    def _set_level(self, batches: list[Batch], generator: torch.Generator, tint: bool) -> Level:
         """Let the light go on as bright and as even as explains most, and paint as what reflects the same of it; what was found."""
         values = torch.sigmoid(self._logits)
         paint = (values[:, 4] < PAINT) & (self._around[:, GLOW].sum(1) == 0)
@@ -268,7 +269,7 @@ class MaterialFit:
             tables = light.prefilter()
             return [b.evidence(self._bend, tables, around) for b in few]
 
-        found = find_level(under, values[:, 3].numpy())
+        found = find_level(under, values[:, 3].numpy(), tint)
         if found.gain <= 0:
             return found
         before = self._light.prefilter().diffuse(self._normal) * self._around[:, :1]

@@ -70,10 +70,11 @@ def graded(radiance: NDArray[Any], brightness: NDArray[Any], contrast: float, ar
     return np.asarray(brightness * level * shape / mean(shape), np.float32)
 
 
-def find_level(evidence: Callable[[Floats, float], Sequence[Evidence]], roughness: NDArray[np.float32]) -> Level:
+def find_level(evidence: Callable[[Floats, float], Sequence[Evidence]], roughness: NDArray[np.float32], tint: bool = True) -> Level:
     """The brightness of each colour and the contrast under which paint of `roughness` (texels,) explains most.
 
-    `evidence` gives the pixels of all photos under the light of a brightness (3,) and a contrast.
+    `evidence` gives the pixels of all photos under the light of a brightness (3,) and a contrast. Without `tint` colours stay as they are
+    to one another.
     """
     seen: dict[_Place, Floats] = {}
 
@@ -90,10 +91,10 @@ def find_level(evidence: Callable[[Floats, float], Sequence[Evidence]], roughnes
             there = here.beside(brighter, stronger)
             while there.near and at(there).sum() < (1 - CLEARLY) * at(here).sum():
                 here, there, moved = there, there.beside(brighter, stronger), True
-    for tint in (-1, 1):
-        all_three = replace(here, tint=(tint, tint, tint))
+    for way in (-1, 1) if tint else ():
+        all_three = replace(here, tint=(way, way, way))
         better = at(all_three) < (1 - CLEARLY) * at(here)
-        there = replace(here, tint=tuple(tint * int(b) for b in better))
+        there = replace(here, tint=tuple(way * int(b) for b in better))
         if 0 < better.sum() < 3 and at(there).sum() < at(here).sum():
             here = there
             break
