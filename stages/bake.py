@@ -247,11 +247,12 @@ def _fit_materials(
     from gsbake.surface.resolution import pixel_footprint
     from gsbake.surface.watch import PLACES, MeshWatch
     from gsbake.texture.coarse import Coarse
-    from gsbake.texture.fit import TRIALS, MaterialFit, Priors, rivals, trial_cost, trial_roughness
+    from gsbake.texture.fit import MaterialFit, Priors
     from gsbake.texture.neighbours import neighbours
     from gsbake.texture.pixels import PixelReader
     from gsbake.texture.plainer import plainer
     from gsbake.texture.sharpen import sharp_metals
+    from gsbake.texture.starts import best_fit, trial_cost, trial_roughness
     from gsbake.texture.visibility import Visibility
 
     settings = ctx.settings.bake
@@ -298,17 +299,13 @@ def _fit_materials(
     diffuse, why = looks_diffuse(*watch.changes())
     matte = wanted(ctx, "view_dependence", diffuse)
     trials = {} if matte else trial_roughness(start, photos, ctx.seed, lambda done, total: ctx.check_stop())
-    starts = rivals(trials) or [TRIALS[-1] if matte else TRIALS[1]]
-    tried = ", ".join(f"{score:.2f} dB from {roughness:g}" for roughness, score in trials.items())
     begun = time.perf_counter()
-    fits = [start(roughness) for roughness in (starts if any(map(len, held)) else starts[:1])]
-    results = [fit.run(photos, held, settings.fit_steps, ctx.seed, each, metals=not matte) for fit in fits]
-    spent = (time.perf_counter() - begun) / (settings.fit_steps * len(fits))
-    best = max(range(len(fits)), key=lambda k: results[k].held_out or 0.0)
-    fit, fitted = fits[best], results[best]
-    if len(fits) > 1:
-        tried += "; fitted in full " + ", ".join(f"{f.held_out:.2f} dB from {r:g}" for f, r in zip(results, starts, strict=True))
-    ctx.decide("roughness starts at", f"{starts[best]:g}", tried or ("the object is matt" if matte else "too few photos for trials"))
+    choice = best_fit(start, photos, held, settings.fit_steps, ctx.seed, trials, matte, each)
+    spent = (time.perf_counter() - begun) / (settings.fit_steps * choice.fits)
+    fit, fitted = choice.fit, choice.fitted
+    ctx.decide("roughness starts at", f"{choice.roughness:g}", choice.why)
+    if choice.metals:
+        ctx.decide("metals doubted", "kept" if fitted.metal.any() else "taken for paint", choice.metals)
     leave_out(
         ctx, "view_dependence", diffuse, why, "reflections taken for broad, none tried", "reflections looked for", trial_cost(photos, spent)
     )

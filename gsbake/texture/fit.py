@@ -10,10 +10,7 @@ plain |error| reflections a little off are passed over and the light ends too di
 neighbouring texels are alike; what a reflection explains is not paint (a small price on base colour, which also fixes the light's
 brightness); most things are not metal; most light is white.
 
-How rough the object is at the start decides which light is found: a surface taken for rough cannot show where the light comes from and its
-reflections end as paint; one taken for smooth blurs the light instead. So short trials from a few values compete on photos they were not
-fitted to, and the best goes on; from there every texel finds its own. Where two are close, both are fitted in full and held-out photos
-choose.
+How rough the object is at the start decides which light is found (`starts`); from there every texel finds its own.
 
 How bright and how even the light is hardly shows in gradients, as paint makes up for either: twice it is searched for (`level`).
 
@@ -35,7 +32,7 @@ together in this way; occlusion per texel and the view-wise weights are what a f
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -58,11 +55,6 @@ from gsbake.texture.visibility import Visibility
 
 Floats = NDArray[np.float32]
 
-#: Roughness of all texels that trials start from, and their steps, pixels of a photo and every how many-th photo judges them.
-TRIALS, TRIAL_STEPS, TRIAL_PIXELS, TRIAL_PHOTO = (0.2, 0.45, 0.8), 100, 15_000, 5
-#: Starts that a trial leaves less than this behind the best (dB) are fitted in full as well: 100 steps find a blurred light sooner than a
-#: sharp one, and so favour smooth starts.
-RIVAL = 1.0
 #: Metallic that every texel starts from.
 METALLIC = 0.05
 #: Adam's rates of the texels' logits, of the light and of the normals' bends; all decay to a tenth.
@@ -335,38 +327,3 @@ class MaterialFit:
         shaded = (b.shade(shown, self._bend, tables, self._around).clamp_min(0) for b in batches)
         squares = torch.cat([((linear_to_srgb(s) - b.colour) ** 2).mean(1) for s, b in zip(shaded, batches, strict=True)])
         return -10 * math.log10(max(float(squares.mean()), 1e-10))
-
-
-def trial_roughness(
-    make: Callable[[float], MaterialFit], photos: list[Pixels], seed: int, each: Callable[[int, int], None] | None = None
-) -> dict[float, float]:
-    """PSNR in dB on photos set aside, for each roughness in `TRIALS` as the start of a short fit.
-
-    `make` builds a fit that starts from a roughness. Empty with fewer than `TRIAL_PHOTO` photos.
-    """
-    if len(photos) < TRIAL_PHOTO:
-        return {}
-    few = [p.thinned(TRIAL_PIXELS) for p in photos]
-    judges, rest = few[::TRIAL_PHOTO], [p for i, p in enumerate(few) if i % TRIAL_PHOTO]
-    found: dict[float, float] = {}
-    for turn, roughness in enumerate(TRIALS):
-        score = make(roughness).run(rest, judges, TRIAL_STEPS, seed, metals=False, glow=False, level=False).held_out
-        if score is not None:
-            found[roughness] = score
-        if each is not None:
-            each(turn + 1, len(TRIALS))
-    return found
-
-
-def rivals(trials: Mapping[float, float]) -> list[float]:
-    """The roughnesses of `trials` (PSNR in dB of each) that a whole fit must tell apart, best first."""
-    order = sorted(trials, key=lambda roughness: -trials[roughness])
-    return [roughness for roughness in order if trials[roughness] > trials[order[0]] - RIVAL]
-
-
-def trial_cost(photos: list[Pixels], step: float) -> float:
-    """Seconds that `trial_roughness` would take, from those of one `step` of the fit itself: steps cost by the pixels they shade."""
-    if len(photos) < TRIAL_PHOTO:
-        return 0.0
-    pixels = sum(len(p) for p in photos) / len(photos)
-    return len(TRIALS) * TRIAL_STEPS * step * min(1.0, TRIAL_PIXELS / max(1.0, pixels))

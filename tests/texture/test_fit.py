@@ -16,9 +16,10 @@ from gsbake.light.shade import shade
 from gsbake.surface.raycast import RayCaster
 from gsbake.texture.coarse import Coarse
 from gsbake.texture.colour import decode, encode
-from gsbake.texture.fit import RIVAL, TRIAL_PHOTO, MaterialFit, Priors, rivals, trial_roughness
+from gsbake.texture.fit import MaterialFit, Priors
 from gsbake.texture.neighbours import neighbours
 from gsbake.texture.pixels import SAMPLES, PixelReader, Pixels
+from gsbake.texture.starts import TRIAL_PHOTO, trial_roughness
 from gsbake.texture.texels import Texels, rasterise
 
 SIZE = 64
@@ -216,8 +217,3 @@ def test_coarse_texture_keeps_means_and_detail() -> None:
     stripes = smooth * np.where(np.arange(len(fine)) % 2, 1.2, 0.8)[:, None]
     restored = coarse.up(coarse.down(stripes)) * coarse.detail(stripes)
     assert np.abs(restored - stripes).mean() < 0.01
-
-
-def test_close_starts_are_rivals() -> None:
-    assert rivals({0.2: 21.0, 0.45: 21.0 + 0.5 * RIVAL, 0.8: 21.0 - 0.6 * RIVAL}) == [0.45, 0.2]
-    assert rivals({}) == []

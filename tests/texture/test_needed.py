@@ -9,9 +9,9 @@ import pytest
 import trimesh
 
 from gsbake.surface.raycast import RayCaster
-from gsbake.texture.fit import TRIAL_PIXELS, TRIAL_STEPS, TRIALS, trial_cost
 from gsbake.texture.needed import SHARED, STEADY, TIED, constant_exposure, normals_agree
 from gsbake.texture.normals import find_detail, vertex_normals
+from gsbake.texture.starts import TRIAL_PIXELS, TRIAL_STEPS, TRIALS, trial_cost
 
 
 @pytest.mark.parametrize(("gain", "steady"), [(1.0, True), (STEADY - 0.02, True), (STEADY + 0.02, False), (1 / (STEADY + 0.02), False)])
