@@ -70,9 +70,9 @@ DARK_PAINT = 1e-3
 #: Shares of the steps after which metals are looked for, and the metallic that those found go on from; those that end below `STAYED`
 #: were taken back.
 METALS_AT, METAL, STAYED = (0.3, 0.55, 0.8), 0.8, 0.3
-#: Shares of the steps after which the light's level is searched for, with this many pixels of texels whose metallic is below this; the
-#: light's tint only in the first ones: under matt paint, which hardly tells, it drifts.
-LEVEL_AT, LEVEL_PIXELS, PAINT, TINTED = (0.35, 0.5, 0.65, 0.8), 100_000, 0.3, 2
+#: Shares of the steps after which the light's level is searched for, with this many pixels of texels whose metallic is below this; on matt
+#: things the light's tint only in the first ones: their paint hardly tells it, and it drifts.
+LEVEL_AT, LEVEL_PIXELS, PAINT, TINTED_MATT = (0.35, 0.5, 0.65, 0.8), 100_000, 0.3, 2
 #: Share of the steps after which glowing regions are looked for: the light must be known.
 GLOW_AT = 0.5
 #: How much of the smoothness price base colour (three channels), roughness and metallic pay: print changes the colour alone.
@@ -164,11 +164,12 @@ class MaterialFit:
         metals: bool = True,
         glow: bool = True,
         level: bool = True,
+        matte: bool = False,
     ) -> Fitted:
         """Fit to `photos` in `steps` steps of one photo each, in an order drawn from `seed`; `held` only tell how good it got.
 
-        Without `metals` none are looked for: in trials, and on things that do not shine. Without `glow` nothing glows, without `level` the
-        light's brightness is left to the steps.
+        Without `metals` none are looked for, nor on things that are `matte`. Without `glow` nothing glows, without `level` the light's
+        brightness is left to the steps.
         """
         generator = torch.Generator().manual_seed(seed)
         batches = [Batch.of(p, self._normal) for p in photos if len(p)]
@@ -179,8 +180,8 @@ class MaterialFit:
             if glow and step == int(GLOW_AT * steps):
                 glowing = self._set_glow(batches)
             if level and step in {int(share * steps) for share in LEVEL_AT}:
-                levels.append(self._set_level(batches, generator, len(levels) < TINTED))
-            if metals and step in {int(share * steps) for share in METALS_AT}:
+                levels.append(self._set_level(batches, generator, not matte or len(levels) < TINTED_MATT))
+            if metals and not matte and step in {int(share * steps) for share in METALS_AT}:
                 metal = self._set_metals(batches)
             if step % RENEWED == 0:
                 self._renew()

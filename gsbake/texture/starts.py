@@ -60,7 +60,7 @@ def best_fit(
     starts = rivals(trials) or [TRIALS[-1] if matte else TRIALS[1]]
     starts = starts if judged else starts[:1]
     fits = [make(roughness) for roughness in starts]
-    results = [fit.run(photos, held, steps, seed, each, metals=not matte) for fit in fits]
+    results = [fit.run(photos, held, steps, seed, each, matte=matte) for fit in fits]
     best = max(range(len(fits)), key=lambda k: results[k].held_out or 0.0)
     chosen, fitted, made = fits[best], results[best], len(fits)
     why = ", ".join(f"{score:.2f} dB from {roughness:g}" for roughness, score in trials.items())

@@ -29,7 +29,8 @@ class Known:
     runs: list[tuple[float, bool]] = field(default_factory=list)
     metals: bool = False
 
-    def run(self, photos: Any, held: Any, steps: int, seed: int, each: Any = None, metals: bool = True) -> Fitted:
+    def run(self, photos: Any, held: Any, steps: int, seed: int, each: Any = None, metals: bool = True, matte: bool = False) -> Fitted:
+        metals = metals and not matte
         self.metals = metals and self.gain + self.bare != 0
         self.runs.append((self.roughness, metals))
         score = self.scores[self.roughness] + (self.gain if self.metals else 0)
