@@ -58,6 +58,19 @@ class Opened:
 
 
 @nb.njit(fastmath=FAST, error_model="numpy", nogil=True, cache=True)
+def _pixel(x: float, y: float, z: float, p: Any, lens: Any, size: Any) -> tuple[int, int, float]:
+    """Column, row and z-depth of a place in a photo, see `_pinholes`; depth 0 where it is behind the camera or outside the frame."""
+    here = p[2, 0] * x + p[2, 1] * y + p[2, 2] * z + p[2, 3]
+    if not here > 1e-6:
+        return 0, 0, 0.0
+    across = lens[0] * (p[0, 0] * x + p[0, 1] * y + p[0, 2] * z + p[0, 3]) / here + lens[2]
+    down = lens[1] * (p[1, 0] * x + p[1, 1] * y + p[1, 2] * z + p[1, 3]) / here + lens[3]
+    if not (across >= 0 and down >= 0 and across < size[0] and down < size[1]):
+        return 0, 0, 0.0
+    return int(across), int(down), here
+
+
+@nb.njit(fastmath=FAST, error_model="numpy", nogil=True, cache=True)
 def _count(
     field: Any, lower: Any, cell: float, band: float, depth: Any, starts: Any, sizes: Any, lenses: Any, poses: Any, air: Any, surface: Any
 ) -> None:
@@ -72,15 +85,10 @@ def _count(
                     continue
                 z = lower[2] + (k + 0.5) * cell
                 for v in range(starts.shape[0]):
-                    p, lens = poses[v], lenses[v]
-                    here = p[2, 0] * x + p[2, 1] * y + p[2, 2] * z + p[2, 3]
-                    if not here > 1e-6:
+                    column, row, here = _pixel(x, y, z, poses[v], lenses[v], sizes[v])
+                    if not here > 0:
                         continue
-                    across = lens[0] * (p[0, 0] * x + p[0, 1] * y + p[0, 2] * z + p[0, 3]) / here + lens[2]
-                    down = lens[1] * (p[1, 0] * x + p[1, 1] * y + p[1, 2] * z + p[1, 3]) / here + lens[3]
-                    if not (across >= 0 and down >= 0 and across < sizes[v, 0] and down < sizes[v, 1]):
-                        continue
-                    there = depth[np.uint64(starts[v] + np.int64(down) * sizes[v, 0] + np.int64(across))]
+                    there = depth[np.uint64(starts[v] + row * sizes[v, 0] + column)]
                     if not there > 0:
                         continue
                     if there > here + band:
@@ -97,13 +105,7 @@ def _see_through(cells: Any, left: Any, lower: Any, cell: float, sizes: Any, len
         i, j, k = cells[m, 0] + 0.5, cells[m, 1] + 0.5, cells[m, 2] + 0.5
         x, y, z = lower[0] + i * cell, lower[1] + j * cell, lower[2] + k * cell
         for v in range(poses.shape[0]):
-            p, lens = poses[v], lenses[v]
-            here = p[2, 0] * x + p[2, 1] * y + p[2, 2] * z + p[2, 3]
-            if not here > 1e-6:
-                continue
-            across = lens[0] * (p[0, 0] * x + p[0, 1] * y + p[0, 2] * z + p[0, 3]) / here + lens[2]
-            down = lens[1] * (p[1, 0] * x + p[1, 1] * y + p[1, 2] * z + p[1, 3]) / here + lens[3]
-            if not (across >= 0 and down >= 0 and across < sizes[v, 0] and down < sizes[v, 1]):
+            if not _pixel(x, y, z, poses[v], lenses[v], sizes[v])[2] > 0:
                 continue
             dx, dy, dz = x - centres[v, 0], y - centres[v, 1], z - centres[v, 2]
             step = 0.5 / np.sqrt(dx * dx + dy * dy + dz * dz)
