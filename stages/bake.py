@@ -380,7 +380,7 @@ def _save_mesh(ctx: Context, surface: Surface) -> None:
 
 STAGE = Stage(
     name="bake",
-    version=9,
+    version=10,
     title="Textures",
     run=run,
     needs=("poses", "refine", "mesh"),

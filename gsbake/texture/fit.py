@@ -72,7 +72,7 @@ DARK_PAINT = 1e-3
 METALS_AT, METAL, STAYED = (0.3, 0.55, 0.8), 0.8, 0.3
 #: Shares of the steps after which the light's level is searched for, with this many pixels of texels whose metallic is below this; on matt
 #: things the light's tint only in the first ones: their paint hardly tells it, and it drifts.
-LEVEL_AT, LEVEL_PIXELS, PAINT, TINTED_MATT = (0.35, 0.5, 0.65, 0.8), 100_000, 0.3, 2
+LEVEL_AT, LEVEL_PIXELS, PAINT, TINTED_MATT = (0.5, 0.6, 0.7, 0.8), 100_000, 0.3, 2
 #: Share of the steps after which glowing regions are looked for: the light must be known.
 GLOW_AT = 0.5
 #: How much of the smoothness price base colour (three channels), roughness and metallic pay: print changes the colour alone.
