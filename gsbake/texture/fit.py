@@ -12,7 +12,7 @@ brightness); most things are not metal; most light is white.
 
 How rough the object is at the start decides which light is found (`starts`); from there every texel finds its own.
 
-How bright and how even the light is hardly shows in gradients, as paint makes up for either: twice it is searched for (`level`).
+How bright and how even the light is hardly shows in gradients, as paint makes up for either: a few times it is searched for (`level`).
 
 Metals are looked for when the light is known well enough, and again when they have sharpened it (`metal`); those found are set, and the
 steps that follow may take it back.
