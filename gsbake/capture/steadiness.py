@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsbake.capture.cameras import Array, Camera
+from gsbake.capture.lookup import read_at
 from gsbake.capture.photo import srgb_decode
 
 #: A place that its brightest photos (this quantile) show brighter than the median one by this share shines.
@@ -60,8 +61,7 @@ class Sightings:
         if len(index):
             value = luminance_at(srgb_decode(rgb), pixel[index], BLUR)
             strongest = cv2.GaussianBlur(rgb.max(2), (0, 0), BLUR)
-            x, y = (pixel[index].T - 0.5).astype(np.float32)
-            code = cv2.remap(strongest, x, y, cv2.INTER_LINEAR).ravel()
+            code = read_at(strongest, *(pixel[index].T - 0.5))
             good = (code > DARKEST) & (value > 0)
             row[index[good]] = np.log(value[good])
         self._rows.append(row)
@@ -81,8 +81,7 @@ class Sightings:
 def luminance_at(linear: NDArray[np.float32], pixel: Array, blur: float) -> NDArray[np.float64]:
     """Luminance (n,) of a linear picture (h, w, 3), blurred by `blur` pixels, at the pixel positions (n, 2)."""
     smooth = cv2.GaussianBlur(linear @ _LUMINANCE, (0, 0), blur)
-    x, y = (pixel.T - 0.5).astype(np.float32)
-    return np.asarray(cv2.remap(smooth, x, y, cv2.INTER_LINEAR).ravel(), np.float64)
+    return read_at(smooth, *(pixel.T - 0.5)).astype(np.float64)
 
 
 def exposures(table: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -15,12 +15,12 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 import scipy.sparse as sparse
 from numpy.typing import NDArray
 
 from gsbake.capture.cameras import Camera
+from gsbake.capture.lookup import read_at
 from gsbake.surface.normals import edges_of, vertex_normals
 from gsbake.surface.raycast import RayCaster
 from gsbake.surface.spread import spread
@@ -111,9 +111,8 @@ def _border(mask: NDArray[np.uint8], uv: NDArray[np.float64], direction: NDArray
     along = np.arange(-REACH * STEPS, REACH * STEPS + 1) / STEPS
     if len(uv) == 0:
         return np.zeros(0)
-    x = (uv[:, :1] + along * direction[:, :1] - 0.5).astype(np.float32)
-    y = (uv[:, 1:] + along * direction[:, 1:] - 0.5).astype(np.float32)
-    value = cv2.remap(mask, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).astype(np.float64) / 255 - 0.5
+    x, y = (uv[:, k, None] + along * direction[:, k, None] - 0.5 for k in (0, 1))
+    value = read_at(mask, x, y).astype(np.float64) / 255 - 0.5
     inside, outside = value[:, :-1], value[:, 1:]
     falls = (inside >= 0) & (outside < 0)
     place = along[:-1] + inside / np.where(falls, inside - outside, 1.0) / STEPS
