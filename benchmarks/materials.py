@@ -47,7 +47,8 @@ STEPS: dict[str, tuple[str, ...]] = {
     "fit": ("bake.materials=fit", "bake.visibility=none", *NO_PRIORS),
     "visibility": ("bake.materials=fit", "bake.visibility=directional", *NO_PRIORS),
     "bounce": ("bake.materials=fit", "bake.visibility=bounce", *NO_PRIORS),
-    "priors": ("bake.materials=fit", "bake.visibility=bounce"),
+    "reflections": ("bake.materials=fit", "bake.visibility=reflections", *NO_PRIORS),
+    "priors": ("bake.materials=fit", "bake.visibility=reflections"),
 }
 
 

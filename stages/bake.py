@@ -248,6 +248,7 @@ def _fit_materials(
     from gsbake.surface.watch import PLACES, MeshWatch
     from gsbake.texture.coarse import Coarse
     from gsbake.texture.fit import MaterialFit, Priors
+    from gsbake.texture.mirrored import Mirrors
     from gsbake.texture.neighbours import neighbours
     from gsbake.texture.pixels import PixelReader
     from gsbake.texture.plainer import plainer
@@ -285,19 +286,22 @@ def _fit_materials(
     at = coarse.texels.interpolate(surface.position, surface.atlas.faces)
     pairs = neighbours(coarse.texels, at, normal)
 
-    seen = None
-    if settings.visibility in ("directional", "bounce") and settings.occlusion_rays:
-        above, near, rays = OFFSET * surface.diagonal, REACH * coarse.edge, 2 * settings.occlusion_rays  # over the whole sphere
+    seen, above = None, OFFSET * surface.diagonal
+    if settings.visibility in ("directional", "bounce", "reflections") and settings.occlusion_rays:
+        near, rays = REACH * coarse.edge, 2 * settings.occlusion_rays  # over the whole sphere
         seen = Visibility.trace(coarse.texels, surface.atlas.uv, surface.whole, normal, rays, above, near, lambda *_: ctx.check_stop())
     if settings.visibility == "none":
         occlusion = np.ones_like(occlusion)
 
     def start(roughness: float) -> MaterialFit:
-        light_size, bounce = ctx.settings.splat.env_size, settings.visibility == "bounce"
+        light_size, bounce = ctx.settings.splat.env_size, settings.visibility in ("bounce", "reflections")
         return MaterialFit(coarse.texels, at, pairs, normal, occlusion[:, 0], base, light_size, priors, roughness, seen, bounce)
 
     diffuse, why = looks_diffuse(*watch.changes())
     matte = wanted(ctx, "view_dependence", diffuse)
+    if seen is not None and settings.visibility == "reflections" and not matte:
+        mirrors = Mirrors(surface.whole, surface.atlas.uv, coarse.texels, at, normal, above)
+        photos, held = ([mirrors.traced(pixels) for pixels in part] for part in (photos, held))
     trials = {} if matte else trial_roughness(start, photos, ctx.seed, lambda done, total: ctx.check_stop())
     begun = time.perf_counter()
     choice = best_fit(start, photos, held, settings.fit_steps, ctx.seed, trials, matte, each)
@@ -380,7 +384,7 @@ def _save_mesh(ctx: Context, surface: Surface) -> None:
 
 STAGE = Stage(
     name="bake",
-    version=10,
+    version=11,
     title="Textures",
     run=run,
     needs=("poses", "refine", "mesh"),

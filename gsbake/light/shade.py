@@ -33,6 +33,7 @@ def shade(
     tables: LightTables,
     occlusion: torch.Tensor | None = None,
     diffuse_openness: torch.Tensor | None = None,
+    specular_openness: torch.Tensor | None = None,
 ) -> torch.Tensor:
     """Linear colours (n, 3) of n pixels.
 
@@ -46,6 +47,7 @@ def shade(
     occlusion: (n,), the open share of the hemisphere, 1 = open; None leaves everything open. It scales the diffuse part and, by the
     formula of Lagarde & de Rousiers (*Moving Frostbite to PBR*, 2014), the specular part.
     diffuse_openness: (n,), scales the diffuse part instead, where the share of this very light that gets through is known.
+    specular_openness: (n,), scales the specular part instead, where it was traced what the lobe meets (`traced_openness`).
 
     Notes
     -----
@@ -55,12 +57,41 @@ def shade(
     if occlusion is None:
         open_d = open_s = torch.ones_like(roughness)
     else:
-        open_d, open_s = occlusion if diffuse_openness is None else diffuse_openness, _specular_openness(normal, view, roughness, occlusion)
+        open_d = occlusion if diffuse_openness is None else diffuse_openness
+        open_s = _specular_openness(normal, view, roughness, occlusion) if specular_openness is None else specular_openness
     inputs = (normal, view, albedo, roughness, metallic, open_d, open_s, tables.table)
     if all(t.device.type == "cpu" and t.dtype == torch.float32 for t in inputs):
         colour: torch.Tensor = _Kernel.apply(tables.layout, *inputs)
         return colour
     return _reference(normal, view, albedo, roughness, metallic, open_d, open_s, tables)
+
+
+def traced_openness(
+    normal: torch.Tensor, view: torch.Tensor, roughness: torch.Tensor, occlusion: torch.Tensor, blocked: torch.Tensor
+) -> torch.Tensor:
+    """Share (n,) of the specular lobe left open where it is known whether the mirror direction is `blocked` (n,).
+
+    The share of the mirror direction in the lobe's dominant one is open or blocked as that direction is, the rest as the formula for
+    `occlusion` (n,) says. Without gradient but that of the occlusion.
+    """
+    with torch.no_grad():
+        mirror = _dominance(roughness)
+    ambient = _specular_openness(normal, view, roughness, occlusion)
+    return (1.0 - mirror) * ambient + mirror * (~blocked)
+
+
+def reflected(
+    normal: torch.Tensor, view: torch.Tensor, albedo: torch.Tensor, roughness: torch.Tensor, metallic: torch.Tensor, radiance: torch.Tensor
+) -> torch.Tensor:
+    """What pixels (n, 3) reflect of `radiance` (n, 3) that comes along their mirror direction: the specular part of `shade`, the light in
+    place of the room, by the share that `traced_openness` takes from the room. Gradients go to albedo and metallic."""
+    with torch.no_grad():
+        cosine = _soft_cosine((_unit(normal) * view).sum(dim=1))
+        scale, bias = brdf.scale_and_bias(cosine, roughness)
+        sent = _dominance(roughness).unsqueeze(1) * radiance
+    metal = metallic.unsqueeze(1)
+    f0 = 0.04 * (1.0 - metal) + metal * albedo
+    return sent * (f0 * scale.unsqueeze(1) + bias.unsqueeze(1))
 
 
 def _unit(normal: torch.Tensor) -> torch.Tensor:

@@ -134,8 +134,8 @@ class Bake(Section):
 
     size: Literal[128, 256, 512, 1024, 2048, 4096] = Field(1024, description="Edge of the square textures in texels.")
     occlusion_rays: int = Field(64, ge=0, description="Rays per texel for ambient occlusion; 0 leaves it out.")
-    visibility: Literal["none", "ambient", "directional", "bounce"] = Field(
-        "bounce", description="What the fit of materials knows of shadow: nothing, an even share, one that follows the light, and light from texel to texel too."
+    visibility: Literal["none", "ambient", "directional", "bounce", "reflections"] = Field(
+        "reflections", description="What the fit of materials knows of the object around a texel: nothing, an even shadow, one that follows the light, light from texel to texel too, and its mirror images."
     )
     materials: Literal["none", "delit", "fit", "surfels"] = Field(
         "none", description="none: colours only; delit: colours without the shading of one diffuse light, for matt things; fit: materials and light fitted to the photos in texture space; surfels: those the surfels learnt (splat.shading = pbr)."

@@ -45,7 +45,7 @@ from gsbake.light.colour import colourfulness, linear_to_srgb
 from gsbake.light.cubemap import solid_angles
 from gsbake.light.environment import EnvironmentLight
 from gsbake.texture.alike import Alike
-from gsbake.texture.batch import BOUNCED, GLOW, Batch
+from gsbake.texture.batch import AROUND, BOUNCED, GLOW, SENT, Batch
 from gsbake.texture.emission import find_glow
 from gsbake.texture.level import Level, find_level, graded
 from gsbake.texture.metal import Evidence, find_metals
@@ -143,7 +143,7 @@ class MaterialFit:
         self._bend = torch.zeros(n, 3, requires_grad=True)
         self._even = EVEN * (texels.size / 512) ** 2  # a slope per texel is steeper where texels are larger
         open_share = torch.as_tensor(np.ascontiguousarray(occlusion, np.float32))[:, None]
-        self._around = torch.cat([open_share, open_share, torch.zeros(n, 6)], 1)
+        self._around = torch.cat([open_share, open_share, torch.zeros(n, AROUND - 2)], 1)
         self._texels, self._at, self._shown = texels, np.asarray(at, np.float64), base
         self._visibility, self._bounce = visibility, bounce
         self._light = EnvironmentLight(light_size)
@@ -180,7 +180,7 @@ class MaterialFit:
             if glow and step == int(GLOW_AT * steps):
                 glowing = self._set_glow(batches)
             if level and step in {int(share * steps) for share in LEVEL_AT}:
-                levels.append(self._set_level(batches, generator, not matte or len(levels) < TINTED_MATT))
+                levels.append(self._set_level(batches, generator, not matte or len(levels) < TINTED_MATT, not levels))
             if metals and not matte and step in {int(share * steps) for share in METALS_AT}:
                 metal = self._set_metals(batches)
             if step % RENEWED == 0:
@@ -237,18 +237,20 @@ class MaterialFit:
             # (1 − m) albedo + F0: whatever the roughness, what is not reflected as paint is reflected as gloss.
             reflectance = values[:, :3] + 0.04 * (1 - values[:, 4:])
             irradiance = self._light.prefilter().diffuse(self._normal) * openness[:, None]
-            self._around[:, BOUNCED] = torch.as_tensor(self._visibility.bounced(irradiance.numpy(), reflectance.numpy()))
+            bounced = torch.as_tensor(self._visibility.bounced(irradiance.numpy(), reflectance.numpy()))
+            self._around[:, BOUNCED] = bounced
+            self._around[:, SENT] = reflectance * (irradiance + bounced) + self._around[:, GLOW]
 
     @torch.no_grad()
-    def _set_level(self, batches: list[Batch], generator: torch.Generator, tint: bool) -> Level:
-        """Let the light go on as bright and as even as explains most, and paint as what reflects the same of it; what was found."""
+    def _set_level(self, batches: list[Batch], generator: torch.Generator, tint: bool, rough: bool) -> Level:
+        """Let the light go on as bright and as even as explains most, and paint as rough and as what reflects the same; what was found."""
         values = torch.sigmoid(self._logits)
         paint = (values[:, 4] < PAINT) & (self._around[:, GLOW].sum(1) == 0)
         share = min(1.0, LEVEL_PIXELS / max(1, sum(len(b.weight) for b in batches)))
         asked = paint & (torch.rand(len(paint), generator=generator) < share)
         few = [part for b in batches if len((part := b.showing(asked)).weight)]
         if not few:
-            return Level(np.ones(3), 1.0, 0.0)
+            return Level(np.ones(3), 1.0, 0.0, 0.0)
         radiance, area = self._light.radiance().numpy(), solid_angles(self._light.size)
 
         def regraded(brightness: NDArray[np.float64], contrast: float) -> EnvironmentLight:
@@ -262,7 +264,7 @@ class MaterialFit:
             tables = light.prefilter()
             return [b.evidence(self._bend, tables, around) for b in few]
 
-        found = find_level(under, values[:, 3].numpy(), tint)
+        found = find_level(under, values[:, 3].numpy(), tint, rough)
         if found.gain <= 0:
             return found
         before = self._light.prefilter().diffuse(self._normal) * self._around[:, :1]
@@ -273,6 +275,7 @@ class MaterialFit:
         at = torch.nonzero(paint)[:, 0]
         start = values[at].numpy()
         start[:, :3] = np.clip(start[:, :3] * (before[at] / after[at].clamp_min(1e-6)).numpy(), DARK_PAINT, BASE_RANGE[1])
+        start[:, 3] = found.roughened(start[:, 3])
         self._restart(at.numpy(), start)
         return found
 

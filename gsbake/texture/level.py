@@ -1,4 +1,4 @@
-"""How bright and how even the light is: a search of two numbers, every texel's best paint solved for each try.
+"""How bright and how even the light is, and how rough the paint: a search of three numbers, every texel's best paint solved for each try.
 
 Under one light that does not move, a brighter light and darker paint look nearly the same: only reflections tell them apart, whose strength
 is known (.04 of the light, METHOD §6). Gradient steps find light and paint together and hardly move along that valley; above all an even
@@ -12,11 +12,13 @@ differentiation of pseudo-inverses and nonlinear least squares problems whose va
 
     L' = s · mean(L) · (L / mean(L))^γ / mean of the same
 
-of other brightness s and contrast γ, as long as the photos are explained better, and at the end single colours of the light a little
-brighter or darker. Base colours are found robustly by reweighting: a misplaced reflection must not decide. Errors are those of sRGB
-values, averaged over blocks of a twelfth of the object before they count: a sharp reflection a few pixels off, right in strength, would
-otherwise ask for a darker light, as noise in what explains always weakens what is found (attenuation; Fuller, *Measurement Error
-Models*, 1987).
+of other brightness s and contrast γ, and every texel rougher or smoother by one shift of logit(roughness), as long as the photos are
+explained better, and at the end single colours of the light a little brighter or darker. Roughness takes part because a wrong one bends
+the light: reflections that paint taken for too smooth would show, and photos do not, ask for a dim and even light, and the way out leads
+over a hill. A blurred light and paint too smooth show what a sharp light and rougher paint do, hence steps of both. Base colours are
+found robustly by reweighting: a misplaced reflection must not decide. Errors are those of sRGB values, averaged over blocks of a
+twelfth of the object before they count: a sharp reflection a few pixels off, right in strength, would otherwise ask for a darker light,
+as noise in what explains always weakens what is found (attenuation; Fuller, *Measurement Error Models*, 1987).
 """
 
 from __future__ import annotations
@@ -33,29 +35,48 @@ from gsbake.texture.metal import Evidence, by_eye
 
 Floats = NDArray[np.float64]
 
-#: Factors on brightness and exponents of contrast that are tried from where the search stands, until none helps.
-BRIGHTER, STRONGER = 1.2, 1.15
+#: Factors on brightness, exponents of contrast and shifts of logit(roughness) that are tried, until none helps.
+BRIGHTER, STRONGER, ROUGHER = 1.2, 1.15, 0.4
+#: Steps of brightness, contrast and roughness, in the order they are tried.
+WAYS = ((-1, 0, 0), (1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1), (1, 0, 1), (-1, 0, -1), (0, 1, 1), (0, -1, -1))
+#: Where else a search begins: a bright light on rough paint, as a valley of its own leads there.
+ELSEWHERE = (2, 0, 4)
 #: Factor on one colour of the light that is tried at the end.
 TINT = 1.1
-#: Furthest that the search goes: brightness, and contrast.
-FURTHEST = (3.0, 2.0)
-#: A try must lower the error by this share.
-CLEARLY = 0.002
+#: Furthest that the search goes: brightness, contrast and the shift of logit(roughness).
+FURTHEST = (3.0, 2.0, 3.0)
+#: A try must lower the error by this share; one of other roughness by the second; where else it led by the third.
+CLEARLY, SURELY, FAR = 0.002, 0.01, 0.03
 #: Rounds of reweighting, and the error of an sRGB value from which pixels count less.
 ROUNDS, NEAR = 2, 0.02
 
 
 @dataclass(frozen=True)
 class Level:
-    """`brightness` s (3,) and `contrast` γ of the light that explains the photos best; `gain` is the share of the error that went."""
+    """`brightness` s (3,) and `contrast` γ of the light that explains the photos best, with paint `rougher` by so much in logit(roughness);
+    `gain` is the share of the error that went."""
 
     brightness: Floats
     contrast: float
+    rougher: float
     gain: float
 
     def __str__(self) -> str:
         red, green, blue = self.brightness
-        return f"{red:.2f} {green:.2f} {blue:.2f} times as bright at contrast {self.contrast:.2f} ({self.gain:.1%} less unexplained)"
+        rougher = f", paint rougher by {self.rougher:+.1f}" if self.rougher else ""
+        light = f"{red:.2f} {green:.2f} {blue:.2f} times as bright at contrast {self.contrast:.2f}"
+        return f"{light}{rougher} ({self.gain:.1%} less unexplained)"
+
+    def roughened(self, roughness: NDArray[Any]) -> NDArray[np.float32]:
+        """`roughness` (n,) of paint, as much rougher."""
+        return roughened(roughness, self.rougher)
+
+
+def roughened(roughness: NDArray[Any], rougher: float) -> NDArray[np.float32]:
+    """`roughness` (n,) with its logit shifted by `rougher`."""
+    odds = np.clip(roughness, 1e-4, 1 - 1e-4)
+    odds = odds / (1 - odds) * np.exp(rougher)
+    return np.asarray(odds / (1 + odds), np.float32)
 
 
 def graded(radiance: NDArray[Any], brightness: NDArray[Any], contrast: float, area: NDArray[Any]) -> NDArray[np.float32]:
@@ -70,43 +91,59 @@ def graded(radiance: NDArray[Any], brightness: NDArray[Any], contrast: float, ar
     return np.asarray(brightness * level * shape / mean(shape), np.float32)
 
 
-def find_level(evidence: Callable[[Floats, float], Sequence[Evidence]], roughness: NDArray[np.float32], tint: bool = True) -> Level:
-    """The brightness of each colour and the contrast under which paint of `roughness` (texels,) explains most.
+def find_level(
+    evidence: Callable[[Floats, float], Sequence[Evidence]], roughness: NDArray[np.float32], tint: bool = True, rough: bool = True
+) -> Level:
+    """The brightness of each colour and the contrast under which paint explains most, and how much rougher than `roughness` (n,) it is.
 
     `evidence` gives the pixels of all photos under the light of a brightness (3,) and a contrast. Without `tint` colours stay as they are
-    to one another.
+    to one another, without `rough` the paint stays as rough as it is; with it, a second search begins far off.
     """
     seen: dict[_Place, Floats] = {}
+    lit: dict[tuple[float, ...], Sequence[Evidence]] = {}
 
     def at(place: _Place) -> Floats:
         if place not in seen:
-            seen[place] = _unexplained(evidence(place.brightness, STRONGER**place.stronger), roughness)
+            light = (*place.brightness, STRONGER**place.stronger)
+            if light not in lit:
+                lit[light] = evidence(place.brightness, light[-1])
+            seen[place] = _unexplained(lit[light], roughened(roughness, ROUGHER * place.rougher))
         return seen[place]
 
-    here = start = _Place(0, 0)
-    moved = True
-    while moved:
-        moved = False
-        for brighter, stronger in ((-1, 0), (1, 0), (0, 1), (0, -1)):
-            there = here.beside(brighter, stronger)
-            while there.near and at(there).sum() < (1 - CLEARLY) * at(here).sum():
-                here, there, moved = there, there.beside(brighter, stronger), True
-    for way in (-1, 1) if tint else ():
-        all_three = replace(here, tint=(way, way, way))
+    def down(here: _Place) -> _Place:
+        moved = True
+        while moved:
+            moved = False
+            for way in (way for way in WAYS if rough or not way[2]):
+                least = 1 - (SURELY if way[2] else CLEARLY)
+                there = here.beside(*way)
+                while there.near and at(there).sum() < least * at(here).sum():
+                    here, there, moved = there, there.beside(*way), True
+        return here
+
+    start = _Place(0, 0, 0)
+    here = down(start)
+    if rough:
+        there = down(start.beside(*ELSEWHERE))
+        here = there if at(there).sum() < (1 - FAR) * at(here).sum() else here
+    for sign in (-1, 1) if tint else ():
+        all_three = replace(here, tint=(sign, sign, sign))
         better = at(all_three) < (1 - CLEARLY) * at(here)
-        there = replace(here, tint=tuple(way * int(b) for b in better))
+        there = replace(here, tint=tuple(sign * int(b) for b in better))
         if 0 < better.sum() < 3 and at(there).sum() < at(here).sum():
             here = there
             break
-    return Level(here.brightness, STRONGER**here.stronger, float(1 - at(here).sum() / max(float(at(start).sum()), 1e-12)))
+    gain = float(1 - at(here).sum() / max(float(at(start).sum()), 1e-12))
+    return Level(here.brightness, STRONGER**here.stronger, ROUGHER * here.rougher, gain)
 
 
 @dataclass(frozen=True)
 class _Place:
-    """Where the search stands, in steps of brightness and contrast, and of each colour's tint."""
+    """Where the search stands, in steps of brightness, contrast and roughness, and of each colour's tint."""
 
     brighter: int
     stronger: int
+    rougher: int
     tint: tuple[int, ...] = (0, 0, 0)
 
     @property
@@ -115,10 +152,11 @@ class _Place:
 
     @property
     def near(self) -> bool:
-        return BRIGHTER ** abs(self.brighter) <= FURTHEST[0] and STRONGER ** abs(self.stronger) <= FURTHEST[1]
+        far = (BRIGHTER ** abs(self.brighter), STRONGER ** abs(self.stronger), ROUGHER * abs(self.rougher))
+        return all(value <= most for value, most in zip(far, FURTHEST, strict=True))
 
-    def beside(self, brighter: int, stronger: int) -> _Place:
-        return _Place(self.brighter + brighter, self.stronger + stronger, self.tint)
+    def beside(self, brighter: int, stronger: int, rougher: int) -> _Place:
+        return _Place(self.brighter + brighter, self.stronger + stronger, self.rougher + rougher, self.tint)
 
 
 def _unexplained(photos: Sequence[Evidence], roughness: NDArray[np.float32]) -> Floats:

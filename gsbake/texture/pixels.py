@@ -41,7 +41,7 @@ class Pixels:
 
     `texel` (n, 4) int64 indices into the texels and `share` (n, 4) their bilinear weights; `towards` (n, 3) unit vectors from the surface
     to the camera; `colour` (n, 3) sRGB 0..1; `weight` (n,) 0..1; `block` (n,) which square block of the photo each lies in; `pixel` (n,)
-    flat row-major index in the photo.
+    flat row-major index in the photo; `met` (n,) the texel that the mirrored view meets, -1: none, None: not traced.
     """
 
     texel: NDArray[np.int64]
@@ -51,6 +51,7 @@ class Pixels:
     weight: Floats
     block: NDArray[np.int32]
     pixel: NDArray[np.int64]
+    met: NDArray[np.int64] | None = None
 
     def __len__(self) -> int:
         return len(self.weight)
@@ -58,7 +59,9 @@ class Pixels:
     def thinned(self, most: int) -> Pixels:
         """Every second, third … pixel, so that at most `most` are left."""
         step = max(1, -(-len(self) // most))
-        return Pixels(*(getattr(self, field.name)[::step] for field in fields(self)))
+        every = {field.name: getattr(self, field.name) for field in fields(self)}
+        kept: Any = {name: None if part is None else part[::step] for name, part in every.items()}
+        return Pixels(**kept)
 
     def without_gain(self, gain: NDArray[Any]) -> Pixels:
         """The same pixels with a photo's `gain` (3,) of linear colour divided out."""
@@ -71,9 +74,7 @@ class PixelReader:
     """Reads photos of a mesh with `uv` (v, 2) (origin top left) and `faces` (f, 3); `caster` holds the same triangles in the same order."""
 
     def __init__(self, caster: RayCaster, uv: NDArray[Any], texels: Texels, diagonal: float) -> None:
-        self._caster, self._uv, self._size, self._diagonal = caster, np.asarray(uv, np.float64), texels.size, diagonal
-        self._slot = np.full(texels.size * texels.size, -1, np.int64)
-        self._slot[texels.index] = np.arange(len(texels))
+        self._caster, self._uv, self._texels, self._diagonal = caster, np.asarray(uv, np.float64), texels, diagonal
 
     def read(self, camera: Camera, rgb: NDArray[np.uint8], mask: NDArray[np.uint8] | None) -> Pixels:
         """The pixels of a photo (h, w, 3) that show the mesh, inside its `mask` (h, w; 255: object) when there is one."""
@@ -114,23 +115,22 @@ class PixelReader:
             rays = np.stack([(column + dx) / camera.fx, (row + dy) / camera.fy, np.ones(len(pixel))], 1) @ camera.R
             hits = self._caster.first_hit(camera.centre[None], rays)
             uv = np.einsum("nk,nkd->nd", hits.bary, self._uv[self._caster.faces[np.maximum(hits.face, 0)]])
-            x, y = np.clip((uv * self._size).astype(np.int64), 0, self._size - 1).T
-            slot = self._slot[y * self._size + x]
+            slot = self._texels.holding(uv)
             met = hits.hit & (slot >= 0)
             texel[:, k], distance[met, k] = np.maximum(slot, 0), hits.distance[met]
         return texel, distance < distance.min(1, keepdims=True) + EDGE_STEP * self._diagonal
 
     def _taps(self, uv: NDArray[np.float64]) -> tuple[NDArray[np.int64], Floats]:
         """The four texels around each texture coordinate (n, 2) and their weights; texels off the charts take no part."""
-        x, y = uv[:, 0] * self._size - 0.5, uv[:, 1] * self._size - 0.5
+        x, y = uv[:, 0] * self._texels.size - 0.5, uv[:, 1] * self._texels.size - 0.5
         left, top = np.floor(x), np.floor(y)
         fx, fy = x - left, y - top
         texel = np.zeros((len(uv), 4), np.int64)
         share = np.zeros((len(uv), 4), np.float32)
         for k, (dx, dy) in enumerate(((0, 0), (1, 0), (0, 1), (1, 1))):
-            column = np.clip(left + dx, 0, self._size - 1).astype(np.int64)
-            row = np.clip(top + dy, 0, self._size - 1).astype(np.int64)
-            slot = self._slot[row * self._size + column]
+            column = np.clip(left + dx, 0, self._texels.size - 1).astype(np.int64)
+            row = np.clip(top + dy, 0, self._texels.size - 1).astype(np.int64)
+            slot = self._texels.slot[row * self._texels.size + column]
             part = (fx if dx else 1 - fx) * (fy if dy else 1 - fy)
             share[:, k] = np.where(slot >= 0, part, 0)
             texel[:, k] = np.maximum(slot, 0)

@@ -8,6 +8,7 @@ top of the image (v = 0 in glTF).
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numba
@@ -43,6 +44,18 @@ class Texels:
     def interpolate(self, values: NDArray[Any], faces: NDArray[Any]) -> Floats:
         """Vertex `values` (v, c) over `faces` (f, 3), interpolated at each texel: (n, c) float32."""
         return _interpolate(np.ascontiguousarray(values, np.float32), np.ascontiguousarray(faces, np.int32), self.face, self.bary)
+
+    @cached_property
+    def slot(self) -> NDArray[np.int64]:
+        """Which texel each place (size²,) of the texture is, -1: none."""
+        out = np.full(self.size * self.size, -1, np.int64)
+        out[self.index] = np.arange(len(self))
+        return out
+
+    def holding(self, uv: NDArray[Any]) -> NDArray[np.int64]:
+        """The texel (m,) that texture coordinates (m, 2) (origin top left) lie in, -1: none."""
+        x, y = np.clip((uv * self.size).astype(np.int64), 0, self.size - 1).T
+        return np.asarray(self.slot[y * self.size + x])
 
     def image(self, values: NDArray[Any], empty: float = 0.0) -> Floats:
         """An image (size, size, c) float32 with texel `values` (n, c) or (n,) in place and `empty` elsewhere."""

@@ -110,8 +110,6 @@ class Visibility:
         origin = position + offset * facing
         column, row = texels.index % texels.size, texels.index // texels.size
         turn = (row % PATTERN) * PATTERN + column % PATTERN
-        slot = np.full(texels.size * texels.size, -1, np.int64)
-        slot[texels.index] = np.arange(len(texels))
         found: list[tuple[NDArray[Any], ...]] = []
         copies = directions(count)
         for k in range(count):
@@ -122,9 +120,8 @@ class Visibility:
             hits = caster.first_hit(origin[up], ray[up])
             hit = np.flatnonzero(hits.hit)
             texel = up[hit]
-            place = np.einsum("nk,nkd->nd", hits.bary[hit], uv[caster.faces[hits.face[hit]]]) * texels.size
-            x, y = np.clip(place.astype(np.int64), 0, texels.size - 1).T
-            found.append((texel, turn[texel] * count + k, slot[y * texels.size + x], cosine[texel] * (4 / count)))
+            met = texels.holding(np.einsum("nk,nkd->nd", hits.bary[hit], uv[caster.faces[hits.face[hit]]]))
+            found.append((texel, turn[texel] * count + k, met, cosine[texel] * (4 / count)))
             if each is not None:
                 each(k + 1, count)
         texel, direction, met, weight = (np.concatenate(parts) for parts in zip(*found, strict=True))

@@ -10,7 +10,7 @@ import torch
 
 from gsbake.light import cubemap
 from gsbake.light.environment import EnvironmentLight
-from gsbake.light.shade import _reference, shade
+from gsbake.light.shade import _reference, reflected, shade, traced_openness
 from gsbake.light.tables import LightTables
 
 
@@ -86,6 +86,26 @@ def test_sphere_against_the_rendering_equation() -> None:
         error = got.detach().numpy() - truth
         assert np.sqrt((error**2).mean() / (truth**2).mean()) < tolerance
         assert abs(error.mean() / truth.mean()) < tolerance
+
+
+def test_object_as_bright_as_the_room_changes_nothing() -> None:
+    """Under an even light L, a lobe that meets the object where it sends L as well reflects what it would reflect in the open."""
+    tables = EnvironmentLight(8, 1.0).prefilter()
+    normal, view, albedo, rough, metal = buffers(500, 5)
+    level, whole = tables.specular(normal, rough), torch.ones(500)
+    blocked = torch.arange(500) % 2 == 0
+    openness = traced_openness(normal, view, rough, whole, blocked)
+    direct = shade(normal, view, albedo, rough, metal, tables, whole, whole, openness)
+    both = direct + blocked[:, None] * reflected(normal, view, albedo, rough, metal, level)
+    torch.testing.assert_close(both, shade(normal, view, albedo, rough, metal, tables), rtol=1e-4, atol=1e-5)
+
+
+def test_smooth_lobe_goes_by_its_mirror_direction_and_a_rough_one_by_the_ambient_share() -> None:
+    normal, view, *_ = buffers(2, 6)
+    half, blocked = torch.full((2,), 0.5), torch.tensor([True, False])
+    assert traced_openness(normal, view, torch.full((2,), 0.02), half, blocked).tolist() == pytest.approx([0, 1], abs=1e-3)
+    rough = traced_openness(normal, view, torch.ones(2), half, blocked)
+    assert rough.tolist() == pytest.approx([0.5, 0.5], abs=1e-3)
 
 
 def test_gradcheck_in_double() -> None:

@@ -92,14 +92,15 @@ def glossy() -> Scene:
     return Scene(0.25)
 
 
-def test_paint_and_roughness_come_back(glossy: Scene) -> None:
-    fitted = glossy.fit(0.2).run(glossy.photos[2:], glossy.photos[:2], 300, 0)
+@pytest.mark.parametrize("start", [0.2, 0.45])
+def test_paint_and_roughness_come_back(glossy: Scene, start: float) -> None:
+    fitted = glossy.fit(start).run(glossy.photos[2:], glossy.photos[:2], 300, 0)
     known = fitted.weight > 0.3
     assert known.mean() > 0.4
     paint, truth = fitted.values[known, :3], glossy.paint[known]
     gain = (paint * truth).sum(0) / (paint**2).sum(0)  # brightness is shared with the light
     assert np.abs(encode(paint * gain) - encode(truth)).mean() < 0.06
-    assert np.abs(fitted.values[known, 3] - 0.25).mean() < 0.12
+    assert np.abs(fitted.values[known, 3] - 0.25).mean() < 0.06
     assert fitted.values[known, 4].mean() < 0.1
     assert fitted.held_out is not None and fitted.held_out > 22
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from gsbake.light.cubemap import solid_angles
 from gsbake.light.environment import EnvironmentLight
 from gsbake.light.shade import shade
-from gsbake.texture.level import BRIGHTER, TINT, Level, find_level, graded
+from gsbake.texture.level import BRIGHTER, ROUGHER, TINT, Level, find_level, graded, roughened
 from gsbake.texture.metal import Evidence
 
 Doubles = NDArray[np.float64]
@@ -33,40 +33,41 @@ TRUE = EnvironmentLight.from_function(room, SIZE).radiance().detach().numpy()
 class Plastic:
     """Texels of many paints and one gloss, seen from many sides; `off` degrees by which the normals that explain them are wrong."""
 
-    def __init__(self, off: float = 0.0, single: bool = False) -> None:
+    def __init__(self, off: float = 0.0, single: bool = False, roughness: float = 0.2) -> None:
         rng = np.random.default_rng(5)
         self.normal = rng.normal(size=(TEXELS, 3))
         self.normal /= np.linalg.norm(self.normal, axis=1, keepdims=True)
         self.meshed = self.normal + np.radians(off) * rng.normal(size=(TEXELS, 3))
         self.paint = rng.uniform(0.05, 0.6, (TEXELS, 3)).astype(np.float32)
-        self.roughness = np.full(TEXELS, 0.2, np.float32)
+        self.roughness = np.full(TEXELS, roughness, np.float32)
         self.sides = []
         for _ in range(PHOTOS):
             side = rng.normal(size=3)
             self.sides.append(side / np.linalg.norm(side))
         self.single = single
 
-    def colours(self, normal: Doubles, side: Doubles, base: NDArray[np.float32], light: NDArray[np.float32]) -> NDArray[np.float32]:
+    def colours(
+        self, normal: Doubles, side: Doubles, base: NDArray[np.float32], light: NDArray[np.float32], gloss: NDArray[np.float32]
+    ) -> NDArray[np.float32]:
         tables = EnvironmentLight.from_radiance(light).prefilter()
         n, v = (torch.as_tensor(x, dtype=torch.float32) for x in (normal, np.tile(side, (len(normal), 1))))
         with torch.no_grad():
-            gloss = torch.full((len(normal),), 0.2)
-            return np.asarray(shade(n, v, torch.as_tensor(base), gloss, torch.zeros(len(normal)), tables).numpy())
+            return np.asarray(shade(n, v, torch.as_tensor(base), torch.as_tensor(gloss), torch.zeros(len(normal)), tables).numpy())
 
     def evidence(self, believed: NDArray[np.float32]) -> Callable[[Doubles, float], Sequence[Evidence]]:
         """What `find_level` asks for when the light is `believed`."""
         photos = []
         for side in self.sides:
             seen = np.flatnonzero(self.normal @ side > 0.2)
-            photos.append((side, seen, self.colours(self.normal[seen], side, self.paint[seen], TRUE)))
+            photos.append((side, seen, self.colours(self.normal[seen], side, self.paint[seen], TRUE, self.roughness[seen])))
 
         def under(brightness: Doubles, contrast: float) -> list[Evidence]:
             light = graded(believed, brightness, contrast, AREA)
             found = []
             for side, seen, colour in photos:
 
-                def trial(value: float, rough: object, metallic: float, side=side, normal=self.meshed[seen]) -> NDArray[np.float32]:  # type: ignore[no-untyped-def]
-                    return self.colours(normal, side, np.full((len(normal), 3), value, np.float32), light)
+                def trial(value: float, rough: NDArray[np.float32], metallic: float, side=side, seen=seen) -> NDArray[np.float32]:  # type: ignore[no-untyped-def]
+                    return self.colours(self.meshed[seen], side, np.full((len(seen), 3), value, np.float32), light, rough[seen])
 
                 # Blocks of pixels show texels that lie side by side, here those with normals alike.
                 order = np.argsort(np.argsort(self.normal[seen] @ np.array([0.3, 0.5, 0.8])))
@@ -76,8 +77,9 @@ class Plastic:
 
         return under
 
-    def level(self, believed: NDArray[np.float32]) -> Level:
-        return find_level(self.evidence(believed), self.roughness)
+    def level(self, believed: NDArray[np.float32], rough: bool = False, rougher: float = 0.0) -> Level:
+        """The level found by one who believes in this light and in paint `rougher` than it is."""
+        return find_level(self.evidence(believed), roughened(self.roughness, rougher), rough=rough)
 
 
 def mean(light: NDArray[np.float32]) -> Doubles:
@@ -116,6 +118,35 @@ def test_an_even_glow_that_paint_made_up_for_goes() -> None:
 def test_one_colour_alone_is_found_out() -> None:
     found = Plastic().level(graded(TRUE, np.array([1.0, 1.0, TINT]), 1.0, AREA))
     assert found.brightness == pytest.approx(np.array([1, 1, 1 / TINT]))
+
+
+def test_roughness_shifts_by_its_odds() -> None:
+    level = Level(np.ones(3), 1.0, np.log(3.0), 0.1)
+    assert level.roughened(np.array([0.5, 0.25, 0.0, 1.0])) == pytest.approx([0.75, 0.5, 0, 1], abs=1e-3)
+    assert "rougher by +1.1" in str(level)
+
+
+def test_right_roughness_stays() -> None:
+    found = Plastic().level(TRUE, rough=True)
+    assert found.rougher == 0 and found.gain == 0
+
+
+@pytest.mark.parametrize(("true", "wrong"), [(0.2, -0.8), (0.2, 0.8), (0.85, -2.0)])
+def test_paint_taken_for_too_smooth_or_too_rough_comes_back(true: float, wrong: float) -> None:
+    """Not by a light made dim and even, which would hide the reflections that paint so smooth would show."""
+    plastic = Plastic(roughness=true)
+    found = plastic.level(TRUE, rough=True, rougher=wrong)
+    assert found.rougher == pytest.approx(-wrong, abs=ROUGHER + 1e-6)
+    assert found.brightness == pytest.approx(np.ones(3), rel=BRIGHTER - 1)
+    assert plastic.level(TRUE, rough=False, rougher=wrong).rougher == 0
+
+
+def test_bright_light_on_rough_paint_is_found_from_the_other_valley() -> None:
+    """Rough paint taken for satin, under a light that was dimmed and evened to match."""
+    believed = graded(TRUE, np.full(3, 0.6), 0.6, AREA)
+    found = Plastic(roughness=0.9).level(believed, rough=True, rougher=-2.4)
+    assert found.rougher > 1.2
+    assert found.brightness.mean() * 0.6 > 0.8
 
 
 def test_reflections_a_little_off_do_not_ask_for_a_darker_light() -> None:
