@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from gsbake.light.cubemap import solid_angles
 from gsbake.light.environment import EnvironmentLight
 from gsbake.light.shade import shade
+from gsbake.texture.colour import decode
 from gsbake.texture.level import BRIGHTER, ROUGHER, TINT, Level, find_level, graded, roughened
 from gsbake.texture.metal import Evidence
 
@@ -141,12 +142,36 @@ def test_paint_taken_for_too_smooth_or_too_rough_comes_back(true: float, wrong: 
     assert plastic.level(TRUE, rough=False, rougher=wrong).rougher == 0
 
 
-def test_bright_light_on_rough_paint_is_found_from_the_other_valley() -> None:
-    """Rough paint taken for satin, under a light that was dimmed and evened to match."""
+def test_dim_even_light_on_smooth_paint_goes_to_the_bright_one_on_rough_paint() -> None:
     believed = graded(TRUE, np.full(3, 0.6), 0.6, AREA)
     found = Plastic(roughness=0.9).level(believed, rough=True, rougher=-2.4)
     assert found.rougher > 1.2
     assert found.brightness.mean() * 0.6 > 0.8
+
+
+@pytest.mark.parametrize(("depth", "there"), [(0.05, True), (0.1, False)])
+def test_valley_behind_a_hill_is_found_where_it_is_clearly_deeper(depth: float, there: bool) -> None:
+    """One pixel whose error is laid out by hand: .1 at a light dimmer by a step, `depth` at 1.7 times the light on rougher paint."""
+
+    def error(steps: float, rougher: float) -> float:
+        near = 0.1 + 0.02 * (abs(steps + 1) + abs(rougher))
+        far = depth + 0.02 * (abs(steps - 3) + abs(rougher - 2.0))
+        hill = 0.3 if 0 < rougher < 1.5 else 0.0
+        return min(near, far) + hill
+
+    def under(brightness: Doubles, contrast: float) -> list[Evidence]:
+        steps = float(np.log(brightness[0]) / np.log(BRIGHTER))
+
+        def shown(base: float, roughness: NDArray[np.float32], metallic: float) -> NDArray[np.float32]:
+            rougher = float(np.log(roughness[0] / (1 - roughness[0])))
+            return decode(np.full((1, 3), 0.3 + error(steps, rougher) + 0.01 * abs(contrast - 1), np.float32))
+
+        colour = decode(np.full((1, 3), 0.3, np.float32))
+        return [Evidence(np.zeros(1, np.int64), colour, np.ones(1, np.float32), np.zeros(1, np.int32), shown)]
+
+    found = find_level(under, np.full(1, 0.5, np.float32), tint=False)
+    assert (found.rougher > 1.5) == there
+    assert found.brightness[0] == pytest.approx(BRIGHTER**3 if there else 1 / BRIGHTER)
 
 
 def test_reflections_a_little_off_do_not_ask_for_a_darker_light() -> None:
