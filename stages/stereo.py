@@ -8,14 +8,17 @@ from gsbake.pipeline.stage import Context, Stage
 
 #: With fewer photos, or smaller ones, matching says too little to be worth its time.
 LEAST_PHOTOS, LEAST_SIZE = 5, 200
+#: Parts too thin for the hull get points as dense as so many all over the object.
+THIN_POINTS = 40_000
 
 
 def run(ctx: Context) -> dict[str, Any]:
-    """Write `points.ply`, `depth/<name>.npz` and, with masks, `hull.npz`; nothing when stereo is skipped."""
+    """Write `points.ply`, `depth/<name>.npz` and, with masks, `hull.npz` and `thin.npz`; nothing when stereo is skipped."""
     import numpy as np
 
     from gsbake.capture.hull import visual_hull
     from gsbake.capture.posed import PosedPhotos
+    from gsbake.capture.thin import find_thin
     from gsbake.stereo.ghosts import find_ghosts, without_ghosts
     from gsbake.stereo.photos import one_thread
     from gsbake.stereo.session import StereoRun
@@ -72,6 +75,15 @@ def run(ctx: Context) -> dict[str, Any]:
             f"photos see through {100 * opened.share:.1f} % of its cells onto a surface behind, "
             f"at {opened.refused} other places onto none, at {opened.holed} against silhouettes",
         )
+    if hull is not None:
+        with ctx.part("thin parts"):
+            slight = find_thin(posed, hull, THIN_POINTS, ctx.seed)
+        ctx.decide(
+            "thin parts",
+            f"{len(slight.points)} points" if len(slight.points) else "none",
+            f"{100 * slight.share:.1f} % of the masks is narrower than a cell of the hull",
+        )
+        slight.save(ctx.out / "thin.npz")
     (ctx.out / "depth").mkdir()
     for one in maps:
         one.save(ctx.out / "depth" / f"{one.camera.name}.npz")
@@ -97,7 +109,7 @@ def run(ctx: Context) -> dict[str, Any]:
 
 STAGE = Stage(
     name="stereo",
-    version=3,
+    version=4,
     title="Multi-view stereo",
     run=run,
     needs=("poses",),

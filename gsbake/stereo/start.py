@@ -17,6 +17,7 @@ from scipy.spatial import cKDTree
 from gsbake.capture.cameras import Array, Camera
 from gsbake.capture.hull import Hull
 from gsbake.capture.posed import PosedPhotos
+from gsbake.capture.thin import load_thin
 from gsbake.stereo.cloud import StereoCloud
 from gsbake.stereo.maps import read_depth
 
@@ -88,7 +89,8 @@ def in_air(points: Array, maps: Iterator[tuple[Camera, NDArray[np.float32]]], ma
 
 
 def start_points(posed: PosedPhotos, folder: Path, count: int, seed: int) -> StartPoints | None:
-    """At most `count` evenly spread points from the stereo stage's `folder`, and up to as many from its opened hull, where there is one.
+    """At most `count` evenly spread points from the stereo stage's `folder`, up to as many from its opened hull, where there is one, and
+    those on parts too thin for it.
 
     None where stereo found too few.
     The hull's points take the mean colour of the stereo points: nothing is known of theirs.
@@ -112,6 +114,9 @@ def start_points(posed: PosedPhotos, folder: Path, count: int, seed: int) -> Sta
     if len(more):
         solid = ~in_air(more, depth_maps(posed, folder), AIR * gap)
         more, more_normals = more[solid], more_normals[solid]
+    if (folder / "thin.npz").exists():
+        slight, slight_normals = load_thin(folder / "thin.npz")
+        more, more_normals = np.concatenate([more, slight]), np.concatenate([more_normals, slight_normals])
     filled = np.broadcast_to(colours.mean(0), (len(more), 3))
     return StartPoints(
         np.concatenate([points, more]), np.concatenate([normals, more_normals]), np.concatenate([colours, filled]), len(points)
