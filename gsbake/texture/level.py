@@ -12,13 +12,12 @@ differentiation of pseudo-inverses and nonlinear least squares problems whose va
 
     L' = s · mean(L) · (L / mean(L))^γ / mean of the same
 
-of other brightness s and contrast γ, and every texel rougher or smoother by one shift of logit(roughness), as long as the photos are
-explained better, and at the end single colours of the light a little brighter or darker. Roughness takes part because a wrong one bends
-the light: reflections that paint taken for too smooth would show, and photos do not, ask for a dim and even light, and the way out leads
-over a hill. A blurred light and paint too smooth show what a sharp light and rougher paint do, hence steps of both. Base colours are
-found robustly by reweighting: a misplaced reflection must not decide. Errors are those of sRGB values, averaged over blocks of a
-twelfth of the object before they count: a sharp reflection a few pixels off, right in strength, would otherwise ask for a darker light,
-as noise in what explains always weakens what is found (attenuation; Fuller, *Measurement Error Models*, 1987).
+of other brightness s and contrast γ, and every texel rougher by one shift of logit(roughness), as long as the photos are explained
+better, and at the end single colours of the light a little brighter or darker. Roughness takes part because a wrong one bends the light:
+reflections that paint taken for too smooth would show, and photos do not, ask for a dim and even light, and the way out leads over a hill.
+Base colours are found robustly by reweighting: a misplaced reflection must not decide. Errors are those of sRGB values, averaged over
+blocks of a twelfth of the object before they count: a sharp reflection a few pixels off, right in strength, would otherwise ask for a
+darker light, as noise in what explains always weakens what is found (attenuation; Fuller, *Measurement Error Models*, 1987).
 """
 
 from __future__ import annotations
@@ -37,15 +36,15 @@ Floats = NDArray[np.float64]
 
 #: Factors on brightness, exponents of contrast and shifts of logit(roughness) that are tried, until none helps.
 BRIGHTER, STRONGER, ROUGHER = 1.2, 1.15, 0.4
-#: Steps of brightness, contrast and roughness, in the order they are tried.
-WAYS = ((-1, 0, 0), (1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1), (1, 0, 1), (-1, 0, -1), (0, 1, 1), (0, -1, -1))
+#: Steps of brightness, contrast and roughness, in the order they are tried. Never smoother: a blurred light asks for that by itself.
+WAYS = ((-1, 0, 0), (1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (1, 0, 1), (0, 1, 1))
 #: Where else a search begins: a bright light on rough paint, as a valley of its own leads there.
 ELSEWHERE = (2, 0, 4)
 #: Factor on one colour of the light that is tried at the end.
 TINT = 1.1
 #: Furthest that the search goes: brightness, contrast and the shift of logit(roughness).
 FURTHEST = (3.0, 2.0, 3.0)
-#: A try must lower the error by this share; one of other roughness by the second; where else it led by the third.
+#: A try must lower the error by this share; one of rougher paint by the second; where else it led by the third.
 CLEARLY, SURELY, FAR = 0.002, 0.01, 0.03
 #: Rounds of reweighting, and the error of an sRGB value from which pixels count less.
 ROUNDS, NEAR = 2, 0.02

@@ -92,9 +92,8 @@ def glossy() -> Scene:
     return Scene(0.25)
 
 
-@pytest.mark.parametrize("start", [0.2, 0.45])
-def test_paint_and_roughness_come_back(glossy: Scene, start: float) -> None:
-    fitted = glossy.fit(start).run(glossy.photos[2:], glossy.photos[:2], 300, 0)
+def test_paint_and_roughness_come_back(glossy: Scene) -> None:
+    fitted = glossy.fit(0.2).run(glossy.photos[2:], glossy.photos[:2], 300, 0)
     known = fitted.weight > 0.3
     assert known.mean() > 0.4
     paint, truth = fitted.values[known, :3], glossy.paint[known]
