@@ -41,9 +41,7 @@ def neighbours(texels: Texels, at: NDArray[Any], normal: NDArray[Any]) -> Pairs:
 
 def _beside(texels: Texels) -> Pairs:
     """Pairs (m, 2) that share an edge in the texture."""
-    size = texels.size
-    slot = np.full((size, size), -1, np.int64)
-    slot.ravel()[texels.index] = np.arange(len(texels))
+    slot = texels.slot.reshape(texels.size, texels.size)
     pairs = []
     for a, b in ((slot[:, :-1], slot[:, 1:]), (slot[:-1], slot[1:])):
         both = (a >= 0) & (b >= 0)
