@@ -41,14 +41,15 @@ SCORER, PYTHON = ROOT.parent / "shared" / "score", ROOT / ".score" / "bin" / "py
 #: What the stages up to the mesh are called.
 TO_MESH = ("ingest", "poses", "stereo", "train", "refine", "mesh")
 #: Rows and what each sets beside the profile.
-NO_PRIORS = tuple(f"bake.{prior}_prior=0" for prior in ("smooth", "dark", "metal", "white"))
+NO_PRIORS = tuple(f"bake.{prior}_prior=0" for prior in ("smooth", "dark", "metal", "white", "parsimony"))
 STEPS: dict[str, tuple[str, ...]] = {
     "projected": ("splat.shading=pbr", "bake.materials=surfels"),
     "fit": ("bake.materials=fit", "bake.visibility=none", *NO_PRIORS),
     "visibility": ("bake.materials=fit", "bake.visibility=directional", *NO_PRIORS),
     "bounce": ("bake.materials=fit", "bake.visibility=bounce", *NO_PRIORS),
     "reflections": ("bake.materials=fit", "bake.visibility=reflections", *NO_PRIORS),
-    "priors": ("bake.materials=fit", "bake.visibility=reflections"),
+    "priors": ("bake.materials=fit", "bake.visibility=reflections", "bake.parsimony_prior=0"),
+    "parsimony": ("bake.materials=fit", "bake.visibility=reflections"),
 }
 
 

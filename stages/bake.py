@@ -281,7 +281,7 @@ def _fit_materials(
         ctx.check_stop()
         ctx.progress(done, total, "materials and light")
 
-    priors = Priors(settings.smooth_prior, settings.dark_prior, settings.metal_prior, settings.white_prior)
+    priors = Priors(settings.smooth_prior, settings.dark_prior, settings.metal_prior, settings.white_prior, settings.parsimony_prior)
     normal, occlusion, base = (coarse.down(x) for x in (detail.normal, open_share[:, None], shown.values))
     at = coarse.texels.interpolate(surface.position, surface.atlas.faces)
     pairs = neighbours(coarse.texels, at, normal)
@@ -384,7 +384,7 @@ def _save_mesh(ctx: Context, surface: Surface) -> None:
 
 STAGE = Stage(
     name="bake",
-    version=12,
+    version=13,
     title="Textures",
     run=run,
     needs=("poses", "refine", "mesh"),

@@ -146,6 +146,7 @@ class Bake(Section):
     dark_prior: float = Field(0.005, ge=0, description="What a reflection explains is not paint; also settles how bright the light is.")
     metal_prior: float = Field(0.003, ge=0, description="Most things are not metal.")
     white_prior: float = Field(0.0005, ge=0, description="Most light is white.")
+    parsimony_prior: float = Field(0.03, ge=0, description="An object is made of few materials; counts as much as photos are left unexplained.")
     roughness: Fraction = Field(0.8, description="Roughness of the whole asset where it is not measured (bake.materials = none, delit).")
 
 

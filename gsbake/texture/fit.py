@@ -4,11 +4,13 @@ With the mesh, its atlas and the cameras fixed, each step shades the pixels of o
 and takes an Adam step on texels and light:
 
     Σ w ρ(sRGB(shade) − photo) + tv · |∇ texture| + dark · mean base colour + metal · mean metallic + white · colourfulness of the light
+    + parsimony · unexplained · |texture − what is common|²
 
 The first term is robust (pseudo-Huber: squares of small errors, large ones by themselves), so a misplaced reflection moves little; with
 plain |error| reflections a little off are passed over and the light ends too dim. The others settle what photos under one light leave open:
 neighbouring texels are alike; what a reflection explains is not paint (a small price on base colour, which also fixes the light's
-brightness); most things are not metal; most light is white.
+brightness); most things are not metal; most light is white; an object is made of few materials (`parsimony`), which is believed as much as
+the photos are left unexplained.
 
 How rough the object is at the start decides which light is found (`starts`); from there every texel finds its own.
 
@@ -49,6 +51,7 @@ from gsbake.texture.batch import AROUND, BOUNCED, GLOW, SENT, Batch
 from gsbake.texture.emission import find_glow
 from gsbake.texture.level import Level, find_level, graded
 from gsbake.texture.metal import Evidence, find_metals
+from gsbake.texture.parsimony import NEAR, common
 from gsbake.texture.pixels import Pixels
 from gsbake.texture.texels import Texels
 from gsbake.texture.visibility import Visibility
@@ -79,6 +82,10 @@ GLOW_AT = 0.5
 ALIKE = (1.0, 1.0, 1.0, 6.0, 4.0)
 #: Shadows and bounced light are renewed every so many steps.
 RENEWED = 25
+#: Share of the steps from which texels are drawn to common materials (the light's level must be known), looked up anew every so many steps.
+COMMON_AT, COMMON_ANEW = 0.5, 50
+#: How much of what was unexplained counts on when shadows are renewed.
+KEPT = 0.7
 #: Errors of sRGB values count by their square up to about the first, beyond by themselves; times the second.
 ROBUST, STEEP = 0.1, 1.5
 #: Share of the neighbouring pairs of texels that one step compares.
@@ -93,6 +100,7 @@ class Priors:
     dark: float = 0.005
     metal: float = 0.003
     white: float = 0.0005
+    parsimony: float = 0.03
 
 
 @dataclass(frozen=True)
@@ -148,6 +156,8 @@ class MaterialFit:
         self._visibility, self._bounce = visibility, bounce
         self._light = EnvironmentLight(light_size)
         self._priors = priors
+        self._common: torch.Tensor | None = None
+        self._unexplained = torch.zeros(2)  # sums of squared errors with the pixels' weights, and of these
         self._alike = torch.tensor(ALIKE)
         self._pairs = torch.as_tensor(pairs)
         self._adam = torch.optim.Adam([self._logits.requires_grad_()], lr=RATE, betas=BETAS, eps=STILL)
@@ -164,27 +174,35 @@ class MaterialFit:
         metals: bool = True,
         glow: bool = True,
         level: bool = True,
+        parsimony: bool = True,
         matte: bool = False,
     ) -> Fitted:
         """Fit to `photos` in `steps` steps of one photo each, in an order drawn from `seed`; `held` only tell how good it got.
 
         Without `metals` none are looked for, nor on things that are `matte`. Without `glow` nothing glows, without `level` the light's
-        brightness is left to the steps.
+        brightness is left to the steps, without `parsimony` materials may be as many as there are texels.
         """
         generator = torch.Generator().manual_seed(seed)
         batches = [Batch.of(p, self._normal) for p in photos if len(p)]
         order: list[int] = []
         metal, glowing = np.zeros(len(self._logits), bool), 0
         levels: list[Level] = []
+        self._common, self._unexplained = None, torch.zeros(2)
         for step in range(steps if batches else 0):
+            anew = step % COMMON_ANEW == 0
             if glow and step == int(GLOW_AT * steps):
                 glowing = self._set_glow(batches)
             if level and step in {int(share * steps) for share in LEVEL_AT}:
                 levels.append(self._set_level(batches, generator, not matte or len(levels) < TINTED_MATT, not levels))
+                anew = True
             if metals and not matte and step in {int(share * steps) for share in METALS_AT}:
                 metal = self._set_metals(batches)
+                anew = True
             if step % RENEWED == 0:
                 self._renew()
+                self._unexplained *= KEPT
+            if parsimony and self._priors.parsimony and anew and step >= COMMON_AT * steps:
+                self._common = self._find_common()
             order = order or torch.randperm(len(batches), generator=generator).tolist()
             self._step(batches[order.pop()], 0.1 ** (step / steps), generator)
             if each is not None:
@@ -204,6 +222,8 @@ class MaterialFit:
         shaded = batch.shade(values, self._bend, self._light.prefilter(), self._around)
         # Clamped, a reflection brighter than white has no gradient: where the photo shows none, it is misplaced rather than too bright.
         error = linear_to_srgb(shaded.clamp(0, 1)) - batch.colour
+        with torch.no_grad():
+            self._unexplained += torch.stack([(error.square().mean(1) * batch.weight).sum(), batch.weight.sum()])
         error = STEEP * ((error.square() + ROBUST**2).sqrt() - ROBUST).mean(1)
         priors = self._priors
         loss = (error * batch.weight).mean()
@@ -216,6 +236,10 @@ class MaterialFit:
             pair = self._pairs[start : start + count]
             loss = loss + priors.smooth * ((values[pair[:, 0]] - values[pair[:, 1]]).abs() @ self._alike).mean()
             loss = loss + self._even * ((self._bend[pair[:, 0]] - self._bend[pair[:, 1]]) ** 2).sum(1).mean()
+        if self._common is not None:
+            doubt = self._unexplained[0] / self._unexplained[1].clamp_min(1e-6) / ROBUST**2
+            away = (torch.cat([linear_to_srgb(values[:, :3]), values[:, 3:4]], 1) - self._common) / torch.tensor(NEAR)
+            loss = loss + priors.parsimony * doubt * 0.5 * away.square().sum(1).mean()
         loss = loss + FLAT * (self._bend**2).sum(1).mean()
         for adam, rate in ((self._adam, RATE), (self._adam_bend, RATE_BEND), (self._adam_light, RATE_LIGHT)):
             adam.zero_grad()
@@ -240,6 +264,11 @@ class MaterialFit:
             bounced = torch.as_tensor(self._visibility.bounced(irradiance.numpy(), reflectance.numpy()))
             self._around[:, BOUNCED] = bounced
             self._around[:, SENT] = reflectance * (irradiance + bounced) + self._around[:, GLOW]
+
+    @torch.no_grad()
+    def _find_common(self) -> torch.Tensor:
+        """The material (n, 4) that each texel is drawn to: its own where it glows, whose paint hardly shows."""
+        return torch.as_tensor(common(torch.sigmoid(self._logits).numpy(), self._around[:, GLOW].sum(1).numpy() == 0))
 
     @torch.no_grad()
     def _set_level(self, batches: list[Batch], generator: torch.Generator, tint: bool, rough: bool) -> Level:

@@ -91,7 +91,7 @@ def trial_roughness(
     judges, rest = few[::TRIAL_PHOTO], [p for i, p in enumerate(few) if i % TRIAL_PHOTO]
     found: dict[float, float] = {}
     for turn, roughness in enumerate(TRIALS):
-        score = make(roughness).run(rest, judges, TRIAL_STEPS, seed, metals=False, glow=False, level=False).held_out
+        score = make(roughness).run(rest, judges, TRIAL_STEPS, seed, metals=False, glow=False, level=False, parsimony=False).held_out
         if score is not None:
             found[roughness] = score
         if each is not None:

@@ -58,9 +58,9 @@ def room(directions: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 class Scene:
-    """A ball of two paints, `roughness` all over, seen by `count` cameras."""
+    """A ball of two paints, or of all between them in an `even` spread, `roughness` all over, seen by `count` cameras."""
 
-    def __init__(self, roughness: float, count: int = 12) -> None:
+    def __init__(self, roughness: float, count: int = 12, even: bool = False) -> None:
         mesh, uv = ball()
         caster = RayCaster(mesh.vertices, mesh.faces, 1)
         self.texels: Texels = rasterise(uv, mesh.faces, SIZE)
@@ -68,7 +68,8 @@ class Scene:
         self.normal /= np.linalg.norm(self.normal, axis=1, keepdims=True)
         # Stripes: a paint that followed the normal could be light as well.
         stripe = np.sin(5 * np.arctan2(self.normal[:, 1], self.normal[:, 0]) + 4 * self.normal[:, 2])[:, None]
-        self.paint = np.where(stripe > 0, [0.6, 0.2, 0.1], [0.05, 0.3, 0.4]).astype(np.float32)
+        share = np.arcsin(stripe) / np.pi + 0.5 if even else stripe > 0
+        self.paint = (share * [0.6, 0.2, 0.1] + (1 - share) * [0.05, 0.3, 0.4]).astype(np.float32)
         tables = EnvironmentLight.from_function(room, 16).prefilter()
         reader = PixelReader(caster, uv, self.texels, 2.0)
         self.photos: list[Pixels] = []

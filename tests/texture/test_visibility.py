@@ -207,13 +207,14 @@ class Tray:
                       torch.zeros(n), tables)  # type: ignore[arg-type]  # fmt: skip
         return replace(blank, colour=encode(colour + gloss.detach().numpy()))
 
-    def error(self, visibility: Visibility | None, bounce: bool) -> float:
+    def error(self, visibility: Visibility | None, bounce: bool, parsimony: float = 0.0) -> float:
         """Mean error of the fitted paint (sRGB) inside the box, brightness aside."""
+        priors = replace(Priors(), parsimony=parsimony)
         texels = self.box.texels
         ambient = np.ones(len(texels)) if visibility is None else visibility.openness(WHITE)
         start = np.full((len(texels), 3), 0.4)
         pairs = neighbours(texels, self.box.at, self.box.normal)
-        fit = MaterialFit(texels, self.box.at, pairs, self.box.normal, ambient, start, 16, Priors(), 0.5, visibility, bounce)
+        fit = MaterialFit(texels, self.box.at, pairs, self.box.normal, ambient, start, 16, priors, 0.5, visibility, bounce)
         fitted = fit.run(self.photos, [], 120, 0)
         known = fitted.weight > 0.3
         gain = (fitted.values[known, :3] * self.paint[known]).sum(0) / (fitted.values[known, :3] ** 2).sum(0)
@@ -226,3 +227,4 @@ def test_shadow_and_bounced_light_do_not_end_as_paint() -> None:
     bare, shadows, bounced = tray.error(None, False), tray.error(tray.box.visibility, False), tray.error(tray.box.visibility, True)
     assert shadows < 0.9 * bare
     assert bounced < 0.9 * shadows
+    assert tray.error(tray.box.visibility, True, Priors().parsimony) < 0.9 * bounced
