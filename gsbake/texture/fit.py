@@ -158,7 +158,7 @@ class MaterialFit:
         self._priors = priors
         self._common: torch.Tensor | None = None
         self._unexplained = torch.zeros(2)  # sums of squared errors with the pixels' weights, and of these
-        self._alike = torch.tensor(ALIKE)
+        self._alike, self._near = torch.tensor(ALIKE), torch.tensor(NEAR)
         self._pairs = torch.as_tensor(pairs)
         self._adam = torch.optim.Adam([self._logits.requires_grad_()], lr=RATE, betas=BETAS, eps=STILL)
         self._adam_bend = torch.optim.Adam([self._bend], lr=RATE_BEND, betas=BETAS, eps=STILL)
@@ -222,9 +222,9 @@ class MaterialFit:
         shaded = batch.shade(values, self._bend, self._light.prefilter(), self._around)
         # Clamped, a reflection brighter than white has no gradient: where the photo shows none, it is misplaced rather than too bright.
         error = linear_to_srgb(shaded.clamp(0, 1)) - batch.colour
-        with torch.no_grad():
-            self._unexplained += torch.stack([(error.square().mean(1) * batch.weight).sum(), batch.weight.sum()])
-        error = STEEP * ((error.square() + ROBUST**2).sqrt() - ROBUST).mean(1)
+        squares = error.square()
+        self._unexplained += torch.stack([(squares.detach().mean(1) * batch.weight).sum(), batch.weight.sum()])
+        error = STEEP * ((squares + ROBUST**2).sqrt() - ROBUST).mean(1)
         priors = self._priors
         loss = (error * batch.weight).mean()
         loss = loss + priors.dark * values[:, :3].mean() + priors.metal * values[:, 4].mean()
@@ -238,7 +238,7 @@ class MaterialFit:
             loss = loss + self._even * ((self._bend[pair[:, 0]] - self._bend[pair[:, 1]]) ** 2).sum(1).mean()
         if self._common is not None:
             doubt = self._unexplained[0] / self._unexplained[1].clamp_min(1e-6) / ROBUST**2
-            away = (torch.cat([linear_to_srgb(values[:, :3]), values[:, 3:4]], 1) - self._common) / torch.tensor(NEAR)
+            away = (torch.cat([linear_to_srgb(values[:, :3]), values[:, 3:4]], 1) - self._common) / self._near
             loss = loss + priors.parsimony * doubt * 0.5 * away.square().sum(1).mean()
         loss = loss + FLAT * (self._bend**2).sum(1).mean()
         for adam, rate in ((self._adam, RATE), (self._adam_bend, RATE_BEND), (self._adam_light, RATE_LIGHT)):
@@ -268,13 +268,17 @@ class MaterialFit:
     @torch.no_grad()
     def _find_common(self) -> torch.Tensor:
         """The material (n, 4) that each texel is drawn to: its own where it glows, whose paint hardly shows."""
-        return torch.as_tensor(common(torch.sigmoid(self._logits).numpy(), self._around[:, GLOW].sum(1).numpy() == 0))
+        return torch.as_tensor(common(torch.sigmoid(self._logits).numpy(), self._dark().numpy()))
+
+    def _dark(self) -> torch.Tensor:
+        """Which texels (n,) have no light of their own."""
+        return self._around[:, GLOW].sum(1) == 0
 
     @torch.no_grad()
     def _set_level(self, batches: list[Batch], generator: torch.Generator, tint: bool, rough: bool) -> Level:
         """Let the light go on as bright and as even as explains most, and paint as rough and as what reflects the same; what was found."""
         values = torch.sigmoid(self._logits)
-        paint = (values[:, 4] < PAINT) & (self._around[:, GLOW].sum(1) == 0)
+        paint = (values[:, 4] < PAINT) & self._dark()
         share = min(1.0, LEVEL_PIXELS / max(1, sum(len(b.weight) for b in batches)))
         asked = paint & (torch.rand(len(paint), generator=generator) < share)
         few = [part for b in batches if len((part := b.showing(asked)).weight)]
