@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
+import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy.optimize import lsq_linear
 
 from gsbake.texture.metal import Evidence, Line, told
-from gsbake.texture.sharpen import HUE, Seen, _nearer, _of_calm_hue, _parts, _solved, metal_places, sharpened
+from gsbake.texture.sharpen import HUE, Seen, _likely, _metal, _of_calm_hue, _parts, _repeated, _solved, metal_places, sharpened
 from gsbake.texture.texels import Texels
 
 SIZE = 32
@@ -32,7 +35,8 @@ def photos(base: NDArray[np.float32], count: int = 30, noise: float = 0.0) -> li
         offset = np.full_like(slope, 0.02)
         colour = slope * base[texel].mean(1) + offset + rng.normal(scale=noise, size=slope.shape)
         seen = Evidence(texel[:, 4], colour.astype(np.float32), np.ones(len(corner), np.float32), np.zeros(len(corner), np.int32), never)
-        out.append(Seen(texel, np.ones(texel.shape, bool), seen, Line(slope, offset)))
+        column, row = (at.ravel() for at in np.meshgrid(np.arange(len(x)), np.arange(len(y))))
+        out.append(Seen(column, row, texel, np.ones(texel.shape, bool), seen, Line(slope, offset)))
     return out
 
 
@@ -45,7 +49,7 @@ def test_a_grille_finer_than_the_pixels_comes_back() -> None:
     column, row = texels.index % SIZE, texels.index // SIZE
     hole = (column % 6 < 3) & (row % 6 < 3)
     truth = np.where(hole[:, None], 0.0, GOLD).astype(np.float32)
-    values = np.tile(np.array([0.4, 0.4, 0.4, 0.2, 0.8], np.float32), (len(texels), 1))
+    values = np.tile(np.append(truth.mean(0), [0.2, 0.8]).astype(np.float32), (len(texels), 1))
     place = np.ones(len(texels), bool)
     out = sharpened(values, texels, place, photos(truth, 60, 0.002))
     inner = (np.minimum(column, row) > 3) & (np.maximum(column, row) < SIZE - 5)
@@ -124,14 +128,54 @@ def test_noise_is_drawn_to_metal_or_hole() -> None:
 
 
 @pytest.mark.parametrize("bright", [0.9, 0.15])
-def test_what_is_nearer_is_the_metal_around_or_black(bright: float) -> None:
+def test_what_is_likely_is_the_metal_around_or_black(bright: float) -> None:
     texels = everywhere()
     column, row = texels.index % SIZE, texels.index // SIZE
     hole = (column % 6 < 3) & (row % 6 < 3)
     shown = np.where(hole[:, None], 0.15 * bright * GOLD, bright * GOLD).astype(np.float32)
-    out = _nearer(shown, texels, np.ones(len(texels), bool))
+    out = _likely(shown, texels, np.ones(len(texels), bool))
     assert (out[hole] == 0).all()
     np.testing.assert_allclose(out[~hole], np.tile(bright * GOLD, (int((~hole).sum()), 1)), rtol=0.02)
+
+
+def test_bars_that_are_blurred_stay_as_many() -> None:
+    texels = everywhere()
+    x, y = texels.index % SIZE / 5.3, texels.index // SIZE / 6.1
+    bar = np.hypot(x - np.round(x), y - np.round(y)) > 0.35
+    sharp = np.where(bar[:, None], GOLD, 0).astype(np.float32)
+    shown = cv2.GaussianBlur(texels.image(sharp), (0, 0), 1.5).reshape(-1, 3)
+    everything = np.ones(len(texels), bool)
+    inner = (np.minimum(texels.index % SIZE, texels.index // SIZE) > 6) & (np.maximum(texels.index % SIZE, texels.index // SIZE) < SIZE - 7)
+    out, metal = _likely(shown, texels, everything), _metal(shown, texels, everything)
+    halves = np.where(2 * shown.mean(1, keepdims=True) > metal.mean(1, keepdims=True), metal, 0)
+    assert out[inner].mean() == pytest.approx(shown[inner].mean(), rel=0.06)
+    assert halves[inner].mean() > 1.12 * shown[inner].mean()
+
+
+def test_photos_that_are_brighter_or_dimmer_than_shaded_tell_the_same_grille() -> None:
+    texels = everywhere()
+    column, row = texels.index % SIZE, texels.index // SIZE
+    hole = (column % 6 < 3) & (row % 6 < 3)
+    truth = np.where(hole[:, None], 0.0, GOLD).astype(np.float32)
+    values = np.tile(np.append(truth.mean(0), [0.2, 0.8]).astype(np.float32), (len(texels), 1))
+    rng = np.random.default_rng(6)
+    seen = []
+    for photo in photos(truth, 60, 0.002):
+        off = np.float32(2 ** rng.uniform(-1, 1))
+        seen.append(replace(photo, line=Line(off * photo.line.slope, off * photo.line.offset)))
+    out = sharpened(values, texels, np.ones(len(texels), bool), seen)
+    inner = (np.minimum(column, row) > 3) & (np.maximum(column, row) < SIZE - 5)
+    assert (out[inner & hole, 4] == 0).mean() > 0.98 and (out[inner & ~hole, 4] == 1).mean() > 0.95
+    assert np.abs(out[inner, :3] - truth[inner]).mean() < 0.3 * np.abs(values[inner, :3] - truth[inner]).mean()
+
+
+def test_a_pattern_is_what_both_halves_show() -> None:
+    texels = everywhere()
+    rng = np.random.default_rng(7)
+    same, one, other = rng.uniform(0.2, 0.8, (3, len(texels))).astype(np.float32)
+    everything = np.ones(len(texels), bool)
+    assert _repeated(texels, everything, 0.6 * same + 0.4 * one, 0.6 * same + 0.4 * other).all()
+    assert not _repeated(texels, everything, one, other).any()
 
 
 @pytest.mark.parametrize(("share", "place"), [(0.6, True), (0.1, False)])
