@@ -384,7 +384,7 @@ def _save_mesh(ctx: Context, surface: Surface) -> None:
 
 STAGE = Stage(
     name="bake",
-    version=14,
+    version=15,
     title="Textures",
     run=run,
     needs=("poses", "refine", "mesh"),

@@ -92,7 +92,8 @@ def sharpened(values: Floats, texels: Texels, place: NDArray[np.bool_], photos: 
     """`values` (n, 5) of `texels` (linear base colour, roughness, metallic) with the base colour of metals that have holes solved in
     `place` (n,).
 
-    What turns out darker than any metal, or much darker than the metal around, is a hole, and paint; the rest of the grille is metal alone.
+    What turns out darker than any metal, or much darker than the metal around, is a hole: paint, and rough, as nothing is there that would
+    mirror the room. The rest of the grille is metal alone.
     """
     parts, start = _parts(photos, place), values[place, :3]
     whole, one, other = (_of_calm_hue(_solved(some, start), texels, place).mean(1) for some in (parts, parts[::2], parts[1::2]))
@@ -109,6 +110,8 @@ def sharpened(values: Floats, texels: Texels, place: NDArray[np.bool_], photos: 
     hole = base.mean(1) < np.maximum(HOLE * metal, DARKEST_METAL)
     out = values.copy()
     out[grille, :3] = np.where(hole[:, None], np.maximum(base - GLOSS, 0), np.minimum(base, 1))
+    if np.ptp(values[:, 3]) > 0:  # else one number does all over
+        out[grille, 3] = np.where(hole, 1, out[grille, 3])
     out[grille, 4] = ~hole
     return out
 

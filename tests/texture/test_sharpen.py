@@ -50,13 +50,16 @@ def test_a_grille_finer_than_the_pixels_comes_back() -> None:
     hole = (column % 6 < 3) & (row % 6 < 3)
     truth = np.where(hole[:, None], 0.0, GOLD).astype(np.float32)
     values = np.tile(np.append(truth.mean(0), [0.2, 0.8]).astype(np.float32), (len(texels), 1))
+    values[::2, 3] = 0.3
     place = np.ones(len(texels), bool)
     out = sharpened(values, texels, place, photos(truth, 60, 0.002))
     inner = (np.minimum(column, row) > 3) & (np.maximum(column, row) < SIZE - 5)
     before, after = (np.abs(x[inner, :3] - truth[inner]).mean() for x in (values, out))
     assert after < 0.15 * before
     assert (out[inner & hole, 4] == 0).all() and (out[inner & ~hole, 4] == 1).all()
-    np.testing.assert_array_equal(out[:, 3], values[:, 3])
+    np.testing.assert_array_equal(out[:, 3], np.where(out[:, 4] == 1, values[:, 3], 1))
+    values[:, 3] = 0.2
+    assert (sharpened(values, texels, place, photos(truth, 60, 0.002))[:, 3] == values[:, 3]).all()
 
 
 def test_the_steps_approach_bounded_least_squares() -> None:
