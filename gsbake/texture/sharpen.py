@@ -124,10 +124,7 @@ def _around(texels: Texels, values: NDArray[Any], width: float) -> Floats:
 
 def _patterned(texels: Texels, place: NDArray[np.bool_], hole: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Which of the t texels in `place` (n,) have bright metal and holes (t,) around them, both."""
-    both = np.zeros((len(place), 2), np.float32)
-    both[place, 0], both[place, 1] = hole, 1
-    around = _around(texels, both, AROUND)[place]
-    share = around[:, 0] / np.maximum(around[:, 1], 1e-6)
+    share = _mean(hole[:, None], texels, place, AROUND)[:, 0]
     return np.asarray((share > HOLES[0]) & (share < HOLES[1]))
 
 
