@@ -49,7 +49,7 @@ check: setup ## Lint and types
 test: check ## Lint, types and the quick tests
 	$(BIN)/pytest -m "not slow and not stress"
 
-stress: setup ## The slow tests: hostile input at length, kills at random moments, whole bakes of development captures where present
+stress: setup ## The slow tests: hostile input at length, kills at random moments, poses of a development capture where present
 	$(BIN)/pytest -m "slow or stress"
 
 bench: setup ## Measure kernels, error against time (beside other tools) and growth, about two idle hours: PARTS="table timeline growth" ARGS=…

@@ -15,7 +15,7 @@ import pytest
 from gsbake.capture.sources import discover
 from gsbake.profile.schema import Profile
 
-CAPTURES = Path(os.environ.get("GSBAKE_CAPTURES", Path(__file__).resolve().parents[2] / "shared" / "captures"))
+CAPTURES = Path(os.environ.get("GSBAKE_CAPTURES", Path(__file__).resolve().parents[3] / "shared" / "captures"))
 
 
 class FakeContext:
