@@ -37,7 +37,6 @@ from numpy.typing import NDArray
 
 from gsbake.capture.cameras import Camera
 from gsbake.texture.coarse import Coarse
-from gsbake.texture.colour import encode
 from gsbake.texture.fit import MaterialFit
 from gsbake.texture.metal import DARKEST_METAL, ROBUST, Evidence, Line, told
 from gsbake.texture.pixels import PixelReader, Pixels
@@ -188,33 +187,33 @@ class _Part:
     weight: Floats
     line: Line
 
-    def gain(self, base: Floats, before: Floats) -> Floats:
-        """How much brighter (m, 1) than shaded with `base` (t, 3) the photo is around each pixel; it was taken to be `before`."""
-        shaded = self._shaded(base)
-        weight = self._trusted(before * shaded)
+    def gain(self, shown: Floats, before: Floats) -> Floats:
+        """How much brighter (m, 1) than shaded the photo is around each pixel that shows the base colour `shown` (m, 3); it was taken to be
+        `before`."""
+        weight = self._trusted(shown, self._gained(before))
+        shaded = self.line.slope * shown + self.line.offset
         sums = np.stack([(weight * shaded * self.colour).sum(1), (weight * shaded**2).sum(1)], 1)
         column, row = self.column - self.column.min(), self.row - self.row.min()
         image = np.zeros((row.max() + 1, column.max() + 1, 2), np.float32)
         image[row, column] = sums
-        shown, expected = cv2.GaussianBlur(image, (0, 0), LOCAL)[row, column].T
+        around, expected = cv2.GaussianBlur(image, (0, 0), LOCAL)[row, column].T
         even = EVEN * expected.mean()
-        return np.asarray(np.clip((shown + even) / np.maximum(expected + even, 1e-12), 1 / GAIN, GAIN)[:, None], np.float32)
+        return np.asarray(np.clip((around + even) / np.maximum(expected + even, 1e-12), 1 / GAIN, GAIN)[:, None], np.float32)
 
-    def asks(self, base: Floats, gain: Floats) -> tuple[Floats, Floats]:
-        """How far each texel (t, 3) is asked to go from `base` (t, 3) where the photo has this `gain` (m, 1), and with what weight."""
-        shaded = gain * self._shaded(base)
-        use = self._trusted(shaded)
-        slope = gain * self.line.slope
-        return self.mean.T @ (use * slope * (self.colour - shaded)), self.mean.T @ (use * slope**2)
+    def asks(self, shown: Floats, gain: Floats) -> tuple[Floats, Floats]:
+        """How far each texel (t, 3) is asked to go where the pixels show `shown` (m, 3) with this `gain` (m, 1), and with what weight."""
+        line = self._gained(gain)
+        use = self._trusted(shown, line)
+        rest = self.colour - line.offset - line.slope * shown
+        return self.mean.T @ (use * line.slope * rest), self.mean.T @ (use * line.slope**2)
 
-    def _shaded(self, base: Floats) -> Floats:
-        """What the pixels show (m, 3) with `base` (t, 3)."""
-        return np.asarray(self.line.slope * (self.mean @ base) + self.line.offset, np.float32)
+    def _gained(self, gain: Floats) -> Line:
+        """The line of a photo that is brighter by `gain` (m, 1)."""
+        return Line(gain * self.line.slope, gain * self.line.offset)
 
-    def _trusted(self, shaded: Floats) -> Floats:
-        """The weights (m, 3), those of pixels far from what is `shaded` (m, 3) less."""
-        error = encode(np.clip(shaded, 0, 1)) - encode(self.colour)
-        return np.asarray(self.weight / np.maximum(np.abs(error) / ROBUST, 1), np.float32)
+    def _trusted(self, shown: Floats, line: Line) -> Floats:
+        """The weights (m, 3), those of pixels far from what `line` says of `shown` (m, 3) less."""
+        return np.asarray(self.weight / np.maximum(np.abs(line.error(self.colour, shown)) / ROBUST, 1), np.float32)
 
 
 def _parts(photos: Sequence[Seen], place: NDArray[np.bool_]) -> list[_Part]:
@@ -244,10 +243,11 @@ def _solved(parts: Sequence[_Part], start: Floats, likely: Callable[[Floats], Fl
     gains = [np.ones((len(part.row), 1), np.float32) for part in parts]
     for step in range(STEPS):
         pull, asked = np.zeros_like(start), np.zeros_like(start)
-        if likely is not None:
-            gains = [part.gain(base, gain) for part, gain in zip(parts, gains, strict=True)]
-        for part, gain in zip(parts, gains, strict=True):
-            towards, weight = part.asks(base, gain)
+        for k, part in enumerate(parts):
+            shown = np.asarray(part.mean @ base)
+            if likely is not None:
+                gains[k] = part.gain(shown, gains[k])
+            towards, weight = part.asks(shown, gains[k])
             pull += towards
             asked += weight
         usual = np.median(asked[asked > 0]) if (asked > 0).any() else 1.0
