@@ -16,6 +16,11 @@ from gsbake.texture.texels import Texels
 
 SIZE = 32
 GOLD = np.array([0.9, 0.7, 0.4], np.float32)
+ROW, COLUMN = np.divmod(np.arange(SIZE * SIZE), SIZE)
+#: A grille: which texels are holes, its base colour, and which texels lie well inside the photos.
+HOLE = (COLUMN % 6 < 3) & (ROW % 6 < 3)
+GRILLE = np.where(HOLE[:, None], 0.0, GOLD).astype(np.float32)
+INNER = (np.minimum(COLUMN, ROW) > 3) & (np.maximum(COLUMN, ROW) < SIZE - 5)
 
 
 def everywhere() -> Texels:
@@ -46,20 +51,16 @@ def never(base: float, roughness: NDArray[np.float32], metallic: float) -> NDArr
 
 def test_a_grille_finer_than_the_pixels_comes_back() -> None:
     texels = everywhere()
-    column, row = texels.index % SIZE, texels.index // SIZE
-    hole = (column % 6 < 3) & (row % 6 < 3)
-    truth = np.where(hole[:, None], 0.0, GOLD).astype(np.float32)
-    values = np.tile(np.append(truth.mean(0), [0.2, 0.8]).astype(np.float32), (len(texels), 1))
+    values = np.tile(np.append(GRILLE.mean(0), [0.2, 0.8]).astype(np.float32), (len(texels), 1))
     values[::2, 3] = 0.3
     place = np.ones(len(texels), bool)
-    out = sharpened(values, texels, place, photos(truth, 60, 0.002))
-    inner = (np.minimum(column, row) > 3) & (np.maximum(column, row) < SIZE - 5)
-    before, after = (np.abs(x[inner, :3] - truth[inner]).mean() for x in (values, out))
+    out = sharpened(values, texels, place, photos(GRILLE, 60, 0.002))
+    before, after = (np.abs(x[INNER, :3] - GRILLE[INNER]).mean() for x in (values, out))
     assert after < 0.15 * before
-    assert (out[inner & hole, 4] == 0).all() and (out[inner & ~hole, 4] == 1).all()
+    assert (out[INNER & HOLE, 4] == 0).all() and (out[INNER & ~HOLE, 4] == 1).all()
     np.testing.assert_array_equal(out[:, 3], np.where(out[:, 4] == 1, values[:, 3], 1))
     values[:, 3] = 0.2
-    assert (sharpened(values, texels, place, photos(truth, 60, 0.002))[:, 3] == values[:, 3]).all()
+    assert (sharpened(values, texels, place, photos(GRILLE, 60, 0.002))[:, 3] == values[:, 3]).all()
 
 
 def test_the_steps_approach_bounded_least_squares() -> None:
@@ -95,7 +96,7 @@ def test_hue_comes_from_around_and_brightness_stays() -> None:
     bright = rng.uniform(0.3, 0.8, (len(texels), 1))
     stained = (bright * GOLD / GOLD.mean() * rng.uniform(0.8, 1.2, (len(texels), 3))).clip(0, 1).astype(np.float32)
     out = _of_calm_hue(stained, texels, np.ones(len(texels), bool))
-    inner = np.minimum(texels.index % SIZE, texels.index // SIZE) > HUE
+    inner = np.minimum(COLUMN, ROW) > HUE
     hue = out[inner] / out[inner].mean(1, keepdims=True)
     assert hue.std(0).max() < 0.3 * (stained[inner] / stained[inner].mean(1, keepdims=True)).std(0).max()
     assert np.abs(out - stained).mean(1)[inner].mean() < 0.08
@@ -105,11 +106,10 @@ def test_hue_comes_from_around_and_brightness_stays() -> None:
 def test_metal_without_holes_and_paint_are_left_alone() -> None:
     texels = everywhere()
     values = np.random.default_rng(2).uniform(0.2, 0.8, (len(texels), 5)).astype(np.float32)
-    column, row = texels.index % SIZE, texels.index // SIZE
-    place = column < SIZE // 2
+    place = COLUMN < SIZE // 2
     even = np.full((len(texels), 3), 0.7, np.float32)
     np.testing.assert_array_equal(sharpened(values, texels, place, photos(even)), values)
-    pierced = even * ~((column % 6 < 3) & (row % 6 < 3))[:, None]
+    pierced = even * ~HOLE[:, None]
     out = sharpened(values, texels, place, photos(pierced.astype(np.float32)))
     np.testing.assert_array_equal(out[~place], values[~place])
     assert (out[place] != values[place]).mean() > 0.5
@@ -117,38 +117,32 @@ def test_metal_without_holes_and_paint_are_left_alone() -> None:
 
 def test_noise_is_drawn_to_metal_or_hole() -> None:
     texels = everywhere()
-    column, row = texels.index % SIZE, texels.index // SIZE
-    hole = (column % 6 < 3) & (row % 6 < 3)
-    truth = np.where(hole[:, None], 0.0, GOLD).astype(np.float32)
     everything = np.ones(len(texels), bool)
     values = np.tile(np.array([0.4, 0.4, 0.4, 0.2, 0.8], np.float32), (len(texels), 1))
-    seen = photos(truth, 30, 0.08)
+    seen = photos(GRILLE, 30, 0.08)
     alone = _solved(_parts(seen, everything), values[:, :3])
     drawn = sharpened(values, texels, everything, seen)[:, :3]
-    inner = (np.minimum(column, row) > 3) & (np.maximum(column, row) < SIZE - 5)
-    before, after = (np.abs(x[inner] - truth[inner]).mean() for x in (alone, drawn))
+    before, after = (np.abs(x[INNER] - GRILLE[INNER]).mean() for x in (alone, drawn))
     assert after < 0.7 * before
 
 
 @pytest.mark.parametrize("bright", [0.9, 0.15])
 def test_what_is_likely_is_the_metal_around_or_black(bright: float) -> None:
     texels = everywhere()
-    column, row = texels.index % SIZE, texels.index // SIZE
-    hole = (column % 6 < 3) & (row % 6 < 3)
-    shown = np.where(hole[:, None], 0.15 * bright * GOLD, bright * GOLD).astype(np.float32)
+    shown = np.where(HOLE[:, None], 0.15 * bright * GOLD, bright * GOLD).astype(np.float32)
     out = _likely(shown, texels, np.ones(len(texels), bool))
-    assert (out[hole] == 0).all()
-    np.testing.assert_allclose(out[~hole], np.tile(bright * GOLD, (int((~hole).sum()), 1)), rtol=0.02)
+    assert (out[HOLE] == 0).all()
+    np.testing.assert_allclose(out[~HOLE], np.tile(bright * GOLD, (int((~HOLE).sum()), 1)), rtol=0.02)
 
 
 def test_bars_that_are_blurred_stay_as_many() -> None:
     texels = everywhere()
-    x, y = texels.index % SIZE / 5.3, texels.index // SIZE / 6.1
+    x, y = COLUMN / 5.3, ROW / 6.1
     bar = np.hypot(x - np.round(x), y - np.round(y)) > 0.35
     sharp = np.where(bar[:, None], GOLD, 0).astype(np.float32)
     shown = cv2.GaussianBlur(texels.image(sharp), (0, 0), 1.5).reshape(-1, 3)
     everything = np.ones(len(texels), bool)
-    inner = (np.minimum(texels.index % SIZE, texels.index // SIZE) > 6) & (np.maximum(texels.index % SIZE, texels.index // SIZE) < SIZE - 7)
+    inner = (np.minimum(COLUMN, ROW) > 6) & (np.maximum(COLUMN, ROW) < SIZE - 7)
     out, metal = _likely(shown, texels, everything), _metal(shown, texels, everything)
     halves = np.where(2 * shown.mean(1, keepdims=True) > metal.mean(1, keepdims=True), metal, 0)
     assert out[inner].mean() == pytest.approx(shown[inner].mean(), rel=0.06)
@@ -157,19 +151,15 @@ def test_bars_that_are_blurred_stay_as_many() -> None:
 
 def test_photos_that_are_brighter_or_dimmer_than_shaded_tell_the_same_grille() -> None:
     texels = everywhere()
-    column, row = texels.index % SIZE, texels.index // SIZE
-    hole = (column % 6 < 3) & (row % 6 < 3)
-    truth = np.where(hole[:, None], 0.0, GOLD).astype(np.float32)
-    values = np.tile(np.append(truth.mean(0), [0.2, 0.8]).astype(np.float32), (len(texels), 1))
+    values = np.tile(np.append(GRILLE.mean(0), [0.2, 0.8]).astype(np.float32), (len(texels), 1))
     rng = np.random.default_rng(6)
     seen = []
-    for photo in photos(truth, 60, 0.002):
+    for photo in photos(GRILLE, 60, 0.002):
         off = np.float32(2 ** rng.uniform(-1, 1))
         seen.append(replace(photo, line=Line(off * photo.line.slope, off * photo.line.offset)))
     out = sharpened(values, texels, np.ones(len(texels), bool), seen)
-    inner = (np.minimum(column, row) > 3) & (np.maximum(column, row) < SIZE - 5)
-    assert (out[inner & hole, 4] == 0).mean() > 0.98 and (out[inner & ~hole, 4] == 1).mean() > 0.95
-    assert np.abs(out[inner, :3] - truth[inner]).mean() < 0.3 * np.abs(values[inner, :3] - truth[inner]).mean()
+    assert (out[INNER & HOLE, 4] == 0).mean() > 0.98 and (out[INNER & ~HOLE, 4] == 1).mean() > 0.95
+    assert np.abs(out[INNER, :3] - GRILLE[INNER]).mean() < 0.3 * np.abs(values[INNER, :3] - GRILLE[INNER]).mean()
 
 
 def test_a_pattern_is_what_both_halves_show() -> None:
