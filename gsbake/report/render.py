@@ -70,9 +70,10 @@ class Asset:
 
 @dataclass(frozen=True, eq=False)
 class Samples:
-    """What n camera samples on the asset see, in the asset's frame: unit `normal` and `view` (towards the eye) (n, 3), linear
-    `base_color` (n, 3), `occlusion`, `roughness`, `metallic` (n,), own radiance `emissive` (n, 3) if any part glows."""
+    """What n camera samples on the asset see, in the asset's frame: `position`, unit `normal` and `view` (towards the eye) (n, 3), linear
+    `base_color` (n, 3), `occlusion`, `roughness`, `metallic` (n,), emitted radiance `emissive` (n, 3) if any part is emissive."""
 
+    position: Floats
     normal: Floats
     view: Floats
     base_color: Floats
@@ -91,14 +92,19 @@ class Shader(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Picture:
-    """A render: straight sRGB `rgb` (h, w, 3) in 0..1 and `alpha` (h, w), and the buffers behind it, averaged over the covered samples:
+    """A render: straight linear radiance `linear` (h, w, 3), `alpha` (h, w), and the buffers behind it, averaged over the covered samples:
     `base_color` (h, w, 3) linear, unit `normal` (h, w, 3), `orm` (h, w, 3)."""
 
-    rgb: Floats
+    linear: Floats
     alpha: Floats
     base_color: Floats
     normal: Floats
     orm: Floats
+
+    @property
+    def rgb(self) -> Floats:
+        """Straight sRGB (h, w, 3) in 0..1."""
+        return encode_srgb(self.linear)
 
     def over(self, grey: float) -> Floats:
         """The picture (h, w, 3) over a plain background, mixed in sRGB values as photos with masks are."""
@@ -161,7 +167,7 @@ class Renderer:
         straight = mean / np.maximum(alpha, 1e-6)[..., None]
         normal = straight[..., 7:10]
         length = np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-6)
-        return Picture(encode_srgb(straight[..., :3]), alpha, straight[..., 4:7], normal / length, straight[..., 10:13])
+        return Picture(straight[..., :3], alpha, straight[..., 4:7], normal / length, straight[..., 10:13])
 
     def _window(self, camera: Camera) -> tuple[slice, slice]:
         """Rows and columns that hold the asset's projection; the whole picture when the camera stands within its bounds."""
@@ -193,7 +199,8 @@ class Renderer:
         if orm is None:
             orm = np.broadcast_to(np.array([1, 1, 0], np.float32), (len(face), 3))
         assert base is not None
-        return Samples(normal, view, base, orm[:, 0], orm[:, 1], orm[:, 2], self._read("emissive", level, uv))
+        position, emissive = mix(asset.position.astype(np.float32)), self._read("emissive", level, uv)
+        return Samples(position, normal, view, base, orm[:, 0], orm[:, 1], orm[:, 2], emissive)
 
     def _choose_level(self, camera: Camera, distance: Floats) -> int:
         """Halvings after which a texel is about as large as a sample's footprint on the surface."""

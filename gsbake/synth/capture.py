@@ -74,7 +74,7 @@ def true_mesh(cells: int = 112) -> tuple[Array, NDArray[np.int64]]:
 
 
 def surface_points(vertices: Array, faces: NDArray[np.int64], count: int, seed: int) -> dict[str, NDArray[np.float32]]:
-    """`count` area-uniform surface points (world): position, normal, albedo (linear), roughness, metallic."""
+    """`count` area-uniform surface points (world): position, normal, albedo (linear), roughness, metallic, emission (linear)."""
     draw = np.random.default_rng(seed)
     corner = vertices[faces]
     area = np.linalg.norm(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=1)
@@ -90,6 +90,7 @@ def surface_points(vertices: Array, faces: NDArray[np.int64], count: int, seed: 
         "albedo": surface[:, :3],
         "roughness": surface[:, 3],
         "metallic": surface[:, 4],
+        "emission": scene.emissions(points),
     }
     return {name: part.astype(np.float32) for name, part in parts.items()}
 
@@ -122,6 +123,7 @@ def _write_view(folder: Path, camera: Camera, rig: Rig, background: bool) -> Non
     _write_png(truth / "masks" / name, alpha)
     _write_png(truth / "albedo" / name, encode_srgb(maps[..., :3]), alpha)
     _write_png(truth / "normal" / name, np.round(255 * code).astype(np.uint8), alpha)
+    _write_png(truth / "emission" / name, encode_srgb(maps[..., 8:11]), alpha)
     _write_png(truth / "orm" / name, np.round(255 * np.clip(orm, 0, 1)).astype(np.uint8), alpha)
 
 
@@ -141,14 +143,14 @@ def write_capture(folder: Path, views: int = 24, size: int = 128, seed: int = 0,
 
     `images/000.png`…: sRGB photos of `size`² pixels, RGBA cut-outs, or opaque photos with a patterned ground when `background`;
     `transforms.json` when `poses`; `truth/`: `mesh.ply`, `points.npz` (30 000 surface points with materials), `cameras.json`
-    (`CameraSet`), and per photo `masks/`, `albedo/` (sRGB), `normal/` (world, 0..1 coded), `orm/` (1, roughness, metallic; linear). The
-    same arguments write the same bytes. Raises UsageError for fewer than 3 views or a size below 16.
+    (`CameraSet`), and per photo `masks/`, `albedo/` and `emission/` (sRGB), `normal/` (world, 0..1 coded), `orm/` (1, roughness, metallic;
+    linear). The same arguments write the same bytes. Raises UsageError for fewer than 3 views or a size below 16.
     """
     if views < 3 or size < 16:
         raise UsageError(f"The built-in capture needs at least 3 views of 16 pixels, not {views} of {size}; raise --views or --size.")
     import trimesh
 
-    for name in ("images", "truth/masks", "truth/albedo", "truth/normal", "truth/orm"):
+    for name in ("images", "truth/masks", "truth/albedo", "truth/normal", "truth/orm", "truth/emission"):
         (folder / name).mkdir(parents=True, exist_ok=True)
     cams = cameras(views, size, seed, background)
     rig = studio()

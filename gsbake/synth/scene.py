@@ -1,9 +1,12 @@
-"""The analytic object of the built-in capture: a bowl-topped jar with a metal foot and a thin metal handle, as a signed distance field.
+"""The analytic object of the built-in capture: a bowl-topped jar with a glazed band, a small lamp, a metal foot and a thin metal handle.
+
+It is a signed distance field with materials.
 
 World frame: Z-up, the object stands on z = 0 at `ORIGIN`. Primitives are exact distances (rounded cylinder, torus, sphere); unions by min
 and the carved bowl by max keep the field 1-Lipschitz, which is all that sphere tracing needs (Hart, *Sphere tracing*, The Visual Computer
-1996). The surface carries two materials: a matte, brightly patterned dielectric and a rough gold-like metal. The pattern is hashed value
-noise, aperiodic, so that structure from motion finds features that do not repeat.
+1996). The surface carries four materials: a diffuse, brightly patterned dielectric, a glossy dielectric (the glazed band), a rough
+gold-like metal, and a round emissive patch. The pattern is hashed value noise, aperiodic, so that structure from motion finds features
+that do not repeat. The lamp is flush with the convex side of the jar, so no other point of the object receives its light.
 """
 
 from __future__ import annotations
@@ -27,6 +30,10 @@ BODY_Z, BODY_RADIUS, BODY_HALF, BODY_ROUND = 0.52, 0.40, 0.40, 0.08
 BOWL_Z, BOWL_RADIUS = 1.10, 0.36
 FOOT_Z, FOOT_RADIUS, FOOT_HALF, FOOT_ROUND = 0.08, 0.30, 0.08, 0.03
 HANDLE_X, HANDLE_Z, HANDLE_MAJOR, HANDLE_MINOR = 0.40, 0.52, 0.22, 0.04
+#: The glazed band about the jar between these heights: linear albedo and roughness.
+GLAZE_Z, GLAZE_ALBEDO, GLAZE_ROUGHNESS = (0.16, 0.34), (0.05, 0.12, 0.34), 0.22
+#: The lamp: its centre's direction from the axis is (-1, 0), its height, radius and radiance (linear; above 1 would clip in the photos).
+LAMP_Z, LAMP_RADIUS, LAMP_RADIANCE = 0.66, 0.09, (0.95, 0.80, 0.45)
 
 _compiled: Any = njit(cache=True, nogil=True, error_model="numpy")
 _inlined: Any = njit(cache=True, nogil=True, error_model="numpy", inline="always")
@@ -109,6 +116,21 @@ def _step(edge0: float, edge1: float, value: float) -> float:
     return t * t * (3 - 2 * t)
 
 
+@_inlined
+def _in_lamp(x: float, y: float, z: float) -> bool:
+    """Whether a world point on the surface belongs to the lamp."""
+    dy, dz = y - ORIGIN[1], z - LAMP_Z
+    return x < ORIGIN[0] - 0.5 * BODY_RADIUS and dy * dy + dz * dz < LAMP_RADIUS * LAMP_RADIUS
+
+
+@_compiled
+def emission(x: float, y: float, z: float) -> tuple[float, float, float]:
+    """Emitted radiance (3), linear, of the surface point nearest to a world point."""
+    if _in_lamp(x, y, z):
+        return LAMP_RADIANCE
+    return 0.0, 0.0, 0.0
+
+
 @_compiled
 def material(x: float, y: float, z: float) -> tuple[float, float, float, float, float]:
     """Linear albedo (3), perceptual roughness and metallic of the surface point nearest to a world point."""
@@ -117,6 +139,10 @@ def material(x: float, y: float, z: float) -> tuple[float, float, float, float, 
     if metal_distance(x, y, z) < ceramic_distance(x, y, z):
         shade = 0.85 + 0.3 * (coarse - 0.5)
         return 0.82 * shade, 0.62 * shade, 0.33 * shade, 0.42 + 0.12 * (fine - 0.5), 1.0
+    if GLAZE_Z[0] < z < GLAZE_Z[1]:
+        return GLAZE_ALBEDO[0], GLAZE_ALBEDO[1], GLAZE_ALBEDO[2], GLAZE_ROUGHNESS, 0.0
+    if _in_lamp(x, y, z):
+        return 0.03, 0.03, 0.03, 0.5, 0.0
     # Cream glaze, blotches of teal and rust at two scales, and a dark speckle: strong, aperiodic edges.
     teal = _step(0.50, 0.58, coarse)
     rust = _step(0.58, 0.66, noise(11 * x + 31, 11 * y, 11 * z + 17))
@@ -185,6 +211,15 @@ def materials(points: Array) -> Array:
     out = np.empty((len(points), 5))
     for i in range(len(points)):
         out[i, 0], out[i, 1], out[i, 2], out[i, 3], out[i, 4] = material(points[i, 0], points[i, 1], points[i, 2])
+    return out
+
+
+@_compiled
+def emissions(points: Array) -> Array:
+    """Emitted radiance (n, 3) at world points (n, 3) on the surface."""
+    out = np.empty((len(points), 3))
+    for i in range(len(points)):
+        out[i, 0], out[i, 1], out[i, 2] = emission(points[i, 0], points[i, 1], points[i, 2])
     return out
 
 

@@ -17,7 +17,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from gsbake.synth.scene import distance, ground, material, normal, trace
+from gsbake.synth.scene import distance, emission, ground, material, normal, trace
 
 Array = NDArray[np.float64]
 
@@ -226,12 +226,14 @@ def outgoing(
 def render(
     rotation: Array, centre: Array, fx: float, fy: float, cx: float, cy: float, width: int, height: int, rig: Rig, background: bool
 ) -> tuple[Array, Array]:
-    """One photo with 2x2 samples a pixel: linear RGB + coverage (h, w, 4) and albedo, normal, roughness, metallic (h, w, 8), premultiplied.
+    """One photo with 2x2 samples a pixel: linear RGB + coverage (h, w, 4) and the surface buffers (h, w, 11), premultiplied.
+
+    Buffers: albedo (3), normal (3), roughness, metallic, emission (3).
 
     `rotation` (3, 3) world→camera with OpenCV axes, `centre` (3,) the camera in the world. With `background` the colour channels also hold
     the ground and the environment behind it; coverage stays the object's.
     """
-    picture, buffers = np.zeros((height, width, 4)), np.zeros((height, width, 8))
+    picture, buffers = np.zeros((height, width, 4)), np.zeros((height, width, 11))
     ox, oy, oz = centre[0], centre[1], centre[2]
     for j in range(height):
         for i in range(width):
@@ -249,11 +251,14 @@ def render(
                     x, y, z = ox + t * dx, oy + t * dy, oz + t * dz
                     n = normal(x, y, z)
                     surface = material(x, y, z)
+                    glow = emission(x, y, z)
                     r, g, b = outgoing((x, y, z), n, (-dx, -dy, -dz), surface, rig, k)
+                    r, g, b = r + glow[0], g + glow[1], b + glow[2]
                     picture[j, i, 3] += 0.25
                     for c in range(3):
                         buffers[j, i, c] += 0.25 * surface[c]
                         buffers[j, i, 3 + c] += 0.25 * n[c]
+                        buffers[j, i, 8 + c] += 0.25 * glow[c]
                     buffers[j, i, 6] += 0.25 * surface[3]
                     buffers[j, i, 7] += 0.25 * surface[4]
                 elif not background:

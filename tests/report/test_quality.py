@@ -13,7 +13,7 @@ from gsbake.capture.cameras import Camera
 from gsbake.capture.posed import View
 from gsbake.pipeline.errors import BadInputError
 from gsbake.report.quality import GREY, MAX_PSNR, asset_cameras, chosen_views, compare, psnr, ssim
-from gsbake.report.render import Picture
+from gsbake.report.render import Picture, decode_srgb
 from tests.report.shapes import front_camera
 
 SIZE = 32
@@ -22,7 +22,7 @@ CAMERA = front_camera(4, SIZE, 40)
 
 def picture(grey: float, alpha: np.ndarray) -> Picture:
     rgb = np.full((SIZE, SIZE, 3), grey, np.float32)
-    return Picture(rgb, alpha.astype(np.float32), rgb, rgb, rgb)
+    return Picture(decode_srgb(rgb), alpha.astype(np.float32), rgb, rgb, rgb)
 
 
 def box(x0: int, x1: int) -> np.ndarray:

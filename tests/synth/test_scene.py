@@ -67,16 +67,34 @@ def test_trace_hits_where_the_closed_form_says() -> None:
     assert abs(scene.trace(OX, OY, 3.0, 0.0, 0.0, -1.0, 0.0, 1e-6) - (3.0 - 0.74)) < 1e-5
 
 
-def test_materials_are_two_and_physical() -> None:
+def test_materials_are_four_and_physical() -> None:
     points = around(4000)
     surface = scene.materials(points)
     metal = scene.materials(np.array([[OX + 0.66, OY, 0.52], [OX, OY, 0.0]]))
     assert np.all(metal[:, 4] == 1)
     assert set(np.unique(surface[:, 4])) == {0.0, 1.0}
     assert surface[:, :3].min() > 0.01 and surface[:, :3].max() < 0.95
-    ceramic = surface[surface[:, 4] == 0]
-    assert np.all(ceramic[:, 3] == 0.75)
-    assert ceramic[:, :3].std(axis=0).min() > 0.08  # textured enough to find features on
+    glaze, lamp = scene.materials(np.array([[OX, OY - 0.40, 0.25], [OX - 0.40, OY + 0.05, 0.66]]))
+    np.testing.assert_allclose(glaze, [*scene.GLAZE_ALBEDO, scene.GLAZE_ROUGHNESS, 0])
+    assert lamp[:3].max() < 0.05 and lamp[4] == 0
+    diffuse = surface[surface[:, 3] == 0.75]
+    assert np.all(diffuse[:, 4] == 0)
+    assert diffuse[:, :3].std(axis=0).min() > 0.08  # textured enough to find features on
+
+
+def test_the_lamp_is_a_patch_of_its_radius_that_no_other_point_sees() -> None:
+    angle, height = np.meshgrid(np.linspace(-np.pi, np.pi, 721), np.linspace(0.40, 0.90, 251))
+    side = np.column_stack([OX + 0.4 * np.cos(angle.ravel()), OY + 0.4 * np.sin(angle.ravel()), height.ravel()])
+    lit = scene.emissions(side).max(1) > 0
+    area = lit.mean() * 2 * np.pi * 0.4 * 0.5
+    np.testing.assert_allclose(area, np.pi * scene.LAMP_RADIUS**2, rtol=0.03)  # the side turns away from the disc a little
+    assert scene.emissions(np.array([[OX + 0.40, OY, 0.66]])).max() == 0
+    # All of the object lies behind the tangent planes at the lamp's points.
+    for point in side[lit][::40]:
+        outward = np.array([point[0] - OX, point[1] - OY, 0]) / 0.4
+        surface = around(4000)
+        surface = surface[np.abs(scene.distances(surface)) < 0.02]
+        assert ((surface - point) @ outward).max() < 0.03
 
 
 def test_noise_is_smooth_and_aperiodic() -> None:
