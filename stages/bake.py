@@ -40,11 +40,13 @@ def run(ctx: Context) -> dict[str, Any]:
     """Write `mesh.safetensors` and the EXR masters; return the figures of the atlas and the coverage."""
     import numpy as np
 
+    from gsbake.splat.threads import configure
     from gsbake.texture.flood import continue_over_surface, flood
     from gsbake.texture.masters import write_exr
     from gsbake.texture.needed import normals_agree
     from gsbake.texture.normals import normal_map
 
+    configure(ctx.threads)
     settings = ctx.settings.bake
     if settings.materials == "surfels" and not (ctx.inputs["refine"] / "light.safetensors").exists():
         raise BadInputError(

@@ -13,13 +13,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import cv2
 import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
 from gsbake.capture.cameras import Array, Camera
 from gsbake.capture.photo import Bytes
+from gsbake.imaging.distance import distance_to_zero
 
 if TYPE_CHECKING:
     from gsbake.capture.posed import PosedPhotos
@@ -36,7 +36,7 @@ _KEEP = 8
 _BAND = 6.0
 
 
-@nb.njit(parallel=True, fastmath=True, cache=True)
+@nb.njit(parallel=True, error_model="numpy", cache=True)
 def _carve(
     distance: Floats, starts: NDArray[np.int64], sizes: NDArray[np.int64], lens: Array, poses: Array, lower: Array, cell: float, n: int,
     wrong_share: float, least_seen: int,
@@ -103,8 +103,7 @@ def silhouette_distance(mask: Bytes) -> Floats:
     if inside.all() or not inside.any():
         far = float(np.hypot(*mask.shape))
         return np.full(mask.shape, -far if inside.all() else far, np.float32)
-    outer = cv2.distanceTransform(1 - inside, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-    inner = cv2.distanceTransform(inside, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    outer, inner = distance_to_zero(1 - inside), distance_to_zero(inside)
     # Distances run between pixel centres, the edge lies half a pixel before them.
     return np.where(inside > 0, 0.5 - inner, outer - 0.5).astype(np.float32)
 

@@ -68,8 +68,9 @@ class EnvironmentLight(torch.nn.Module):
         return values.reshape(height, cut, 2 * height, cut, 3).mean(axis=(1, 3)).astype(np.float32)
 
     def save(self, path: Path | str) -> None:
-        """Write the radiance as safetensors (key `radiance`)."""
-        meta = {"faces": "+X -X +Y -Y +Z -Z, OpenGL orientation", "frame": "unit", "unit": "linear RGB radiance"}
+        """Write the radiance as safetensors (key `radiance`); the same radiance writes the same bytes."""
+        # one key: safetensors writes several in an arbitrary order, which would change the file's digest
+        meta = {"format": "linear RGB radiance in the unit frame; faces +X -X +Y -Y +Z -Z, OpenGL orientation"}
         safetensors.torch.save_file({"radiance": self.radiance().detach().cpu().contiguous()}, str(path), metadata=meta)
 
     @classmethod

@@ -85,7 +85,7 @@ def _glance(
     return BEHIND if pz - radius > far else LOOK
 
 
-@nb.njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+@nb.njit(cache=True, nogil=True, error_model="numpy")
 def fuse_view(
     start: int,
     stop: int,

@@ -73,7 +73,7 @@ def imls_field(
     return np.clip(field, -1, 1).astype(np.float32)
 
 
-@nb.njit(cache=True, fastmath=True)
+@nb.njit(cache=True, error_model="numpy")
 def _splat(index: Any, local: Any, normal: Any, trust: Any, radii: Any, sums: Any, mass: Any, first: Any) -> None:
     """Add every sample's plane to the lattice samples within its radius; all lengths in cells. `first`: an earlier field, or empty."""
     sizes = (index.shape[0] * EDGE, index.shape[1] * EDGE, index.shape[2] * EDGE)

@@ -100,7 +100,7 @@ def follow_normals(
     return vertices + np.clip(shift, -limit, limit)[:, None] * normal
 
 
-@nb.njit(cache=True, nogil=True, fastmath=True)
+@nb.njit(cache=True, nogil=True, error_model="numpy")
 def _gather(
     start: int,
     stop: int,

@@ -10,12 +10,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-import cv2
 import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
 from gsbake.capture.cameras import Camera
+from gsbake.imaging.distance import distance_to_zero
 
 Floats = NDArray[np.float32]
 
@@ -93,7 +93,7 @@ def outside_distance(mask: NDArray[np.uint8], margin: float = MASK_MARGIN) -> Fl
     if inside.all():
         return np.zeros(mask.shape, np.float32)
     # The edge lies half a pixel before the nearest inside pixel's centre.
-    distance = cv2.distanceTransform(1 - inside, cv2.DIST_L2, cv2.DIST_MASK_PRECISE) - 0.5
+    distance = distance_to_zero(1 - inside) - 0.5
     return np.maximum(distance - margin, 0).astype(np.float32)
 
 

@@ -11,16 +11,22 @@ from numpy.typing import NDArray
 
 from gsbake.pipeline.errors import BadInputError
 
+#: Every file says it was captured then: the time of writing would change the file's digest from run to run.
+EPOCH = "1970:01:01 00:00:00"
 #: Channel names by count; more channels are numbered.
 NAMES = {1: ("Y",), 3: ("R", "G", "B"), 4: ("R", "G", "B", "A")}
 
 
 def write_exr(path: Path, image: NDArray[Any]) -> None:
-    """Write `image` (h, w, c) as a half-float EXR without loss beyond rounding (ZIP). Raises OSError when it cannot be written."""
+    """Write `image` (h, w, c) as a half-float EXR without loss beyond rounding (ZIP); the same image writes the same bytes.
+
+    Raises OSError when it cannot be written.
+    """
     height, width, channels = image.shape
     spec = oiio.ImageSpec(width, height, channels, oiio.HALF)
     spec.channelnames = NAMES.get(channels, tuple(f"C{k}" for k in range(channels)))
     spec["compression"] = "zip"
+    spec["DateTime"] = EPOCH
     _write(path, spec, np.ascontiguousarray(image, np.float16))
 
 

@@ -249,6 +249,7 @@ def test_masters_are_half_floats_and_come_back(tmp_path: Path) -> None:
     image = np.random.default_rng(0).random((5, 7, 3)).astype(np.float16)
     write_exr(tmp_path / "a.exr", image)
     assert np.array_equal(read_exr(tmp_path / "a.exr"), image.astype(np.float32))
+    assert b"1970:01:01 00:00:00" in (tmp_path / "a.exr").read_bytes()  # and not the time of writing
     with pytest.raises(BadInputError, match=r"b\.exr"):
         read_exr(tmp_path / "b.exr")
 

@@ -1,0 +1,1 @@
+"""Images as arrays: colour curves, reading and writing, sampling, distances, similarity figures."""

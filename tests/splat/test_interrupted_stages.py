@@ -1,0 +1,87 @@
+"""The real train and refine stages, stopped by SIGTERM and by SIGKILL in the middle of their steps: they end with the same bytes."""
+
+from __future__ import annotations
+
+import shutil
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+SETTINGS = (
+    "ingest.max_size=96", "stereo.enabled=never", "train.iterations=260", "train.max_size=96", "train.init_surfels=1500",
+    "splat.max_surfels=2500", "splat.shading=pbr", "splat.env_size=8", "refine.iterations=120", "skip.refined_poses=never",
+)  # fmt: skip
+
+#: Runs up to a stage and, once that stage has done so many steps, sends itself a signal (0: never).
+RUNNER = """
+import os, sys
+from pathlib import Path
+from gsbake.cli.options import Options
+from gsbake.cli.session import open_session
+from gsbake.pipeline.engine import Observer
+from gsbake.pipeline.errors import GsbakeError
+
+out, stage, step, number = sys.argv[1], sys.argv[2], int(sys.argv[3]), int(sys.argv[4])
+
+class Stopper(Observer):
+    sent = number == 0
+
+    def progress(self, name, done, total, text, live):
+        if not self.sent and name == stage and done >= step and "surfels" in live:
+            self.sent = True  # a second SIGTERM would not wait for the checkpoint
+            os.kill(os.getpid(), number)
+
+session = open_session(Options(out=Path(out)), Stopper())
+try:
+    session.engine.run(stage)
+except GsbakeError as error:
+    sys.exit(error.exit_code)
+"""
+
+
+def run(out: Path, stage: str, step: int = 0, number: int = 0) -> int:
+    """Exit code of one run up to `stage`."""
+    command = [sys.executable, "-c", RUNNER, str(out), stage, str(step), str(int(number))]
+    return subprocess.run(command, capture_output=True, timeout=300, check=False).returncode
+
+
+def gsbake(*args: object) -> None:
+    done = subprocess.run([sys.executable, "-m", "gsbake", *map(str, args)], capture_output=True, text=True, timeout=300, check=False)
+    assert done.returncode == 0, done.stderr[-2000:]
+
+
+def results(out: Path) -> dict[str, bytes]:
+    """The files that training and refining published."""
+    manifests = [path for stage in ("train", "refine") for path in (out / "stages" / stage).glob("*/manifest.json")]
+    files = [path for manifest in manifests for path in manifest.parent.iterdir() if path != manifest]
+    return {f"{path.parent.parent.name}/{path.name}": path.read_bytes() for path in files}
+
+
+@pytest.fixture(scope="module")
+def posed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An output folder with everything that training needs."""
+    root = tmp_path_factory.mktemp("interrupted")
+    gsbake("synth", root / "capture", "--views", 10, "--size", 96)
+    words = [word for pair in SETTINGS for word in ("--set", pair)]
+    gsbake("stereo", root / "capture", "--profile", "smoke", "--out", root / "out", *words)
+    return root / "out"
+
+
+def test_stopped_and_killed_stages_end_with_the_same_bytes(posed: Path, tmp_path: Path) -> None:
+    whole, broken = tmp_path / "whole", tmp_path / "broken"
+    shutil.copytree(posed, whole)
+    shutil.copytree(posed, broken)
+    assert run(whole, "refine") == 0
+    assert run(broken, "train", 90, signal.SIGTERM) == 75
+    checkpoints = list((broken / "stages" / "train").glob("*.checkpoint/checkpoint.*"))
+    assert len(checkpoints) == 1 and checkpoints[0].stat().st_size > 0
+    assert run(broken, "train", 170, signal.SIGKILL) == -signal.SIGKILL
+    assert run(broken, "refine", 60, signal.SIGTERM) == 75
+    assert run(broken, "refine", 100, signal.SIGKILL) == -signal.SIGKILL
+    assert run(broken, "refine") == 0
+    expected = results(whole)
+    assert {"train/surfels.safetensors", "train/light.safetensors", "refine/surfels.safetensors", "refine/log.csv"} <= expected.keys()
+    assert results(broken) == expected
