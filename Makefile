@@ -22,7 +22,7 @@ SCORE_ARGS ?=
 PARTS ?= table timeline growth
 ARGS ?=
 
-.PHONY: help setup demo test check bench stress score clean
+.PHONY: help setup node demo test check bench stress score clean
 
 help: ## Show this
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 10
@@ -37,6 +37,13 @@ $(STAMP): pyproject.toml constraints.txt
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[dev]'
 	@touch $@
 
+node: $(VENV)/node/.stamp ## Install the JavaScript reference implementations that tests compare with
+
+$(VENV)/node/.stamp: $(STAMP) tests/node/package-lock.json
+	@mkdir -p $(VENV)/node && cp tests/node/package.json tests/node/package-lock.json $(VENV)/node
+	PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/npm ci --prefix $(VENV)/node --silent --no-audit --no-fund
+	@touch $@
+
 demo: setup ## Bake the built-in capture with the smallest profile
 	$(BIN)/gsbake synth $(DEMO_OUT)/capture
 	$(BIN)/gsbake run $(DEMO_OUT)/capture --profile smoke --out $(DEMO_OUT)
@@ -46,10 +53,10 @@ check: setup ## Lint and types
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 
-test: check ## Lint, types and the quick tests
-	$(BIN)/pytest -m "not slow and not stress"
+test: check node ## Lint, types and the quick tests, with the share of lines they run
+	$(BIN)/pytest -m "not slow and not stress" --cov --cov-report=term:skip-covered
 
-stress: setup ## The slow tests: hostile input at length, kills at random moments, poses of a development capture where present
+stress: setup node ## The slow tests: hostile input at length, kills at random moments, poses of a development capture where present
 	$(BIN)/pytest -m "slow or stress"
 
 bench: setup ## Measure kernels, error against time (beside other tools) and growth, about two idle hours: PARTS="table timeline growth" ARGS=…

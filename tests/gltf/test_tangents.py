@@ -1,19 +1,16 @@
-"""Tangents against closed forms, and against the reference implementation where a developer has it."""
+"""Tangents against closed forms, and against the reference implementation."""
 
 from __future__ import annotations
 
 import json
-import os
-import shutil
-import subprocess
 from pathlib import Path
 
 import numpy as np
-import pytest
 import trimesh
 
 from gsbake.gltf.tangents import frame_to_world, tangents, world_to_frame
 from gsbake.texture.normals import vertex_normals
+from tests.support.node import run_node
 
 
 def patch(n: int = 12) -> tuple[np.ndarray, np.ndarray]:
@@ -77,10 +74,7 @@ def test_frames_are_inverse_to_each_other() -> None:
 
 
 def test_same_as_the_reference_implementation(tmp_path: Path) -> None:
-    """Against mikktspace.c compiled to WebAssembly (npm package `mikktspace`, folder in GSBAKE_NODE_MODULES)."""
-    modules = os.environ.get("GSBAKE_NODE_MODULES", "")
-    if not (shutil.which("node") and Path(modules, "mikktspace").is_dir()):
-        pytest.skip("node or the mikktspace package is not there")
+    """Against mikktspace.c compiled to WebAssembly (npm package `mikktspace`)."""
     ball = trimesh.creation.icosphere(subdivisions=3)
     rng = np.random.default_rng(0)
     position, faces = np.asarray(ball.vertices) * (1 + 0.1 * rng.random((len(ball.vertices), 1))), np.asarray(ball.faces)
@@ -94,8 +88,7 @@ def test_same_as_the_reference_implementation(tmp_path: Path) -> None:
         "const m=require(process.argv[1]+'/mikktspace'),f=require('fs'),d=JSON.parse(f.readFileSync(process.argv[2]));"
         "const a=x=>new Float32Array(x);console.log(JSON.stringify(Array.from(m.generateTangents(a(d.p),a(d.n),a(d.t)))))"
     )
-    out = subprocess.run(["node", "-e", script, modules, str(tmp_path / "in.json")], capture_output=True, text=True, check=True).stdout
-    reference = np.array(json.loads(out)).reshape(-1, 3, 4)
+    reference = np.array(run_node(script, "mikktspace", tmp_path / "in.json")).reshape(-1, 3, 4)
     ours = mine.tangent[mine.faces]
     assert np.array_equal(ours[..., 3], reference[..., 3])
     angle = np.degrees(np.arccos(np.clip((ours[..., :3] * reference[..., :3]).sum(-1), -1, 1)))

@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 
 from benchmarks.truth import measure_stage
+from tests.support.node import gltf_issues
 from tests.support.truth import Figures, measure
 
 SMALL = (
@@ -64,6 +65,10 @@ def test_materials(figures: Figures) -> None:
 
 def test_looks_right_in_another_light(figures: Figures) -> None:
     assert figures.relit > RELIT, figures
+
+
+def test_the_asset_is_valid(baked: tuple[Path, Path]) -> None:
+    assert gltf_issues(baked[1] / "asset.glb") == []
 
 
 @pytest.mark.parametrize(

@@ -15,6 +15,7 @@ from gsbake.light.shade import shade
 from gsbake.texture.colour import decode
 from gsbake.texture.level import BRIGHTER, ROUGHER, TINT, Level, find_level, graded, roughened
 from gsbake.texture.metal import Evidence
+from tests.support.monte_carlo import render
 
 Doubles = NDArray[np.float64]
 TEXELS, PHOTOS, SIZE = 400, 16, 16
@@ -32,9 +33,12 @@ TRUE = EnvironmentLight.from_function(room, SIZE).radiance().detach().numpy()
 
 
 class Plastic:
-    """Texels of many paints and one gloss, seen from many sides; `off` degrees by which the normals that explain them are wrong."""
+    """Texels of many paints and one gloss, seen from many sides; `off` degrees by which the normals that explain them are wrong.
 
-    def __init__(self, off: float = 0.0, single: bool = False, roughness: float = 0.2) -> None:
+    With `reference` the photos are taken by the Monte Carlo renderer, which shares no code with what explains them."""
+
+    def __init__(self, off: float = 0.0, single: bool = False, roughness: float = 0.2, reference: bool = False) -> None:
+        self.reference = reference
         rng = np.random.default_rng(5)
         self.normal = rng.normal(size=(TEXELS, 3))
         self.normal /= np.linalg.norm(self.normal, axis=1, keepdims=True)
@@ -60,7 +64,12 @@ class Plastic:
         photos = []
         for side in self.sides:
             seen = np.flatnonzero(self.normal @ side > 0.2)
-            photos.append((side, seen, self.colours(self.normal[seen], side, self.paint[seen], TRUE, self.roughness[seen])))
+            if self.reference:
+                view = np.tile(side, (len(seen), 1))
+                colour = render(self.normal[seen], view, self.paint[seen], self.roughness[seen], np.zeros(len(seen)), room)
+            else:
+                colour = self.colours(self.normal[seen], side, self.paint[seen], TRUE, self.roughness[seen])
+            photos.append((side, seen, colour.astype(np.float32)))
 
         def under(brightness: Doubles, contrast: float) -> list[Evidence]:
             light = graded(believed, brightness, contrast, AREA)
@@ -98,6 +107,13 @@ def test_graded_light_has_the_brightness_and_the_contrast_asked_for() -> None:
 def test_the_right_light_stays() -> None:
     found = Plastic().level(TRUE)
     assert np.allclose(found.brightness, 1) and found.contrast == 1 and found.gain == 0
+
+
+@pytest.mark.parametrize("factor", [1.0, 1.7, 0.6])
+def test_the_light_of_reference_photos_comes_back(factor: float) -> None:
+    found = Plastic(reference=True).level(graded(TRUE, np.full(3, factor), 1.0, AREA))
+    assert found.brightness * factor == pytest.approx(np.ones(3), rel=BRIGHTER**1.5 - 1)
+    assert 0.75 < found.contrast < 1.35
 
 
 @pytest.mark.parametrize("factor", [1.7, 0.6])

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from gsbake.light.environment import EnvironmentLight
 from gsbake.light.shade import shade
 from gsbake.texture.metal import DARKEST_METAL, LEAST_PHOTOS, Evidence, as_around, find_metals
+from tests.support.monte_carlo import render
 
 TEXELS, PHOTOS = 60, 24
 
@@ -57,10 +58,27 @@ class Wall:
             found.append(Evidence(np.arange(TEXELS), colour, np.ones(TEXELS, np.float32), np.zeros(TEXELS, np.int32), shaded))
         return found
 
+    def reference(self, base: NDArray[np.float32], roughness: float, metallic: float) -> list[Evidence]:
+        """The same, the photos taken by the Monte Carlo renderer, which shares no code with what explains them."""
+        normal = self.normal.numpy().astype(np.float64)
+        shown = [render(normal, t.numpy(), base, np.full(TEXELS, roughness), np.full(TEXELS, metallic), windows) for t in self.towards]
+        return [replace(e, colour=c.astype(np.float32)) for e, c in zip(self.photos(base, roughness, metallic), shown, strict=True)]
+
 
 @pytest.fixture(scope="module")
 def wall() -> Wall:
     return Wall()
+
+
+def test_metals_in_reference_photos(wall: Wall) -> None:
+    gold = np.tile(np.array([1.0, 0.77, 0.34], np.float32), (TEXELS, 1))
+    metals = find_metals(wall.reference(gold, 0.35, 1.0), np.full(TEXELS, 0.8, np.float32))
+    assert len(metals.texel) == TEXELS
+    assert np.abs(metals.base - gold).mean() < 0.05
+    assert np.abs(metals.roughness - 0.35).max() < 0.21  # the next value tried
+    paint = np.random.default_rng(1).uniform(0.1, 0.8, (TEXELS, 3)).astype(np.float32)
+    for roughness in (0.1, 0.35, 0.9):
+        assert len(find_metals(wall.reference(paint, roughness, 0.0), np.full(TEXELS, roughness, np.float32)).texel) == 0
 
 
 def test_metal_is_found_with_its_colour_and_roughness(wall: Wall) -> None:

@@ -1,0 +1,27 @@
+"""The tests' own reference renderer against closed forms."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from tests.support.monte_carlo import render
+
+UP = np.array([[0.0, 0.0, 1.0]])
+WHITE, BLACK = np.ones((1, 3)), np.zeros((1, 3))
+
+
+def test_lambert_under_a_linear_sky() -> None:
+    """E / π of a + b z is a + 2/3 b n_z; the dielectric's specular part is taken off by a black surface."""
+
+    def sky(directions: np.ndarray) -> np.ndarray:
+        return np.asarray((0.5 + 0.3 * directions[:, 2])[:, None] * np.ones(3))
+
+    both = [render(UP, UP, a, np.ones(1), np.zeros(1), sky, 4096) for a in (0.6 * WHITE, BLACK)]
+    np.testing.assert_allclose(both[0] - both[1], 0.6 * (0.5 + 0.3 * 2 / 3), rtol=0.01)
+
+
+def test_white_furnace() -> None:
+    view = np.array([[0.6, 0.0, 0.8]])
+    smooth, rough = (render(UP, view, WHITE, np.full(1, r), np.ones(1), lambda d: np.ones((len(d), 3)), 4096) for r in (0.15, 0.9))
+    assert 0.97 < smooth.mean() < 1.001
+    assert 0.4 < rough.mean() < 0.8  # one bounce of a rough metal loses the rest
