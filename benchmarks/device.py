@@ -18,14 +18,14 @@ from typing import Any
 import torch
 
 from benchmarks.raster import sphere
+from gsbake.config.schema import Profile
 from gsbake.pipeline.machine import cuda_lacks
-from gsbake.profile.schema import Profile
-from gsbake.splat.projection import Pinhole
-from gsbake.splat.raster import render
-from gsbake.splat.surfels import Surfels, quaternion_to
-from gsbake.splat.trainer import Plan, Trainer
-from gsbake.splat.transfer import named
-from gsbake.splat.views import TrainView
+from gsbake.surfels.model import Surfels, quaternion_to
+from gsbake.surfels.raster.projection import Pinhole
+from gsbake.surfels.raster.rasterise import render
+from gsbake.surfels.training.trainer import Plan, Trainer
+from gsbake.surfels.training.views import TrainView
+from gsbake.surfels.transfer import named
 
 CHANNELS = 10
 CASES = [(surfels, size) for surfels in (100_000, 1_000_000) for size in (800, 1600)]

@@ -26,7 +26,7 @@ from benchmarks.step import profile
 from gsbake.cli.options import Options
 from gsbake.cli.session import open_session
 from gsbake.pipeline.machine import default_threads
-from gsbake.splat.threads import configure
+from gsbake.surfels.raster.threads import configure
 from gsbake.synth.capture import write_capture
 
 ROOT = Path(__file__).resolve().parents[1]

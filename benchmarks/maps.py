@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
 from benchmarks.truth import align, nearest, nearest_on_faces, read_centres, read_mesh, read_truth
-from gsbake.capture.cameras import CameraSet
-from gsbake.texture.colour import decode, encode
-from gsbake.texture.masters import read_exr
-from gsbake.texture.texels import rasterise
+from gsbake.geometry.cameras import CameraSet
+from gsbake.imaging.exr import read_exr
+from gsbake.imaging.srgb import decode, encode
+from gsbake.texturing.texels import rasterise
 
 Floats = NDArray[np.float64]
 

@@ -13,9 +13,9 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from gsbake.splat.projection import Pinhole
-from gsbake.splat.raster import render
-from gsbake.splat.reference import render_reference
+from gsbake.surfels.raster.projection import Pinhole
+from gsbake.surfels.raster.rasterise import render
+from gsbake.surfels.raster.reference import render_reference
 
 SCALES = (1e-8, 1e-4, 1e-2, 1e-1, 1.0, 1e4)
 FIELDS = (1.0, 20.0, 50.0, 90.0, 150.0, 170.0)

@@ -14,8 +14,8 @@ import time
 
 import torch
 
-from gsbake.splat.projection import Pinhole
-from gsbake.splat.raster import render
+from gsbake.surfels.raster.projection import Pinhole
+from gsbake.surfels.raster.rasterise import render
 
 
 def sphere(surfels: int, channels: int, size: int) -> tuple[list[torch.Tensor], Pinhole, torch.Tensor, torch.Tensor]:

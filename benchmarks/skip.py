@@ -30,11 +30,11 @@ from benchmarks.timeline import BUILT_IN, ROOT, find_capture, manifests, names
 from benchmarks.truth import measure_stage, read_truth
 from gsbake.cli.options import Options
 from gsbake.cli.session import open_session
+from gsbake.config.schema import Skip
 from gsbake.pipeline.engine import Observer
 from gsbake.pipeline.errors import BadInputError, UsageError
 from gsbake.pipeline.plan import StageState
 from gsbake.pipeline.skip import PREFIX
-from gsbake.profile.schema import Skip
 
 RESULTS = ROOT / "benchmarks" / "results" / "skip.csv"
 #: Stages that `--reuse` takes from another run.

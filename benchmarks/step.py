@@ -21,16 +21,26 @@ import numpy as np
 import torch
 
 from benchmarks.raster import sphere
-from gsbake.light import kernels as light_kernels
-from gsbake.light import tables
-from gsbake.light.environment import EnvironmentLight
-from gsbake.profile.schema import Profile
-from gsbake.splat import adam, adapt, deferred, harmonics, image_loss, losses, projection, projection_loss, raster, similarity, smoothness
-from gsbake.splat import surface_loss as surface
-from gsbake.splat.surfels import Surfels, create
-from gsbake.splat.threads import configure, thread_count
-from gsbake.splat.trainer import Plan, Trainer
-from gsbake.splat.views import TrainView
+from gsbake.config.schema import Profile
+from gsbake.shading import light_tables as tables
+from gsbake.shading import split_sum_kernel as light_kernels
+from gsbake.shading.environment import EnvironmentLight
+from gsbake.surfels import spherical_harmonics as harmonics
+from gsbake.surfels.densification import clone_split as adapt
+from gsbake.surfels.losses import deferred_shading as deferred
+from gsbake.surfels.losses import geometry as surface
+from gsbake.surfels.losses import image as image_loss
+from gsbake.surfels.losses import photometric as similarity
+from gsbake.surfels.losses import projection as projection_loss
+from gsbake.surfels.losses import smoothness
+from gsbake.surfels.losses import terms as losses
+from gsbake.surfels.model import Surfels, create
+from gsbake.surfels.raster import projection
+from gsbake.surfels.raster import rasterise as raster
+from gsbake.surfels.raster.threads import configure, thread_count
+from gsbake.surfels.training import adam
+from gsbake.surfels.training.trainer import Plan, Trainer
+from gsbake.surfels.training.views import TrainView
 
 #: Name in the table, where it is looked up, under which name.
 KERNELS = (("blend forward", raster._Blend, "forward"), ("blend backward", raster._Blend, "backward"))

@@ -29,9 +29,9 @@ from benchmarks.rows import STARTS, Row, draw, markdown, merged, read_csv, text,
 from benchmarks.truth import measure_stage, read_truth
 from gsbake.cli.options import Options
 from gsbake.cli.session import Session, open_session
+from gsbake.config.load import load_profile
 from gsbake.pipeline.errors import BadInputError, UsageError
 from gsbake.pipeline.plan import StageState
-from gsbake.profile.load import load_profile
 
 ROOT = Path(__file__).resolve().parents[1]
 CAPTURES = Path(os.environ.get("GSBAKE_CAPTURES", ROOT.parent / "shared" / "captures"))

@@ -6,4 +6,4 @@ from gsbake.pipeline.registry import Registry
 
 #: Stage names in the order they run, and where each is declared.
 ORDER = ("ingest", "poses", "stereo", "train", "refine", "mesh", "bake", "export", "report")
-REGISTRY = Registry({name: f"stages.{name}:STAGE" for name in ORDER})
+REGISTRY = Registry({name: f"gsbake.stages.{name}:STAGE" for name in ORDER})

@@ -13,12 +13,12 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from gsbake.capture.cameras import Camera
-    from gsbake.surface.raycast import RayCaster
-    from gsbake.texture.normals import Detail
-    from gsbake.texture.pixels import Pixels
-    from gsbake.texture.project import Blended
-    from gsbake.texture.surface import Surface
+    from gsbake.geometry.cameras import Camera
+    from gsbake.geometry.raycast import RayCaster
+    from gsbake.materials.pixels import Pixels
+    from gsbake.texturing.normal_map import Detail
+    from gsbake.texturing.projection import Blended
+    from gsbake.texturing.unwrapped_mesh import Surface
 
 #: Rays for occlusion start this share of the diagonal above the surface; the result is averaged within this many texels.
 OFFSET, REACH = 0.002, 3.0
@@ -40,11 +40,11 @@ def run(ctx: Context) -> dict[str, Any]:
     """Write `mesh.safetensors` and the EXR masters; return the figures of the atlas and the coverage."""
     import numpy as np
 
-    from gsbake.splat.threads import configure
-    from gsbake.texture.flood import continue_over_surface, flood
-    from gsbake.texture.masters import write_exr
-    from gsbake.texture.needed import normals_agree
-    from gsbake.texture.normals import normal_map
+    from gsbake.imaging.exr import write_exr
+    from gsbake.surfels.raster.threads import configure
+    from gsbake.texturing.inpainting import continue_over_surface, flood
+    from gsbake.texturing.needed import normals_agree
+    from gsbake.texturing.normal_map import normal_map
 
     configure(ctx.threads)
     settings = ctx.settings.bake
@@ -132,8 +132,8 @@ def _mesh(ctx: Context, name: str) -> tuple[NDArray[np.float64], NDArray[np.int6
 
 def _unwrap(ctx: Context, vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> Surface:
     """The light mesh cut into charts, with its texels."""
-    from gsbake.texture.atlas import make_atlas
-    from gsbake.texture.surface import Surface
+    from gsbake.texturing.atlas import make_atlas
+    from gsbake.texturing.unwrapped_mesh import Surface
 
     size = ctx.settings.bake.size
     with ctx.part("atlas"):
@@ -149,8 +149,8 @@ def _unwrap(ctx: Context, vertices: NDArray[np.float64], faces: NDArray[np.int64
 
 def _detail(ctx: Context, surface: Surface) -> tuple[tuple[RayCaster, NDArray[np.float64]], Detail]:
     """The dense surface with its vertex normals, and what of it each texel shows."""
-    from gsbake.surface.raycast import RayCaster
-    from gsbake.texture.normals import find_detail, vertex_normals
+    from gsbake.geometry.raycast import RayCaster
+    from gsbake.texturing.normal_map import find_detail, vertex_normals
 
     vertices, faces = _mesh(ctx, "dense.ply")
     caster, normals = RayCaster(vertices, faces, ctx.threads), vertex_normals(vertices, faces)
@@ -161,7 +161,7 @@ def _occlusion(ctx: Context, surface: Surface, dense: tuple[RayCaster, NDArray[n
     """Open share of the hemisphere per texel (n,), traced on the dense surface where there is one."""
     import numpy as np
 
-    from gsbake.texture.openness import open_share
+    from gsbake.texturing.occlusion_map import open_share
 
     rays = ctx.settings.bake.occlusion_rays
     if rays == 0:
@@ -176,12 +176,12 @@ def _occlusion(ctx: Context, surface: Surface, dense: tuple[RayCaster, NDArray[n
 
 def _project_photos(ctx: Context, surface: Surface) -> Blended:
     """Base colour (n, 3) from the photos at their stored size."""
-    from gsbake.capture.exposure import TiePoints
-    from gsbake.capture.posed import PosedPhotos
-    from gsbake.splat.views import held_out
-    from gsbake.texture.colour import decode_bytes
-    from gsbake.texture.needed import constant_exposure
-    from gsbake.texture.project import ProjectionBlender, mask_weights
+    from gsbake.capture.photos.exposure import TiePoints
+    from gsbake.capture.posed_photos import PosedPhotos
+    from gsbake.imaging.srgb import decode_bytes
+    from gsbake.surfels.training.views import held_out
+    from gsbake.texturing.needed import constant_exposure
+    from gsbake.texturing.projection import ProjectionBlender, mask_weights
 
     posed = PosedPhotos.open(ctx.inputs["poses"], ctx.inputs["refine"])
     aside = set(held_out(len(posed), ctx.settings.train.holdout))
@@ -211,8 +211,8 @@ def _delit(ctx: Context, surface: Surface, shown: Blended, detail: Detail, open_
     """Base colour (n, 3): what the photos show without its shading; the light that made it is written beside the textures."""
     import numpy as np
 
-    from gsbake.texture.coarse import Coarse
-    from gsbake.texture.delit import find_irradiance, without_shading
+    from gsbake.materials.delighting import find_irradiance, without_shading
+    from gsbake.texturing.resampling import Coarse
 
     openness = np.ones_like(open_share) if ctx.settings.bake.visibility == "none" else open_share
     coarse = Coarse.sized(surface.atlas.uv, surface.atlas.faces, surface.texels, surface.texel, DELIT_SIZE)
@@ -243,20 +243,20 @@ def _fit_materials(
 
     import numpy as np
 
-    from gsbake.capture.posed import PosedPhotos
-    from gsbake.capture.steadiness import looks_diffuse
-    from gsbake.splat.views import held_out
-    from gsbake.surface.resolution import pixel_footprint
-    from gsbake.surface.watch import PLACES, MeshWatch
-    from gsbake.texture.coarse import Coarse
-    from gsbake.texture.fit import MaterialFit, Priors
-    from gsbake.texture.mirrored import Mirrors
-    from gsbake.texture.neighbours import neighbours
-    from gsbake.texture.pixels import PixelReader
-    from gsbake.texture.plainer import plainer
-    from gsbake.texture.sharpen import sharp_metals
-    from gsbake.texture.starts import best_fit, trial_cost, trial_roughness
-    from gsbake.texture.visibility import Visibility
+    from gsbake.capture.posed_photos import PosedPhotos
+    from gsbake.capture.view_dependence import looks_diffuse
+    from gsbake.materials.adjacency import neighbours
+    from gsbake.materials.fit import MaterialFit, Priors
+    from gsbake.materials.initialisation import best_fit, trial_cost, trial_roughness
+    from gsbake.materials.map_selection import plainer
+    from gsbake.materials.metal_superresolution import sharp_metals
+    from gsbake.materials.pixels import PixelReader
+    from gsbake.materials.reflections import Mirrors
+    from gsbake.materials.view_dependence import PLACES, MeshWatch
+    from gsbake.materials.visibility import Visibility
+    from gsbake.meshing.resolution import pixel_footprint
+    from gsbake.surfels.training.views import held_out
+    from gsbake.texturing.resampling import Coarse
 
     settings = ctx.settings.bake
     posed = PosedPhotos.open(ctx.inputs["poses"], ctx.inputs["refine"])
@@ -347,9 +347,9 @@ def _project_materials(ctx: Context, surface: Surface) -> Blended:
 
     import numpy as np
 
-    from gsbake.capture.posed import PosedPhotos
-    from gsbake.splat.render import SurfelRenderer
-    from gsbake.texture.project import ProjectionBlender, mask_weights
+    from gsbake.capture.posed_photos import PosedPhotos
+    from gsbake.surfels.raster.render import SurfelRenderer
+    from gsbake.texturing.projection import ProjectionBlender, mask_weights
 
     posed = PosedPhotos.open(ctx.inputs["poses"], ctx.inputs["refine"])
     renderer = SurfelRenderer.load(ctx.inputs["refine"])

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from gsbake.capture.cameras import CameraSet, Similarity
+    from gsbake.geometry.cameras import CameraSet, Similarity
     from gsbake.gltf.encode import Sheets
     from gsbake.gltf.write import GltfMesh
 
@@ -27,12 +27,12 @@ PREVIEW_LEVEL = 6
 def run(ctx: Context) -> dict[str, Any]:
     """Write `asset.glb`, `cameras.json`, `light.hdr` (with materials), `previews/` and `audit.json`; return the asset's figures."""
     import gsbake
-    from gsbake.capture.posed import PosedPhotos
+    from gsbake.capture.posed_photos import PosedPhotos
     from gsbake.gltf.audit import as_json, audit, failed
     from gsbake.gltf.encode import encode_within, quantise
     from gsbake.gltf.frame import asset_frame, transforms_json
     from gsbake.gltf.write import build_glb
-    from gsbake.texture.masters import read_exr
+    from gsbake.imaging.exr import read_exr
 
     settings = ctx.settings.export
     baked = ctx.inputs["bake"]
@@ -152,8 +152,8 @@ def _sources(ctx: Context) -> dict[str, str]:
 
 def _write_light(ctx: Context, frame: Similarity) -> None:
     """The learnt environment light, equirectangular, in the asset's frame."""
-    from gsbake.light.environment import EnvironmentLight
-    from gsbake.texture.masters import write_hdr
+    from gsbake.imaging.exr import write_hdr
+    from gsbake.shading.environment import EnvironmentLight
 
     light = EnvironmentLight.load(ctx.inputs["bake"] / "light.safetensors")
     write_hdr(ctx.out / "light.hdr", light.equirectangular(LIGHT_HEIGHT, frame.rotation, "gltf"))
@@ -164,7 +164,7 @@ def _write_previews(ctx: Context, sheets: Sheets, mesh: GltfMesh) -> None:
     import cv2
     import numpy as np
 
-    from gsbake.gltf.png import encode_png
+    from gsbake.imaging.png import encode_png
 
     folder = ctx.out / "previews"
     folder.mkdir()

@@ -14,8 +14,8 @@ from gsbake.pipeline.skip import leave_out
 from gsbake.pipeline.stage import Context, Stage
 
 if TYPE_CHECKING:
-    from gsbake.capture.frames import Given, PhotoSize
-    from gsbake.capture.quality import Quality
+    from gsbake.capture.photos.quality import Quality
+    from gsbake.capture.poses.frames import Given, PhotoSize
 
 #: Fastest PNG compression: the files are read many times and kept for a while, not shipped.
 _PNG_LEVEL = 1
@@ -40,7 +40,7 @@ class _MaskSource:
 
 def run(ctx: Context) -> dict[str, Any]:
     """Read, check and reduce all photos; see docs/architecture.md for the files."""
-    from gsbake.capture.masks import match_masks
+    from gsbake.capture.masks.matching import match_masks
     from gsbake.capture.sources import list_photos
 
     folder = ctx.inputs["photos"]
@@ -116,7 +116,7 @@ def _read_all(
     """Decode, reduce, measure and write all photos, a few at once; broken ones are skipped with a warning."""
     import cv2
 
-    from gsbake.capture.photo import UnreadablePhotoError
+    from gsbake.capture.photos.decode import UnreadablePhotoError
 
     for sub in ("photos", "masks"):
         (ctx.out / sub).mkdir(exist_ok=True)
@@ -162,11 +162,11 @@ def _read_one(path: Path, relative: str, name: str, source: _MaskSource | None, 
     """One photo and its mask (none without a `source`) to working files; runs in a thread."""
     import cv2
 
-    from gsbake.capture.exif import camera_key, focal_pixels
-    from gsbake.capture.frames import PhotoSize
-    from gsbake.capture.masks import mask_of
-    from gsbake.capture.photo import read_photo, to_working
-    from gsbake.capture.quality import measure
+    from gsbake.capture.masks.matching import mask_of
+    from gsbake.capture.photos.decode import read_photo, to_working
+    from gsbake.capture.photos.exif import camera_key, focal_pixels
+    from gsbake.capture.photos.quality import measure
+    from gsbake.capture.poses.frames import PhotoSize
 
     photo = read_photo(path)
     mask = None if source is None else mask_of(photo, relative, source.file, source.invert)
@@ -207,7 +207,7 @@ def _write_png(path: Path, image: Any) -> None:
 
 def _mark_alike(ctx: Context, read: dict[str, _Read]) -> None:
     """Mark and report photos that show the same as an earlier one, and those much more blurred than the rest."""
-    from gsbake.capture.quality import blurred, near_duplicates
+    from gsbake.capture.photos.quality import blurred, near_duplicates
 
     entries = [r.entry for r in read.values()]
     alike = near_duplicates([r.quality.thumbnail for r in read.values()])
@@ -241,7 +241,7 @@ def _settle_masks(ctx: Context, read: dict[str, _Read], masks: dict[str, Path]) 
 
 def _settle_resolution(ctx: Context, read: dict[str, _Read]) -> None:
     """Halve the working photos and masks where the photos hold nothing finer."""
-    from gsbake.capture.sharpness import finer_than_sharp
+    from gsbake.capture.photos.sharpness import finer_than_sharp
 
     entries = [r.entry for r in read.values()]
     longer = max(max(e["width"], e["height"]) for e in entries)
@@ -256,7 +256,7 @@ def _halve(out: Path, entry: dict[str, Any]) -> None:
     """Write a working photo and its mask again at half the size, and put the size right in `entry`."""
     import cv2
 
-    from gsbake.capture.photo import RawPhoto, to_working
+    from gsbake.capture.photos.decode import RawPhoto, to_working
 
     bgr: Any = cv2.imread(str(out / entry["file"]), cv2.IMREAD_COLOR)
     full: Any = cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB)
@@ -275,9 +275,9 @@ def _poses(ctx: Context, listing: list[str], read: dict[str, _Read]) -> dict[str
     """Read the poses that came with the photos, at the size of the working photos, and write them."""
     if "poses" not in ctx.inputs:
         return {"poses": "none"}
-    from gsbake.capture.cameras import CameraSet
-    from gsbake.capture.cloud import write_cloud
-    from gsbake.capture.given import read_poses
+    from gsbake.capture.poses.given import read_poses
+    from gsbake.geometry.cameras import CameraSet
+    from gsbake.geometry.ply import write_cloud
 
     path = ctx.inputs["poses"]
     with ctx.part("poses"):

@@ -15,12 +15,12 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from gsbake.capture.cameras import Camera
-    from gsbake.capture.posed import PosedPhotos
-    from gsbake.surface.resolution import Resolution
-    from gsbake.surface.spool import ViewSpool
-    from gsbake.surface.support import Support
-    from gsbake.surface.tsdf import SparseTsdf
+    from gsbake.capture.posed_photos import PosedPhotos
+    from gsbake.geometry.cameras import Camera
+    from gsbake.meshing.depth_cache import ViewSpool
+    from gsbake.meshing.resolution import Resolution
+    from gsbake.meshing.support_plane import Support
+    from gsbake.meshing.tsdf import SparseTsdf
 
 #: The object lives in the unit sphere; a little more, so that its outermost point is not cut.
 BALL = 1.05
@@ -40,8 +40,8 @@ def run(ctx: Context) -> dict[str, Any]:
     """Write `dense.ply` and `mesh.ply`; return counts, the cell and the errors."""
     import tempfile
 
-    from gsbake.capture.posed import PosedPhotos
-    from gsbake.surface.spool import ViewSpool
+    from gsbake.capture.posed_photos import PosedPhotos
+    from gsbake.meshing.depth_cache import ViewSpool
 
     posed = PosedPhotos.open(ctx.inputs["poses"], ctx.inputs["refine"])
     points, normals, weights = _samples(ctx.inputs["refine"])
@@ -71,7 +71,7 @@ def _samples(folder: Path) -> tuple[NDArray[np.float64], NDArray[np.float64], ND
     """The surfels on their zero set: points (n, 3), outward normals (n, 3), weights (n,) by area and opacity; those in the ball."""
     import numpy as np
 
-    from gsbake.splat.surfels import Surfels
+    from gsbake.surfels.model import Surfels
 
     surfels = Surfels.load(folder / "surfels.safetensors")
     normal = surfels.normal().detach().cpu().numpy().astype(np.float64)
@@ -90,7 +90,7 @@ def _choose(ctx: Context, posed: PosedPhotos, points: NDArray[np.float64]) -> tu
     """The object's box, padded, and the cell, with its reason logged."""
     import numpy as np
 
-    from gsbake.surface.resolution import choose, pixel_footprint, surfel_spacing
+    from gsbake.meshing.resolution import choose, pixel_footprint, surfel_spacing
 
     lower, upper = points.min(0), points.max(0)
     cameras = [camera.within(ctx.settings.train.max_size) for camera in posed.cameras.cameras]
@@ -109,10 +109,10 @@ def _choose(ctx: Context, posed: PosedPhotos, points: NDArray[np.float64]) -> tu
 
 def _render(ctx: Context, posed: PosedPhotos, spool: ViewSpool, resolution: Resolution) -> None:
     """Depth and normals at every photo's pose into the spool; depths that stereo measured replace rendered ones that they agree with."""
-    from gsbake.splat.render import SurfelRenderer
-    from gsbake.stereo.maps import read_depth
-    from gsbake.surface.measured import with_measured
-    from gsbake.surface.views import DepthView
+    from gsbake.meshing.depth_views import DepthView
+    from gsbake.meshing.stereo_depth import with_measured
+    from gsbake.mvs.depth_maps import read_depth
+    from gsbake.surfels.raster.render import SurfelRenderer
 
     renderer = SurfelRenderer.load(ctx.inputs["refine"], ctx.device)
     stereo = ctx.inputs.get("stereo")
@@ -139,7 +139,7 @@ def _support(
     """What the object stands on, which is left out of the mesh; not looked for where masks tell the object apart."""
     import numpy as np
 
-    from gsbake.surface.support import find_support
+    from gsbake.meshing.support_plane import find_support
 
     if posed.has_masks or ctx.settings.mesh.support == "keep":
         return None
@@ -153,7 +153,7 @@ def _noise(spool: ViewSpool) -> float:
     """Median disagreement (unit frame) of neighbouring views' depths; 0 when no two views overlap."""
     import numpy as np
 
-    from gsbake.surface.views import depth_noise
+    from gsbake.meshing.depth_views import depth_noise
 
     views = range(0, len(spool), max(1, len(spool) // 12))
     directions = np.stack([spool.view(index).camera.view_direction for index in range(len(spool))])
@@ -181,8 +181,8 @@ def _field(
     """The distance field, from depth maps or from the surfels' own samples."""
     import numpy as np
 
-    from gsbake.surface.imls import imls_field
-    from gsbake.surface.tsdf import SparseTsdf
+    from gsbake.meshing.imls import imls_field
+    from gsbake.meshing.tsdf import SparseTsdf
 
     field = SparseTsdf(lower, upper, resolution.cell, truncation, ball=BALL, solid=masks or support is not None, support=support)
     with ctx.part("survey"):
@@ -216,9 +216,9 @@ def _finish(
     support: Support | None,
 ) -> dict[str, Any]:
     """Clean, refine along the normals, fit to the masks, decimate, write."""
-    from gsbake.surface import clean
-    from gsbake.surface.ply import write_ply
-    from gsbake.surface.support import drop_surroundings
+    from gsbake.meshing import cleanup as clean
+    from gsbake.meshing.ply import write_ply
+    from gsbake.meshing.support_plane import drop_surroundings
 
     settings = ctx.settings.mesh
     vertices, faces = dense
@@ -276,7 +276,7 @@ def _follow(
     spool: ViewSpool, vertices: NDArray[np.float64], faces: NDArray[np.int32], reach: float, cell: float
 ) -> NDArray[np.float64]:
     """Move the dense vertices so that they agree with the normals that the views show."""
-    from gsbake.surface.normals import NormalGather, follow_normals
+    from gsbake.meshing.refinement.normals import NormalGather, follow_normals
 
     gather = NormalGather(vertices, tolerance=3 * cell)
     for index, view in enumerate(spool):
@@ -287,7 +287,7 @@ def _follow(
 
 def _polish(ctx: Context, posed: PosedPhotos, vertices: NDArray[np.float64], faces: NDArray[np.int32]) -> NDArray[np.float64]:
     """Vertices moved until the silhouettes meet the masks, where every photo has one."""
-    from gsbake.surface.silhouette import polish
+    from gsbake.meshing.refinement.silhouette import polish
 
     rounds = ctx.settings.mesh.silhouette_rounds
     if not rounds or not posed.has_masks:
@@ -316,10 +316,10 @@ def _agree(
     """Vertices moved until photos of textured places agree, where stereo confirmed depths; with figures for the manifest."""
     from functools import lru_cache
 
-    from gsbake.stereo.maps import read_depth
-    from gsbake.stereo.photos import Photo, load_photo
-    from gsbake.surface.photometric import agree
-    from gsbake.surface.photometric_measure import Capture
+    from gsbake.meshing.refinement.photometric import agree
+    from gsbake.meshing.refinement.photometric_measure import Capture
+    from gsbake.mvs.depth_maps import read_depth
+    from gsbake.mvs.pyramids import Photo, load_photo
 
     rounds, size, folder = ctx.settings.mesh.photometric_rounds, ctx.settings.stereo.max_size, ctx.inputs.get("stereo")
     files = [] if folder is None else [folder / "depth" / f"{camera.name}.npz" for camera in posed.cameras.cameras]

@@ -16,8 +16,8 @@ from gsbake.pipeline.skip import leave_out
 from gsbake.pipeline.stage import Context, Stage
 
 if TYPE_CHECKING:
-    from gsbake.capture.cameras import Camera
-    from gsbake.capture.normalise import Extent
+    from gsbake.capture.poses.normalisation import Extent
+    from gsbake.geometry.cameras import Camera
 
 #: Triangulation with given poses is a start for training, not a result: it may take this long, per photo and at least.
 _SECONDS_PER_PHOTO, _LEAST_SECONDS = 3.0, 120.0
@@ -32,8 +32,8 @@ _PNG_LEVEL = 1
 
 def run(ctx: Context) -> dict[str, Any]:
     """Solve or take the poses, undistort, normalise; see docs/architecture.md for the files."""
-    from gsbake.capture.cameras import CameraSet
-    from gsbake.capture.cloud import read_cloud, write_cloud
+    from gsbake.geometry.cameras import CameraSet
+    from gsbake.geometry.ply import read_cloud, write_cloud
 
     ingest = ctx.inputs["ingest"]
     entries: list[dict[str, Any]] = json.loads((ingest / "photos.json").read_text())["photos"]
@@ -70,7 +70,7 @@ def run(ctx: Context) -> dict[str, Any]:
 
 def _settle_poses(ctx: Context, ingest: Path, photos: int) -> bool:
     """Whether the given poses are used. Raises BadInputError when the profile counts on poses that were not given."""
-    from gsbake.capture.cameras import CameraSet
+    from gsbake.geometry.cameras import CameraSet
 
     known = ingest / "poses" / "cameras.json"
     if not known.exists() and ctx.settings.skip.poses == "always":
@@ -87,7 +87,7 @@ def _mend_masks(ctx: Context, masks: Sequence[tuple[Camera, Any]], cloud: Any) -
     import cv2
     import numpy as np
 
-    from gsbake.capture.mending import mend
+    from gsbake.capture.masks.completion import mend
 
     if cloud is None or any(mask is None for _, mask in masks):
         return
@@ -117,10 +117,10 @@ def _drop_spare(ctx: Context, entries: Sequence[dict[str, Any]], cameras: list[C
     """The cameras (unit frame) without the photos that add nothing, whose files go too, and the names of those."""
     import numpy as np
 
-    from gsbake.capture.cameras import CameraSet
-    from gsbake.capture.hull import visual_hull
-    from gsbake.capture.posed import PosedPhotos
-    from gsbake.capture.redundancy import spare_photos
+    from gsbake.capture.hull.visual_hull import visual_hull
+    from gsbake.capture.photos.redundancy import spare_photos
+    from gsbake.capture.posed_photos import PosedPhotos
+    from gsbake.geometry.cameras import CameraSet
 
     posed = PosedPhotos(ctx.out, CameraSet(tuple(cameras)))
 
@@ -175,7 +175,7 @@ def _job(ctx: Context, task: str, entries: Sequence[dict[str, Any]], ingest: Pat
 
 def _colmap(ctx: Context, job: dict[str, Any], out: Path, limit: float | None = None) -> dict[str, Any] | None:
     """Run COLMAP's process, timing its parts; None when it took longer than `limit`."""
-    from gsbake.capture.solve import Watch, run_job
+    from gsbake.capture.sfm.process import Watch, run_job
 
     Path(job["work"]).mkdir(parents=True, exist_ok=True)
     shutil.rmtree(out, ignore_errors=True)
@@ -198,7 +198,7 @@ def _colmap(ctx: Context, job: dict[str, Any], out: Path, limit: float | None = 
 
 def _solve(ctx: Context, entries: Sequence[dict[str, Any]], ingest: Path, out: Path) -> dict[str, Any]:
     """Structure from motion; raises BadInputError when too few photos register."""
-    from gsbake.capture.pairs import choose_matching
+    from gsbake.capture.sfm.pairs import choose_matching
 
     settings = ctx.settings.poses
     names = sorted(e["name"] for e in entries)
@@ -241,7 +241,7 @@ def _feature_masks(ctx: Context, entries: Sequence[dict[str, Any]], ingest: Path
     if wanted == "auto":
         if len(masked) < len(entries):
             return None
-        from gsbake.capture.turntable import standing_background
+        from gsbake.capture.sfm.static_background import standing_background
 
         still, evidence = standing_background([(ingest / e["file"], ingest / e["mask"]) for e in entries])
         ctx.decide("features", "inside the masks" if still else "in whole photos", evidence)
@@ -261,8 +261,8 @@ def _take_given(
     ctx: Context, entries: Sequence[dict[str, Any]], ingest: Path, out: Path
 ) -> tuple[dict[str, Any], list[Camera], Path]:
     """Results, cameras and point file of a capture whose poses are known."""
-    from gsbake.capture.cameras import CameraSet
-    from gsbake.capture.solve import SolveFailedError
+    from gsbake.capture.sfm.process import SolveFailedError
+    from gsbake.geometry.cameras import CameraSet
 
     cameras = list(CameraSet.load(ingest / "poses" / "cameras.json").cameras)
     if len(cameras) < 3:
@@ -291,7 +291,7 @@ def _take_given(
 
 def _given_lenses(cameras: Sequence[Camera]) -> list[dict[str, Any]]:
     """Photos grouped by their given intrinsics."""
-    from gsbake.capture.undistort import lens_key
+    from gsbake.capture.photos.undistortion import lens_key
 
     groups: dict[tuple[float, ...], list[Camera]] = {}
     for camera in cameras:
@@ -307,7 +307,7 @@ def _undistort(ctx: Context, ingest: Path, cameras: Sequence[Camera]) -> list[Ca
     import cv2
     import numpy as np
 
-    from gsbake.capture.undistort import lens_key, pinhole_of, remap_tables, resample
+    from gsbake.capture.photos.undistortion import lens_key, pinhole_of, remap_tables, resample
 
     groups: dict[tuple[float, ...], list[Camera]] = {}
     for camera in cameras:
@@ -348,8 +348,8 @@ def _small_masks(ctx: Context, cameras: Sequence[Camera]) -> list[tuple[Camera, 
     """Each photo's mask at the size that hulls are carved from, None where it has none, and its camera."""
     import cv2
 
-    from gsbake.capture.cameras import CameraSet
-    from gsbake.capture.posed import PosedPhotos
+    from gsbake.capture.posed_photos import PosedPhotos
+    from gsbake.geometry.cameras import CameraSet
 
     posed = PosedPhotos(ctx.out, CameraSet(tuple(cameras)))
     cv2.setNumThreads(ctx.threads)
@@ -358,7 +358,7 @@ def _small_masks(ctx: Context, cameras: Sequence[Camera]) -> list[tuple[Camera, 
 
 def _extent(ctx: Context, cameras: Sequence[Camera], masks: Sequence[tuple[Camera, Any]], points: Any) -> Extent:
     """The ball around the object: from the visual hull when at least half of the photos have masks, else from what the cameras look at."""
-    from gsbake.capture.normalise import extent_from_masks, extent_from_view
+    from gsbake.capture.poses.normalisation import extent_from_masks, extent_from_view
 
     masked = [(camera, mask) for camera, mask in masks if mask is not None]
     if len(masked) >= max(3, 0.5 * len(cameras)):

@@ -9,17 +9,17 @@ from gsbake.pipeline.stage import Context, Stage
 
 def run(ctx: Context) -> dict[str, Any]:
     """Prune, densify and fine-tune; writes the same files as train and reports the counts before and after."""
-    from gsbake.capture.posed import PosedPhotos
-    from gsbake.splat.refine import prune_and_densify
-    from gsbake.splat.session import Session
-    from gsbake.splat.surfels import Surfels
+    from gsbake.capture.posed_photos import PosedPhotos
+    from gsbake.surfels.densification.refinement import prune_and_densify
+    from gsbake.surfels.model import Surfels
+    from gsbake.surfels.training.session import Session
 
     settings = ctx.settings
     posed = PosedPhotos.open(ctx.inputs["poses"], ctx.inputs["train"])
     surfels = Surfels.load(ctx.inputs["train"] / "surfels.safetensors")
     light = None
     if (ctx.inputs["train"] / "light.safetensors").exists():
-        from gsbake.light.environment import EnvironmentLight
+        from gsbake.shading.environment import EnvironmentLight
 
         light = EnvironmentLight.load(ctx.inputs["train"] / "light.safetensors")
     with ctx.part("prune and densify"):

@@ -18,14 +18,14 @@ def run(ctx: Context) -> dict[str, Any]:
     import json
 
     from gsbake import __version__
-    from gsbake.capture.posed import PosedPhotos
+    from gsbake.capture.posed_photos import PosedPhotos
     from gsbake.report import compose, manifests
     from gsbake.report.asset import open_asset
     from gsbake.report.html import Page, render_page
     from gsbake.report.quality import asset_cameras, chosen_views
     from gsbake.report.render import Renderer, Shader, unlit
     from gsbake.report.sheets import map_panels
-    from gsbake.splat.views import held_out
+    from gsbake.surfels.training.views import held_out
 
     settings = ctx.settings.report
     said = manifests.load_manifests(ctx.inputs)

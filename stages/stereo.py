@@ -16,12 +16,12 @@ def run(ctx: Context) -> dict[str, Any]:
     """Write `points.ply`, `depth/<name>.npz` and, with masks, `hull.npz` and `thin.npz`; nothing when stereo is skipped."""
     import numpy as np
 
-    from gsbake.capture.hull import visual_hull
-    from gsbake.capture.posed import PosedPhotos
-    from gsbake.capture.thin import find_thin
-    from gsbake.stereo.ghosts import find_ghosts, without_ghosts
-    from gsbake.stereo.photos import one_thread
-    from gsbake.stereo.session import StereoRun
+    from gsbake.capture.hull.thin_parts import find_thin
+    from gsbake.capture.hull.visual_hull import visual_hull
+    from gsbake.capture.posed_photos import PosedPhotos
+    from gsbake.mvs.matching import StereoRun
+    from gsbake.mvs.outliers import find_ghosts, without_ghosts
+    from gsbake.mvs.pyramids import one_thread
 
     posed = PosedPhotos.open(ctx.inputs["poses"])
     settings = ctx.settings.stereo

@@ -11,11 +11,11 @@ from gsbake.pipeline.stage import Context, Stage
 def run(ctx: Context) -> dict[str, Any]:
     """Start surfels, train them, and write `surfels.safetensors`, `light.safetensors` (materials only) and `log.csv`; where poses or
     exposures were refined also `cameras.json` or `exposure.json`."""
-    from gsbake.capture.posed import PosedPhotos
-    from gsbake.splat.policies import growth
-    from gsbake.splat.session import Session
-    from gsbake.splat.settled import settled_share, settles, spared_steps
-    from gsbake.splat.start import begin
+    from gsbake.capture.posed_photos import PosedPhotos
+    from gsbake.surfels.densification.policies import growth
+    from gsbake.surfels.initialisation import begin
+    from gsbake.surfels.training.session import Session
+    from gsbake.surfels.training.step_budget import settled_share, settles, spared_steps
 
     settings = ctx.settings
     posed = PosedPhotos.open(ctx.inputs["poses"])
@@ -26,7 +26,7 @@ def run(ctx: Context) -> dict[str, Any]:
     ctx.decide("surfels multiply by", rule, reason)
     light = None
     if settings.splat.shading == "pbr":
-        from gsbake.light.environment import EnvironmentLight
+        from gsbake.shading.environment import EnvironmentLight
 
         light = EnvironmentLight(settings.splat.env_size)
     else:

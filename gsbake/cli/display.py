@@ -9,7 +9,7 @@ from typing import Any
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
-from gsbake.cli.wording import duration, figure, figures, size
+from gsbake.cli.formatting import duration, figure, figures, size
 from gsbake.pipeline.engine import Observer
 from gsbake.pipeline.lease import Holder
 from gsbake.pipeline.plan import StageState

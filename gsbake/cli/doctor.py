@@ -19,7 +19,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from gsbake.cli.wording import size
+from gsbake.cli.formatting import size
 from gsbake.pipeline.machine import cpu_name, cuda_devices, default_threads, resolve_device, torch_cuda_build, versions
 
 #: Library (as pip calls it) → module that is imported to see whether it works.

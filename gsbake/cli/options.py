@@ -20,21 +20,21 @@ class Device(StrEnum):
 
 def complete_profile(incomplete: str) -> list[str]:
     """Shell completion of profile names."""
-    from gsbake.profile.load import shipped
+    from gsbake.config.load import shipped
 
     return [name for name in shipped() if name.startswith(incomplete)]
 
 
 def complete_setting(incomplete: str) -> list[str]:
     """Shell completion of section.key=."""
-    from gsbake.profile.load import fields
+    from gsbake.config.load import fields
 
     return [f"{name}=" for name in fields() if "." in name and name.startswith(incomplete)]
 
 
 def complete_stage(incomplete: str) -> list[str]:
     """Shell completion of stage names."""
-    from stages import REGISTRY
+    from gsbake.stages import REGISTRY
 
     return [name for name in REGISTRY.names if name.startswith(incomplete)]
 

@@ -7,14 +7,14 @@ from pathlib import Path
 
 from gsbake.capture.sources import PHOTO_FOLDERS, discover, list_photos
 from gsbake.cli.options import Options
+from gsbake.config.load import DEFAULT, LoadedProfile, load_profile
 from gsbake.pipeline.digest import list_files
 from gsbake.pipeline.engine import Engine, Observer
 from gsbake.pipeline.errors import UsageError
 from gsbake.pipeline.machine import default_threads, resolve_device
 from gsbake.pipeline.plan import Request
 from gsbake.pipeline.project import Project
-from gsbake.profile.load import DEFAULT, LoadedProfile, load_profile
-from stages import REGISTRY
+from gsbake.stages import REGISTRY
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import typer
 
-from gsbake.cli.wording import duration
+from gsbake.cli.formatting import duration
 from gsbake.pipeline.errors import BadInputError
 from gsbake.pipeline.files import disk_error
 

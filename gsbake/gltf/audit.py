@@ -15,7 +15,7 @@ import numpy as np
 
 from gsbake.gltf.read import GltfAsset, parse_glb
 from gsbake.pipeline.errors import BadInputError
-from gsbake.texture.texels import overlapping
+from gsbake.texturing.texels import overlapping
 
 Severity = Literal["error", "warning", "info"]
 

@@ -13,9 +13,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gsbake.gltf.png import encode_png
 from gsbake.gltf.write import GltfImages
-from gsbake.texture.colour import encode_bytes
+from gsbake.imaging.png import encode_png
+from gsbake.imaging.srgb import encode_bytes
 
 Bytes = NDArray[np.uint8]
 

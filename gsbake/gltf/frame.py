@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gsbake.capture.cameras import CameraSet, Similarity
+from gsbake.geometry.cameras import CameraSet, Similarity
 
 #: World (Z-up) to glTF (Y-up).
 Y_UP = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])

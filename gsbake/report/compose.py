@@ -10,15 +10,15 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from gsbake.capture.cameras import Camera
-from gsbake.capture.posed import PosedPhotos
-from gsbake.light.environment import EnvironmentLight
+from gsbake.capture.posed_photos import PosedPhotos
+from gsbake.geometry.cameras import Camera
 from gsbake.report.charts import duration, size
 from gsbake.report.html import Comparison, Figure, Light, Panel, hdr_base64, picture_uri
 from gsbake.report.lights import PROCEDURAL, LitShader, procedural
 from gsbake.report.manifests import Manifests, peak, total_seconds
 from gsbake.report.quality import Likeness, compare
 from gsbake.report.render import Asset, Renderer, Shader, unlit
+from gsbake.shading.environment import EnvironmentLight
 
 Array = NDArray[np.float64]
 

@@ -12,9 +12,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from gsbake.light.environment import EnvironmentLight
-from gsbake.light.shade import shade
 from gsbake.report.render import Floats, Samples
+from gsbake.shading.environment import EnvironmentLight
+from gsbake.shading.split_sum import shade
 
 Array = NDArray[np.float64]
 

@@ -11,9 +11,9 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from gsbake.config.schema import Skip
 from gsbake.pipeline.errors import BadInputError
 from gsbake.pipeline.skip import PREFIX
-from gsbake.profile.schema import Skip
 from gsbake.report.charts import Bar, Curve, bars, duration, lines, size
 from gsbake.report.html import Check, Decision, LeftOut, StageRow, Warned
 

@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 from skimage.metrics import structural_similarity
 
-from gsbake.capture.cameras import Camera
-from gsbake.capture.posed import View
+from gsbake.capture.posed_photos import View
+from gsbake.geometry.cameras import Camera
 from gsbake.pipeline.errors import BadInputError
 from gsbake.report.render import Floats, Picture
 

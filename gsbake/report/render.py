@@ -17,8 +17,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gsbake.capture.cameras import Camera
-from gsbake.surface.raycast import RayCaster
+from gsbake.geometry.cameras import Camera
+from gsbake.geometry.raycast import RayCaster
 
 Floats = NDArray[np.float32]
 

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gsbake.capture.cameras import Camera, CameraSet
+from gsbake.geometry.cameras import Camera, CameraSet
 from gsbake.pipeline.errors import UsageError
 from gsbake.synth import scene
 from gsbake.synth.shade import Rig, render, studio

@@ -11,11 +11,11 @@ from PIL import Image
 
 from benchmarks.maps import _least_error, _true_values
 from benchmarks.materials import STEPS, Row, main, markdown, score, thinned, write
-from gsbake.gltf.png import encode_png
+from gsbake.config.load import load_profile
 from gsbake.gltf.write import GltfImages, GltfMesh, build_glb
+from gsbake.imaging.png import encode_png
+from gsbake.imaging.srgb import decode
 from gsbake.pipeline.errors import UsageError
-from gsbake.profile.load import load_profile
-from gsbake.texture.colour import decode
 
 
 def square() -> GltfMesh:

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from gsbake.capture.sources import discover
-from gsbake.profile.schema import Profile
+from gsbake.config.schema import Profile
 
 CAPTURES = Path(os.environ.get("GSBAKE_CAPTURES", Path(__file__).resolve().parents[3] / "shared" / "captures"))
 
@@ -64,7 +64,7 @@ class Runner:
     def ingest(
         self, photos: Path, masks: Path | None = None, poses: Path | None = None, skip: Mapping[str, str] | None = None, **settings: Any
     ) -> tuple[dict[str, Any], FakeContext]:
-        from stages.ingest import run
+        from gsbake.stages.ingest import run
 
         found = discover(photos, masks, poses)
         inputs = {k: v for k, v in {"photos": found.photos, "masks": found.masks, "poses": found.poses}.items() if v is not None}
@@ -72,7 +72,7 @@ class Runner:
         return run(ctx), ctx
 
     def poses(self, skip: Mapping[str, str] | None = None, **settings: Any) -> tuple[dict[str, Any], FakeContext]:
-        from stages.poses import run
+        from gsbake.stages.poses import run
 
         profile = Profile.model_validate({"poses": settings, "skip": skip or {}})
         ctx = FakeContext(self.root / "poses", {"ingest": self.root / "ingest"}, profile, self.root / "c2")

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from gsbake.capture.cameras import CameraSet
-from gsbake.capture.quality import blur_effect, blurred, near_duplicates
+from gsbake.capture.photos.quality import blur_effect, blurred, near_duplicates
+from gsbake.geometry.cameras import CameraSet
 from gsbake.pipeline.errors import BadInputError
 from tests.capture.conftest import Runner, picture
 

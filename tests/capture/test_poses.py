@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from gsbake.capture.cameras import Camera, CameraSet
-from gsbake.capture.cloud import write_cloud
-from gsbake.capture.posed import PosedPhotos
-from gsbake.capture.solve import Watch, run_job
+from gsbake.capture.posed_photos import PosedPhotos
+from gsbake.capture.sfm.process import Watch, run_job
+from gsbake.geometry.cameras import Camera, CameraSet
+from gsbake.geometry.ply import write_cloud
 from gsbake.pipeline.errors import BadInputError, InterruptedRun
 from tests.capture.conftest import FakeContext, Runner
 
@@ -183,7 +183,7 @@ def test_a_stopped_stage_says_so(tmp_path: Path, runner: Runner, monkeypatch: py
 
 def test_masks_centre_the_object(tmp_path: Path, runner: Runner) -> None:
     """RGBA photos of a ball: the unit sphere's inner nine tenths hold just the ball."""
-    from tests.capture.test_hull import CENTRE, RADIUS, ball_mask, ring
+    from tests.capture.hull.test_visual_hull import CENTRE, RADIUS, ball_mask, ring
 
     (tmp_path / "images").mkdir()
     cameras = ring(16)
@@ -200,7 +200,7 @@ def test_masks_centre_the_object(tmp_path: Path, runner: Runner) -> None:
 
 def test_a_mask_that_lacks_a_part_is_mended(tmp_path: Path, runner: Runner) -> None:
     """A ball with given poses and points; in one photo the mask misses a disc in its middle."""
-    from tests.capture.test_hull import CENTRE, RADIUS, ball_mask, ring
+    from tests.capture.hull.test_visual_hull import CENTRE, RADIUS, ball_mask, ring
 
     (tmp_path / "images").mkdir()
     cameras = ring(16)

@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from gsbake.capture.cameras import Camera, CameraSet
-from gsbake.capture.posed import PosedPhotos
-from gsbake.capture.redundancy import ENOUGH, LEAST_PHOTOS, Coverage, covered_by_others, saved_twice, spare_photos
-from gsbake.capture.sharpness import LOSSLESS, finer_than_sharp, loss_at_half
-from gsbake.capture.steadiness import Changes, Sightings, exposures, looks_diffuse
+from gsbake.capture.photos.redundancy import ENOUGH, LEAST_PHOTOS, Coverage, covered_by_others, saved_twice, spare_photos
+from gsbake.capture.photos.sharpness import LOSSLESS, finer_than_sharp, loss_at_half
+from gsbake.capture.posed_photos import PosedPhotos
+from gsbake.capture.view_dependence import Changes, Sightings, exposures, looks_diffuse
+from gsbake.geometry.cameras import Camera, CameraSet
 from gsbake.pipeline.errors import BadInputError
 from tests.capture.conftest import Runner
 from tests.capture.test_poses import board_capture, transforms

@@ -216,7 +216,7 @@ def test_help_imports_nothing_heavy() -> None:
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert "report" in done.stdout
     loaded = set(done.stdout.split("LOADED")[1].split())
-    assert loaded.isdisjoint({"torch", "numba", "cv2", "numpy", "scipy", "trimesh", "pydantic", "rich.progress", "stages.train"})
+    assert loaded.isdisjoint({"torch", "numba", "cv2", "numpy", "scipy", "trimesh", "pydantic", "rich.progress", "gsbake.stages.train"})
 
 
 def test_completion_knows_stages_profiles_and_settings(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 import typer
 
-from gsbake.cli import doctor, wording
+from gsbake.cli import doctor
+from gsbake.cli import formatting as wording
 
 
 def test_advice_names_the_debian_package() -> None:

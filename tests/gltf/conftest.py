@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import trimesh
 
-from gsbake.gltf.png import encode_png
-from gsbake.gltf.tangents import tangents
+from gsbake.geometry.tangents import tangents
 from gsbake.gltf.write import GltfImages, GltfMesh, build_glb
-from gsbake.texture.atlas import make_atlas
+from gsbake.imaging.png import encode_png
+from gsbake.texturing.atlas import make_atlas
 
 EXTRAS = {"scale": "unknown"}
 

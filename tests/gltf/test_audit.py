@@ -14,8 +14,8 @@ from PIL.PngImagePlugin import PngInfo
 
 from gsbake.gltf.audit import audit, failed
 from gsbake.gltf.container import pack_glb, unpack_glb
-from gsbake.gltf.png import encode_png
 from gsbake.gltf.write import GltfImages, GltfMesh, build_glb
+from gsbake.imaging.png import encode_png
 
 EXTRAS = {"scale": "unknown"}
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gsbake.capture.cameras import Camera, CameraSet, Similarity
+from gsbake.geometry.cameras import Camera, CameraSet, Similarity
 from gsbake.gltf.frame import asset_frame, transforms_json
 
 

@@ -17,19 +17,19 @@ import trimesh
 from safetensors.numpy import load_file
 from scipy.spatial import cKDTree
 
-from gsbake.capture.cameras import Camera, CameraSet, Similarity
+from gsbake.config.schema import Bake, Export, Profile, Splat, Train
+from gsbake.geometry.cameras import Camera, CameraSet, Similarity
+from gsbake.geometry.tangents import frame_to_world
 from gsbake.gltf.read import GltfAsset, read_glb
-from gsbake.gltf.tangents import frame_to_world
-from gsbake.light.environment import EnvironmentLight
+from gsbake.imaging.exr import read_exr, write_exr
+from gsbake.imaging.srgb import LINEAR, encode_bytes
+from gsbake.meshing.ply import write_ply
 from gsbake.pipeline.errors import BadInputError
 from gsbake.pipeline.settings import SettingsView
 from gsbake.pipeline.stage import Stage
-from gsbake.profile.schema import Bake, Export, Profile, Splat, Train
-from gsbake.surface.ply import write_ply
-from gsbake.texture.colour import LINEAR, encode_bytes
-from gsbake.texture.masters import read_exr, write_exr
-from gsbake.texture.texels import rasterise
-from stages import bake, export
+from gsbake.shading.environment import EnvironmentLight
+from gsbake.stages import bake, export
+from gsbake.texturing.texels import rasterise
 
 SIZE, RADIUS, PHOTO = 256, 0.9, 240
 #: Unit frame to world: half a metre of the object is one unit, turned and moved.
@@ -276,7 +276,7 @@ class Painted:
 
 
 def test_materials_and_light_of_a_relightable_asset(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("gsbake.splat.render.SurfelRenderer", Painted)
+    monkeypatch.setattr("gsbake.surfels.raster.render.SurfelRenderer", Painted)
     folder = tmp_path / "run"
     folder.mkdir()
     for name in ("ingest", "poses", "mesh"):

@@ -12,9 +12,9 @@ from PIL import Image
 
 from gsbake.gltf.audit import audit, failed
 from gsbake.gltf.container import pack_glb, unpack_glb
-from gsbake.gltf.png import encode_png
 from gsbake.gltf.read import parse_glb
 from gsbake.gltf.write import GltfImages, GltfMesh, build_glb
+from gsbake.imaging.png import encode_png
 from gsbake.pipeline.errors import BadInputError
 from gsbake.report.asset import from_gltf
 from tests.support.node import gltf_issues

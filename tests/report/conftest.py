@@ -14,9 +14,9 @@ import cv2
 import numpy as np
 import pytest
 
-from gsbake.capture.cameras import Camera, CameraSet, Similarity
+from gsbake.geometry.cameras import Camera, CameraSet, Similarity
 from gsbake.gltf.write import GltfImages, GltfMesh, build_glb
-from gsbake.light.environment import EnvironmentLight
+from gsbake.shading.environment import EnvironmentLight
 from tests.report.shapes import ball
 
 #: World (Z-up) to glTF (+Y up), by the contract of the export.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gsbake.capture.cameras import Camera
+from gsbake.geometry.cameras import Camera
 from gsbake.report.render import Asset
 
 

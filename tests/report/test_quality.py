@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gsbake.capture.cameras import Camera
-from gsbake.capture.posed import View
+from gsbake.capture.posed_photos import View
+from gsbake.geometry.cameras import Camera
 from gsbake.pipeline.errors import BadInputError
 from gsbake.report.quality import GREY, MAX_PSNR, asset_cameras, chosen_views, compare, psnr, ssim
 from gsbake.report.render import Picture, decode_srgb

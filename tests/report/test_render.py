@@ -7,10 +7,10 @@ import math
 import numpy as np
 import pytest
 
-from gsbake.capture.cameras import Camera
-from gsbake.light.environment import EnvironmentLight
+from gsbake.geometry.cameras import Camera
 from gsbake.report.lights import PROCEDURAL, LitShader, procedural
 from gsbake.report.render import Asset, Renderer, bilinear, decode_srgb, encode_srgb, unlit
+from gsbake.shading.environment import EnvironmentLight
 from tests.report.shapes import ball, front_camera, quad
 
 

@@ -10,18 +10,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gsbake.capture.posed import PosedPhotos
+from gsbake.capture.posed_photos import PosedPhotos
+from gsbake.config.schema import Skip
 from gsbake.gltf.read import read_glb
-from gsbake.light.environment import EnvironmentLight
 from gsbake.pipeline.errors import BadInputError
-from gsbake.profile.schema import Skip
 from gsbake.report import compose, manifests
 from gsbake.report.asset import open_asset
 from gsbake.report.lights import LitShader
 from gsbake.report.quality import asset_cameras
 from gsbake.report.render import Renderer
 from gsbake.report.sheets import chart_of_faces, uv_sheet
-from stages.report import STAGE
+from gsbake.shading.environment import EnvironmentLight
+from gsbake.stages.report import STAGE
 from tests.report.conftest import FakeContext
 from tests.report.shapes import ball, quad
 

@@ -16,8 +16,8 @@ import pytest
 import trimesh
 from scipy.spatial import cKDTree
 
+from gsbake.config.schema import Skip
 from gsbake.gltf.read import read_glb
-from gsbake.profile.schema import Skip
 
 #: glTF (+Y up) to the capture's Z-up world.
 TO_WORLD = np.array([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])

@@ -9,9 +9,9 @@ import torch
 from hypothesis import strategies as st
 from torch import Tensor
 
-from gsbake.splat.projection import Pinhole
-from gsbake.splat.raster import Rendered, render
-from gsbake.splat.transfer import TRANSFERS, Transfer
+from gsbake.surfels.raster.projection import Pinhole
+from gsbake.surfels.raster.rasterise import Rendered, render
+from gsbake.surfels.transfer import TRANSFERS, Transfer
 
 SPECIAL_SDF = (0.0, 1e-30, 1e-3, 1.0, 1e6, -1e6)
 

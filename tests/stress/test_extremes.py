@@ -6,7 +6,7 @@ import pytest
 import torch
 from hypothesis import HealthCheck, given, settings
 
-from gsbake.splat.finite import broken
+from gsbake.surfels.training.finite import broken
 from tests.stress.scenes import Scene, build, scenes
 
 

@@ -10,15 +10,15 @@ import psutil
 import pytest
 import torch
 
-from gsbake.light.environment import EnvironmentLight
-from gsbake.profile.schema import Profile
-from gsbake.splat import threads
-from gsbake.splat.finite import broken
-from gsbake.splat.projection import Pinhole
-from gsbake.splat.start import fibonacci_sphere, spacing
-from gsbake.splat.surfels import create
-from gsbake.splat.trainer import Plan, Trainer
-from gsbake.splat.views import TrainView
+from gsbake.config.schema import Profile
+from gsbake.shading.environment import EnvironmentLight
+from gsbake.surfels.initialisation import fibonacci_sphere, spacing
+from gsbake.surfels.model import create
+from gsbake.surfels.raster import threads
+from gsbake.surfels.raster.projection import Pinhole
+from gsbake.surfels.training.finite import broken
+from gsbake.surfels.training.trainer import Plan, Trainer
+from gsbake.surfels.training.views import TrainView
 
 SIZE = 24
 STEPS = int(os.environ.get("GSBAKE_SOAK_STEPS", "20000"))

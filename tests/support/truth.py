@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.truth import measure_file
-from gsbake.capture.cameras import Camera
+from gsbake.geometry.cameras import Camera
 from gsbake.report.asset import open_asset
 from gsbake.report.render import Asset, Renderer, Samples, bilinear, encode_srgb
 from gsbake.synth import scene

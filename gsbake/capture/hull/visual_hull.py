@@ -1,0 +1,245 @@
+"""The visual hull of a masked object, as a signed distance on a grid.
+
+Laurentini, *The visual hull concept* (PAMI 1994): what no silhouette excludes. Instead of a yes or no per voxel each view gives a
+signed distance (pixels from the silhouette's edge, times depth over focal length), and the hull's value is the largest of them:
+surfaces come out at a fraction of a cell with smooth normals. Two allowances for real captures: a point outside a photo's frame is
+*unknown* to that photo, not empty (an object cut off at the edge stays whole), and a few views may disagree, since masks have holes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numba as nb
+import numpy as np
+from numpy.typing import NDArray
+
+from gsbake.capture.photos.decode import Bytes
+from gsbake.geometry.cameras import Array, Camera
+from gsbake.imaging.distance import distance_to_zero
+
+if TYPE_CHECKING:
+    from gsbake.capture.posed_photos import PosedPhotos
+
+Floats = NDArray[np.float32]
+
+#: Views that may call a point empty although it belongs to the object: this share of those that see it, rounded.
+WRONG_VIEWS = 0.03
+#: A point that fewer views than this share (and fewer than 2) see is not taken for object: nothing is known of it.
+SEEN_SHARE = 0.25
+#: At most this many votes are kept per point, which bounds how many views may be wrong.
+_KEEP = 8
+#: Cells from the surface beyond which the distance outside need only be a lower bound.
+_BAND = 6.0
+
+
+@nb.njit(parallel=True, error_model="numpy", cache=True)
+def _carve(
+    distance: Floats, starts: NDArray[np.int64], sizes: NDArray[np.int64], lens: Array, poses: Array, lower: Array, cell: float, n: int,
+    wrong_share: float, least_seen: int,
+) -> Floats:  # fmt: skip
+    """Signed distance (n, n, n) at cell centres; negative inside.
+
+    distance: concatenated signed pixel distances (positive outside) of all views; starts (v,), sizes (v, 2) as h, w;
+    lens (v, 4) fx, fy, cx, cy; poses (v, 3, 4) world→camera.
+    """
+    views = starts.shape[0]
+    most_wrong = min(int(wrong_share * views + 0.5), _KEEP - 1)
+    far = _BAND * cell
+    out = np.empty((n, n, n), np.float32)
+    for i in nb.prange(n):
+        worst = np.empty(_KEEP, np.float64)
+        x = lower[0] + (i + 0.5) * cell
+        for j in range(n):
+            y = lower[1] + (j + 0.5) * cell
+            for k in range(n):
+                z = lower[2] + (k + 0.5) * cell
+                seen = 0
+                worst[:] = -1e30
+                for v in range(views):
+                    p = poses[v]
+                    depth = p[2, 0] * x + p[2, 1] * y + p[2, 2] * z + p[2, 3]
+                    if depth <= 1e-9:
+                        continue
+                    u = lens[v, 0] * (p[0, 0] * x + p[0, 1] * y + p[0, 2] * z + p[0, 3]) / depth + lens[v, 2] - 0.5
+                    w = lens[v, 1] * (p[1, 0] * x + p[1, 1] * y + p[1, 2] * z + p[1, 3]) / depth + lens[v, 3] - 0.5
+                    height, width = sizes[v, 0], sizes[v, 1]
+                    if not (u >= 0 and w >= 0 and u < width - 1 and w < height - 1):
+                        continue
+                    iu, iw = int(u), int(w)
+                    fu, fw = u - iu, w - iw
+                    base = starts[v] + iw * width + iu
+                    top = distance[base] * (1 - fu) + distance[base + 1] * fu
+                    bottom = distance[base + width] * (1 - fu) + distance[base + width + 1] * fu
+                    value = (top * (1 - fw) + bottom * fw) * depth / (0.5 * (lens[v, 0] + lens[v, 1]))
+                    seen += 1
+                    if value > worst[_KEEP - 1]:
+                        slot = _KEEP - 1
+                        while slot > 0 and worst[slot - 1] < value:
+                            worst[slot] = worst[slot - 1]
+                            slot -= 1
+                        worst[slot] = value
+                        if worst[most_wrong] > far:  # no later view can bring it back
+                            break
+                if worst[most_wrong] > far:
+                    out[i, j, k] = worst[most_wrong]
+                elif seen < least_seen:
+                    out[i, j, k] = cell
+                else:
+                    allowed = min(int(wrong_share * seen + 0.5), _KEEP - 1, seen - 1)
+                    out[i, j, k] = worst[allowed]
+    return out
+
+
+def silhouette_distance(mask: Bytes) -> Floats:
+    """Signed distance in pixels from the edge of a mask (h, w), positive outside; the frame's edge is no silhouette.
+
+    A mask without an edge is ± its diagonal everywhere.
+    """
+    inside = (mask > 127).astype(np.uint8)
+    if inside.all() or not inside.any():
+        far = float(np.hypot(*mask.shape))
+        return np.full(mask.shape, -far if inside.all() else far, np.float32)
+    outer, inner = distance_to_zero(1 - inside), distance_to_zero(inside)
+    # Distances run between pixel centres, the edge lies half a pixel before them.
+    return np.where(inside > 0, 0.5 - inner, outer - 0.5).astype(np.float32)
+
+
+def carve(
+    cameras: Sequence[Camera], masks: Sequence[Bytes], centre: Array, radius: float, resolution: int, wrong_views: float = WRONG_VIEWS
+) -> Floats:
+    """Signed distance (n, n, n) of the hull on the cube of half edge `radius` around `centre` (3,), negative inside; axes x, y, z.
+
+    `cameras` are pinholes of the masks' sizes; n = `resolution`. Where too few views look, the value is one cell (outside).
+    The occupancy is `carve(...) < 0`.
+    """
+    fields = [silhouette_distance(m) for m in masks]
+    sizes = np.array([f.shape for f in fields], np.int64).reshape(-1, 2)
+    starts = np.concatenate([[0], np.cumsum(sizes.prod(1))[:-1]]).astype(np.int64)
+    lens = np.array([(c.fx, c.fy, c.cx, c.cy) for c in cameras], float).reshape(-1, 4)
+    poses = np.array([np.concatenate([c.R, c.t[:, None]], 1) for c in cameras], float).reshape(-1, 3, 4)
+    # Views in an order that jumps around the object: what is empty is found so after a few.
+    order = np.argsort(np.arange(len(fields)) * 0.6180339887498949 % 1.0)
+    cell = 2.0 * radius / resolution
+    least = max(2, int(np.ceil(SEEN_SHARE * len(fields))))
+    flat = np.concatenate([f.ravel() for f in fields])
+    return _carve(flat, starts[order], sizes[order], lens[order], poses[order], np.asarray(centre, float) - radius, cell, resolution,
+    wrong_views, least)
+
+
+def _largest_parts(inside: NDArray[np.bool_], share: float = 0.05) -> NDArray[np.bool_]:
+    """Drop loose pieces smaller than `share` of the largest (left where silhouettes cross in empty space)."""
+    from scipy import ndimage
+
+    labels, count = ndimage.label(inside, structure=np.ones((3, 3, 3)))
+    if count < 2:
+        return inside
+    volume = np.bincount(labels.ravel())
+    volume[0] = 0
+    return np.asarray((volume >= share * volume.max())[labels] & inside)
+
+
+@dataclass(frozen=True)
+class Hull:
+    """A visual hull: `occupancy` (n, n, n) with axes x, y, z; cell (i, j, k) has its centre at `lower` + (i+.5, j+.5, k+.5)·`cell`.
+
+    `field` (n, n, n) is the signed distance at the cell centres, negative inside.
+    """
+
+    occupancy: NDArray[np.bool_]
+    lower: Array
+    cell: float
+    field: Floats
+
+    @staticmethod
+    def of(
+        cameras: Sequence[Camera], masks: Sequence[Bytes], centre: Array, radius: float, resolution: int, wrong_views: float = WRONG_VIEWS
+    ) -> Hull:
+        """Carve the cube of half edge `radius` around `centre`."""
+        field = carve(cameras, masks, centre, radius, resolution, wrong_views)
+        cell = 2.0 * radius / resolution
+        inside = field < 0
+        kept = _largest_parts(inside)
+        field[inside & ~kept] = cell
+        return Hull(kept, np.asarray(centre, float) - radius, cell, field)
+
+    def save(self, path: Path) -> None:
+        """Write as a NumPy archive, the distances in half precision."""
+        np.savez_compressed(path, field=self.field.astype(np.float16), lower=self.lower, cell=self.cell)
+
+    @staticmethod
+    def load(path: Path) -> Hull:
+        """Read what `save` wrote."""
+        with np.load(path) as body:
+            field = body["field"].astype(np.float32)
+            return Hull(field < 0, body["lower"], float(body["cell"]), field)
+
+    @property
+    def empty(self) -> bool:
+        """Whether no cell is left."""
+        return not bool(self.occupancy.any())
+
+    def _sample(self, points: Array) -> Array:
+        from scipy import ndimage
+
+        index = (np.asarray(points, float) - self.lower) / self.cell - 0.5
+        return np.asarray(ndimage.map_coordinates(self.field, index.reshape(-1, 3).T, order=1, mode="nearest"), float)
+
+    def signed_distance(self, points: Array) -> Array:
+        """Signed distance (k,) of points (k, 3), negative inside, trilinear between cells.
+
+        A lower bound outside; beyond the grid the distance to the grid is added.
+        """
+        pts = np.asarray(points, float).reshape(-1, 3)
+        upper = self.lower + self.cell * np.array(self.field.shape)
+        beyond = np.linalg.norm(pts - np.clip(pts, self.lower, upper), axis=1)
+        return np.asarray(self._sample(pts) + beyond)
+
+    def gradient(self, points: Array) -> Array:
+        """Outward unit normals (k, 3) of the field at points (k, 3), central differences over one cell."""
+        pts = np.asarray(points, float).reshape(-1, 3)
+        steps = np.eye(3) * self.cell
+        out = np.stack([self._sample(pts + s) - self._sample(pts - s) for s in steps], 1)
+        length = np.linalg.norm(out, axis=1, keepdims=True)
+        return np.where(length > 1e-12, out / np.maximum(length, 1e-12), [0.0, 0.0, 1.0])
+
+    def surface_points(self, count: int, seed: int) -> tuple[Array, Array]:
+        """`count` points (k, 3) spread evenly by area over the hull's surface, and outward unit normals (k, 3).
+
+        Raises ValueError for an empty hull.
+        """
+        if self.empty:
+            raise ValueError("the visual hull is empty")
+        from skimage.measure import marching_cubes
+
+        solid = np.pad(np.clip(self.field, -4 * self.cell, 4 * self.cell), 1, constant_values=self.cell)  # closed at the grid's edge
+        verts, faces, _, _ = marching_cubes(solid, 0.0)
+        corners = (verts[faces].astype(float) - 0.5) * self.cell + self.lower
+        cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        area = np.linalg.norm(cross, axis=1)
+        rng = np.random.default_rng(seed)
+        # Stratified along the cumulated area: evener than independent draws.
+        total = np.cumsum(area)
+        face = np.searchsorted(total, (np.arange(count) + rng.random(count)) / count * total[-1]).clip(0, len(area) - 1)
+        a, b = np.sqrt(rng.random(count)), rng.random(count)
+        weights = np.stack([1 - a, a * (1 - b), a * b], 1)
+        points = np.einsum("kc,kcd->kd", weights, corners[face])
+        return points, self.gradient(points)
+
+
+def visual_hull(posed: PosedPhotos, resolution: int = 128, max_size: int = 512) -> Hull:
+    """The hull of a masked capture in the unit frame, on the cube [-1, 1]³. Masks are read at `max_size`.
+
+    Raises ValueError when a photo has no mask.
+    """
+    cameras, masks = [], []
+    for index in range(len(posed)):
+        camera, mask = posed.mask(index, max_size)
+        if mask is None:
+            raise ValueError(f"photo {camera.name} has no mask")
+        cameras.append(camera)
+        masks.append(mask)
+    return Hull.of(cameras, masks, np.zeros(3), 1.0, resolution)

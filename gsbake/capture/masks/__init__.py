@@ -1,0 +1,1 @@
+"""Masks of the object: which belongs to which photo, and completing them."""

@@ -1,0 +1,194 @@
+"""Profiles: TOML files that extend one another, `--set section.key=value` on top, and errors that name the nearest valid key.
+
+extends = "preview"          # a shipped profile, or a path relative to this file
+
+[train]
+iterations = 5000
+"""
+
+from __future__ import annotations
+
+import difflib
+import tomllib
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from importlib import resources
+from pathlib import Path
+from typing import Any, get_args
+
+from pydantic import BaseModel, ValidationError
+from pydantic.fields import FieldInfo
+
+from gsbake.config.schema import Profile
+from gsbake.pipeline.errors import BadInputError, UsageError
+
+#: What `--profile` means when it is not given.
+DEFAULT = "relight"
+
+
+@dataclass(frozen=True)
+class LoadedProfile:
+    """A validated profile; `origins` says for each "section.key" where its value comes from ("default", a file's name, "--set")."""
+
+    name: str
+    profile: Profile
+    origins: Mapping[str, str]
+
+
+def shipped() -> dict[str, Path]:
+    """{name: file} of the profiles that come with gsbake, in alphabetical order."""
+    folder = Path(str(resources.files("gsbake.profiles")))
+    return {path.stem: path for path in sorted(folder.glob("*.toml"))}
+
+
+def load_profile(name: str = DEFAULT, overrides: Sequence[str] = ()) -> LoadedProfile:
+    """The profile called `name` (shipped, or a TOML file) with `overrides` ("section.key=value") applied.
+
+    Raises UsageError for a profile that does not exist or an override without '=', BadInputError for an unknown key or a bad
+    value, naming file, key and what would be right.
+    """
+    values: dict[str, Any] = {}
+    origins: dict[str, str] = {}
+    for path in reversed(_chain(_find(name, None))):
+        for key, value in _read(path).items():
+            values[key] = value
+            origins[key] = path.stem if path.parent == _shipped_folder() else str(path)
+    for text in overrides:
+        key, value = _parse_override(text)
+        _check_key(key, "--set")
+        values[key] = value
+        origins[key] = "--set"
+    return LoadedProfile(name, _validate(values, origins), {key: origins.get(key, "default") for key in fields()})
+
+
+def fields() -> dict[str, FieldInfo]:
+    """{"section.key": field} of every setting, and "description"."""
+    out: dict[str, FieldInfo] = {}
+    for name, info in Profile.model_fields.items():
+        section = info.annotation
+        if isinstance(section, type) and issubclass(section, BaseModel):
+            out.update({f"{name}.{key}": field for key, field in section.model_fields.items()})
+        else:
+            out[name] = info
+    return out
+
+
+def bounds(field: FieldInfo) -> str:
+    """The allowed values of a field in words: "≥ 0", "one of auto, points", or ""."""
+    choices = get_args(field.annotation)
+    if choices and not any(isinstance(c, type) for c in choices):
+        return "one of " + ", ".join(str(c) for c in choices)
+    signs = {"ge": "≥", "gt": ">", "le": "≤", "lt": "<"}
+    return ", ".join(f"{sign} {getattr(m, name)}" for m in field.metadata for name, sign in signs.items() if hasattr(m, name))
+
+
+def _shipped_folder() -> Path:
+    return next(iter(shipped().values())).parent
+
+
+def _find(name: str, relative_to: Path | None) -> Path:
+    """The file a profile name or path stands for; a name in `extends` may be a path relative to its file."""
+    known = shipped()
+    if name in known:
+        return known[name]
+    path = Path(name) if relative_to is None else relative_to.parent / name
+    for candidate in (path, path.with_name(f"{path.name}.toml")):
+        if candidate.is_file():
+            return candidate
+    near = difflib.get_close_matches(name, known, 1)
+    hint = f"did you mean '{near[0]}'?" if near else f"there are {', '.join(known)}, or give a TOML file."
+    if relative_to is None:
+        raise UsageError(f"There is no profile '{name}': {hint}")
+    raise BadInputError(f'{relative_to}: extends = "{name}" names no profile: {hint}')
+
+
+def _chain(path: Path) -> list[Path]:
+    """The file and those it extends, the most basic last."""
+    chain: list[Path] = []
+    while True:
+        if path.resolve() in [p.resolve() for p in chain]:
+            raise BadInputError(f"{chain[-1]}: 'extends' goes round in a circle through {path.name}.")
+        chain.append(path)
+        parent = _toml(path).get("extends")
+        if parent is None:
+            return chain
+        if not isinstance(parent, str):
+            raise BadInputError(f"{path}: 'extends' must be the name of a profile in quotes, not {parent!r}.")
+        path = _find(parent, path)
+
+
+def _toml(path: Path) -> dict[str, Any]:
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise BadInputError(f"{path} is not valid TOML: {error}.") from error
+    except OSError as error:
+        raise BadInputError(f"{path} cannot be read: {error.strerror}.") from error
+
+
+def _read(path: Path) -> dict[str, Any]:
+    """{"section.key": value} of one file, keys checked."""
+    out: dict[str, Any] = {}
+    for name, value in _toml(path).items():
+        if name == "extends":
+            continue
+        if not isinstance(value, dict):
+            _check_key(name, str(path))
+            out[name] = value
+            continue
+        for key, inner in value.items():
+            _check_key(f"{name}.{key}", str(path))
+            out[f"{name}.{key}"] = inner
+    return out
+
+
+def _check_key(key: str, where: str) -> None:
+    known = fields()
+    if key not in known:
+        raise BadInputError(f"{where}: there is no setting '{key}'; {_nearest(key, known)}.")
+
+
+def _nearest(key: str, known: Iterable[str]) -> str:
+    """The most similar key; one with the same last part comes first, for a setting put into the wrong section."""
+    last = key.rsplit(".", 1)[-1]
+    nearest = max((k for k in known if "." in k), key=lambda k: (k.split(".")[1] == last, difflib.SequenceMatcher(None, key, k).ratio()))
+    return f"the nearest is '{nearest}'"
+
+
+def _parse_override(text: str) -> tuple[str, Any]:
+    key, equals, raw = text.partition("=")
+    key, raw = key.strip(), raw.strip()
+    if not equals or not key:
+        raise UsageError(f"--set takes section.key=value, not '{text}'.")
+    field = fields().get(key)
+    if field is not None and field.annotation is str:
+        return key, raw
+    try:
+        return key, tomllib.loads(f"value = {raw}")["value"]
+    except tomllib.TOMLDecodeError:
+        return key, raw  # a bare word, as in --set mesh.holes=leave
+
+
+def _validate(values: Mapping[str, Any], origins: Mapping[str, str]) -> Profile:
+    body: dict[str, Any] = {}
+    for key, value in values.items():
+        section, dot, name = key.partition(".")
+        if dot:
+            body.setdefault(section, {})[name] = value
+        else:
+            body[section] = value
+    try:
+        return Profile.model_validate(body)
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        key = ".".join(str(part) for part in first["loc"][:2])
+        value = first["input"]
+        field = fields().get(key)
+        allowed = bounds(field) if field is not None else ""
+        if first["type"].startswith("bool"):
+            allowed = "true or false"
+        text = f"must be {allowed}" if allowed else f"fails with: {first['msg']}"
+        if isinstance(value, str) and field is not None:
+            near = difflib.get_close_matches(value, [str(c) for c in get_args(field.annotation)], 1)
+            text += f" (did you mean '{near[0]}'?)" if near else ""
+        raise BadInputError(f"{origins.get(key, 'profile')}: {key} = {value!r} will not do: it {text}.") from error

@@ -1,1 +1,0 @@
-"""Environment light and split-sum shading."""

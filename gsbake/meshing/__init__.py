@@ -1,0 +1,1 @@
+"""From surfels to a clean mesh: distance field, marching cubes, clean-up, decimation."""

@@ -1,0 +1,1 @@
+"""Multi-view stereo: PatchMatch, geometric consistency, fusion, carving of the visual hull."""

@@ -1,0 +1,129 @@
+"""Where along its ray a pixel's surface can be: between the visual hull's first and last crossing, or inside the object's ball."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numba as nb
+import numpy as np
+from numpy.typing import NDArray
+
+from gsbake.capture.hull.visual_hull import Hull
+from gsbake.geometry.cameras import Array, Camera
+from gsbake.mvs.ncc import FAST
+
+Floats = NDArray[np.float32]
+
+#: The object lives in the unit ball; a little more, so that its outermost point is found.
+BALL = 1.05
+#: The hull is widened by this many cells (masks and poses are that uncertain).
+MARGIN = 1.0
+
+
+@nb.njit(fastmath=FAST, error_model="numpy", nogil=True, cache=True)
+def _field(field: Any, x: Any, y: Any, z: Any) -> Any:
+    """Trilinear value at lattice coordinates; far outside beyond the grid."""
+    n0, n1, n2 = field.shape
+    if not (x >= 0 and y >= 0 and z >= 0 and x < n0 - 1 and y < n1 - 1 and z < n2 - 1):
+        return np.float32(1e3)
+    i, j, k = int(x), int(y), int(z)
+    a, b, c = np.float32(x - i), np.float32(y - j), np.float32(z - k)
+    one = np.float32(1)
+    p = (field[i, j, k] * (one - c) + field[i, j, k + 1] * c) * (one - b) + (
+        field[i, j + 1, k] * (one - c) + field[i, j + 1, k + 1] * c
+    ) * b
+    q = (field[i + 1, j, k] * (one - c) + field[i + 1, j, k + 1] * c) * (one - b)
+    q += (field[i + 1, j + 1, k] * (one - c) + field[i + 1, j + 1, k + 1] * c) * b
+    return p * (one - a) + q * a
+
+
+@nb.njit(fastmath=FAST, error_model="numpy", nogil=True, cache=True)
+def _crossing(field: Any, origin: Any, way: Any, start: float, stop: float, margin: float) -> float:
+    """First parameter from `start` towards `stop` where the field, in cells, falls below `margin`; NaN-free: −1 when it never does."""
+    t = start
+    sign = 1.0 if stop > start else -1.0
+    speed = np.sqrt(way[0] ** 2 + way[1] ** 2 + way[2] ** 2)
+    while (stop - t) * sign > 0:
+        value = _field(field, origin[0] + t * way[0], origin[1] + t * way[1], origin[2] + t * way[2])
+        if value < margin:
+            return t
+        # The field is a lower bound of the distance; beyond the grid nothing is known, so steps stay short there too.
+        t += sign * max(0.5, 0.8 * min(value - margin, 4.0)) / speed
+    return -1.0
+
+
+@nb.njit(error_model="numpy", nogil=True, cache=True)
+def _bounds(
+    inside: Any, rays: Any, centre: Any, ball: float, field: Any, lower: Any, cell: float, margin: float, near: Any, far: Any
+) -> None:
+    """Fill `near`, `far` (h, w) z-depths; 0 where the ray misses. `field` in cells; an empty one leaves the ball."""
+    way = np.zeros(3)
+    origin = np.zeros(3)
+    for v in range(inside.shape[0]):
+        for u in range(inside.shape[1]):
+            near[v, u] = 0
+            far[v, u] = 0
+            if inside[v, u] == 0:
+                continue
+            a = b = 0.0
+            c = -ball * ball
+            for k in range(3):
+                a += rays[v, u, k] * rays[v, u, k]
+                b += rays[v, u, k] * centre[k]
+                c += centre[k] * centre[k]
+            root = b * b - a * c
+            if not root > 0:
+                continue
+            first, last = max((-b - np.sqrt(root)) / a, 1e-3), (-b + np.sqrt(root)) / a
+            if not last > first:
+                continue
+            if field.shape[0] > 0:
+                for k in range(3):
+                    origin[k] = (centre[k] - lower[k]) / cell - 0.5
+                    way[k] = rays[v, u, k] / cell
+                start = _crossing(field, origin, way, first, last, margin)
+                if start < 0:
+                    continue
+                last = _crossing(field, origin, way, last, first, margin)
+                first = start
+                if not last > first:
+                    continue
+            near[v, u] = first
+            far[v, u] = last
+
+
+def depth_bounds(camera: Camera, inside: NDArray[np.uint8], hull: Hull | None) -> tuple[Floats, Floats]:
+    """Least and greatest inverse z-depth (h, w) of each pixel's surface, both 0 where there can be none.
+
+    `inside` (h, w) is non-zero where the object may be; without a hull the bound is the ball.
+    """
+    near, far = np.zeros(inside.shape), np.zeros(inside.shape)
+    if hull is None:
+        field, lower, cell = np.zeros((0, 0, 0), np.float32), np.zeros(3), 1.0
+    else:
+        field, lower, cell = (hull.field / hull.cell).astype(np.float32), np.asarray(hull.lower, float), float(hull.cell)
+    _bounds(inside, camera.rays(), np.asarray(camera.centre, float), BALL, field, lower, cell, MARGIN, near, far)
+    hit = far > 0
+    low = np.where(hit, 1 / np.where(hit, far, 1), 0)
+    high = np.where(hit, 1 / np.where(hit, near, 1), 0)
+    return low.astype(np.float32), high.astype(np.float32)
+
+
+def seed_depths(camera: Camera, points: Array, reach: int) -> Floats:
+    """Inverse z-depth (h, w) of the nearest of `points` (k, 3) in each pixel, spread to pixels up to `reach` away; 0 = none."""
+    import cv2
+
+    out = np.zeros((camera.height, camera.width), np.float32)
+    if len(points) == 0:
+        return out
+    pixel, z = camera.project(points)
+    column, row = np.floor(pixel).astype(np.int64).T
+    seen = (z > 1e-3) & (column >= 0) & (row >= 0) & (column < camera.width) & (row < camera.height)
+    np.maximum.at(out, (row[seen], column[seen]), (1 / z[seen]).astype(np.float32))
+    if not out.any():
+        return out
+    distance, label = cv2.distanceTransformWithLabels((out == 0).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
+    values = np.zeros(int(label.max()) + 1, np.float32)
+    here = out > 0
+    values[label[here]] = out[here]
+    return np.where(distance <= reach, values[label], 0).astype(np.float32)

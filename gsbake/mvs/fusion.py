@@ -1,0 +1,82 @@
+"""From depth maps to one point per place: a pixel becomes a point unless an earlier photo already showed that point.
+
+Merrell et al., *Real-time visibility-based fusion of depth maps* (ICCV 2007), in the short form of Galliani et al. 2015: depths were
+averaged over the views that agree before, so a point stands for all pixels that see it, and those are crossed off.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numba as nb
+import numpy as np
+from numpy.typing import NDArray
+
+from gsbake.mvs.depth_maps import DepthMap
+from gsbake.mvs.ncc import FAST
+from gsbake.mvs.point_cloud import StereoCloud
+from gsbake.mvs.pyramids import relative
+
+#: A pixel shows the same point when its depth there differs by less than this share.
+SAME = 0.006
+
+
+@nb.njit(fastmath=FAST, error_model="numpy", nogil=True, cache=True)
+def _cross_off(points: Any, lens: Any, rotation: Any, translation: Any, depth: Any, used: Any, share: Any) -> None:
+    """Mark in `used` (h, w) the pixels that see one of `points` (n, 3) of another camera's frame."""
+    height, width = depth.shape
+    for i in range(points.shape[0]):
+        x, y, z = points[i, 0], points[i, 1], points[i, 2]
+        pz = rotation[2, 0] * x + rotation[2, 1] * y + rotation[2, 2] * z + translation[2]
+        if not pz > np.float32(1e-6):
+            continue
+        u = lens[0] * (rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2] * z + translation[0]) / pz + lens[2]
+        v = lens[1] * (rotation[1, 0] * x + rotation[1, 1] * y + rotation[1, 2] * z + translation[1]) / pz + lens[3]
+        if not (u >= 0 and v >= 0 and u < width and v < height):
+            continue
+        # The nearest four pixels: neighbouring points of one view then leave no gaps in another that looks more closely.
+        for row in range(max(0, int(v - np.float32(0.5))), min(height, int(v + np.float32(0.5)) + 1)):
+            for column in range(max(0, int(u - np.float32(0.5))), min(width, int(u + np.float32(0.5)) + 1)):
+                if abs(depth[row, column] - pz) < share * pz:
+                    used[row, column] = 1
+
+
+def fuse(
+    maps: Sequence[DepthMap], neighbours: Sequence[Sequence[int]], colour: Callable[[int], NDArray[np.uint8]], tick: Callable[[int], None]
+) -> StereoCloud:
+    """Points of all maps, each place once.
+
+    `neighbours[i]` are the views that may see what view i sees, `colour(i)` the photo (h, w, 3) 8-bit sRGB at the map's size;
+    `tick(i)` is called after each view.
+    """
+    depths = [m.depth() for m in maps]
+    used = [np.zeros(d.shape, np.uint8) for d in depths]
+    parts: list[tuple[NDArray[Any], ...]] = []
+    for i, (one, depth) in enumerate(zip(maps, depths, strict=True)):
+        camera = one.camera
+        row, column = np.nonzero((depth > 0) & (used[i] == 0))
+        z = depth[row, column].astype(np.float64)
+        x, y = (column + 0.5 - camera.cx) / camera.fx, (row + 0.5 - camera.cy) / camera.fy
+        local = np.stack([x * z, y * z, z], 1)
+        plane = one.plane[row, column].astype(np.float64)
+        normal = -plane / np.maximum(np.linalg.norm(plane, axis=1, keepdims=True), 1e-12)
+        points = local.astype(np.float32)
+        for j in neighbours[i]:
+            if j > i:
+                other = maps[j].camera
+                rotation, translation = relative(camera, other)
+                lens = np.array([other.fx, other.fy, other.cx, other.cy], np.float32)
+                _cross_off(points, lens, rotation.astype(np.float32), translation.astype(np.float32), depths[j], used[j], np.float32(SAME))
+        parts.append(
+            (
+                (local - camera.t) @ camera.R,
+                normal @ camera.R,
+                colour(i)[row, column] if len(row) else np.zeros((0, 3), np.uint8),
+                z / camera.fx,
+                one.confidence[row, column].astype(np.float64),
+                one.views[row, column],
+            )
+        )
+        tick(i)
+    return StereoCloud(*(np.concatenate(column) for column in zip(*parts, strict=True)))

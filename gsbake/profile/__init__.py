@@ -1,1 +1,0 @@
-"""Settings: the pydantic schema, TOML profiles and overrides."""

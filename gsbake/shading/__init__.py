@@ -1,0 +1,1 @@
+"""Light and reflection: the environment map, its prefiltered tables, the GGX BRDF and split-sum shading."""

@@ -1,0 +1,107 @@
+"""The prefiltered light as shading sees it: one flat table of octahedral levels and its lookups.
+
+`filter_cube` applies the constant operator of `prefilter` inside autograd; `LightTables` looks directions up, trilinear over the square's
+two coordinates and roughness, differentiable with respect to the table, the directions and the roughness. Everything here is plain PyTorch
+and runs on any device; `kernels` holds the CPU twin that shading uses.
+"""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import scipy.sparse
+import torch
+
+from gsbake.shading import octahedral
+from gsbake.shading.prefilter import Layout, operator
+
+
+def _sparse(matrix: scipy.sparse.csr_matrix, dtype: torch.dtype, device: torch.device) -> torch.Tensor:
+    csr = matrix.tocsr()
+    csr.sort_indices()
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="Sparse CSR tensor support is in beta")
+        rows, columns, values = (torch.from_numpy(part) for part in (csr.indptr, csr.indices, csr.data))
+        return torch.sparse_csr_tensor(rows, columns, values, csr.shape, dtype=dtype, check_invariants=True).to(device)
+
+
+@lru_cache(maxsize=8)
+def _matrices(size: int, dtype: torch.dtype, device: torch.device) -> tuple[torch.Tensor, ...]:
+    """Reduction and weights of a map size with their transposes, as torch matrices."""
+    op = operator(size)
+    return tuple(_sparse(m, dtype, device) for m in (op.reduce, op.reduce.T, op.weights, op.weights.T))
+
+
+class _Filter(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, radiance: torch.Tensor, size: int) -> torch.Tensor:
+        reduce, _, weights, _ = _matrices(size, radiance.dtype, radiance.device)
+        ctx.size = size
+        return weights @ torch.cat([radiance, reduce @ radiance])
+
+    @staticmethod
+    def backward(ctx: Any, *grads: torch.Tensor) -> tuple[torch.Tensor, None]:
+        grad = grads[0].contiguous()
+        reduce, reduce_t, _, weights_t = _matrices(ctx.size, grad.dtype, grad.device)
+        both = weights_t @ grad
+        fine = reduce.shape[1]
+        return both[:fine] + reduce_t @ both[fine:], None
+
+
+def clamp_through(value: torch.Tensor, low: float, high: float) -> torch.Tensor:
+    """Clamped, with the gradient of the unclamped value: a parameter that has left the range can come back."""
+    return value + (value.clamp(low, high) - value).detach()
+
+
+@dataclass(frozen=True)
+class LightTables:
+    """Prefiltered light: `table` (layout.texels, 3), linear RGB radiance."""
+
+    table: torch.Tensor
+    layout: Layout
+
+    def specular(self, directions: torch.Tensor, roughness: torch.Tensor) -> torch.Tensor:
+        """Radiance (n, 3) convolved with the head-on GGX lobe around unit `directions` (n, 3), at `roughness` (n,).
+
+        Linear between the levels' roughnesses. Roughness beyond the first or last level reads that level and keeps the slope beside it as
+        its gradient.
+        """
+        knots = torch.tensor(self.layout.roughness, dtype=roughness.dtype, device=roughness.device)
+        rough = clamp_through(roughness, self.layout.roughness[0], self.layout.roughness[-1])
+        level = torch.bucketize(rough.detach(), knots[1:-1], right=True)
+        t = ((rough - knots[level]) / (knots[level + 1] - knots[level])).unsqueeze(1)
+        u, v = octahedral.encode(directions)
+        return (1.0 - t) * self._bilinear(u, v, level) + t * self._bilinear(u, v, level + 1)
+
+    def diffuse(self, normals: torch.Tensor) -> torch.Tensor:
+        """Irradiance / π (n, 3) around unit `normals` (n, 3): what a white Lambertian surface returns."""
+        u, v = octahedral.encode(normals)
+        last = len(self.layout.sizes) - 1
+        return self._bilinear(u, v, torch.full(u.shape, last, dtype=torch.long, device=u.device))
+
+    def detach(self) -> LightTables:
+        """The same light without gradient."""
+        return LightTables(self.table.detach(), self.layout)
+
+    def _bilinear(self, u: torch.Tensor, v: torch.Tensor, level: torch.Tensor) -> torch.Tensor:
+        size = torch.tensor(self.layout.sizes, device=u.device)[level]
+        start = torch.tensor(self.layout.offsets, device=u.device)[level]
+        x = (u + 1.0) * (0.5 * size) + 0.5
+        y = (v + 1.0) * (0.5 * size) + 0.5
+        # The clamp acts on the integers, so that even a NaN reads inside the table.
+        col = torch.minimum(x.detach().floor().long().clamp_min(0), size)
+        row = torch.minimum(y.detach().floor().long().clamp_min(0), size)
+        fx, fy = (x - col).unsqueeze(1), (y - row).unsqueeze(1)
+        base = start + row * (size + 2) + col
+        below = base + size + 2
+        t00, t01, t10, t11 = (self.table.index_select(0, i) for i in (base, base + 1, below, below + 1))
+        return (1.0 - fy) * ((1.0 - fx) * t00 + fx * t01) + fy * ((1.0 - fx) * t10 + fx * t11)
+
+
+def filter_cube(radiance: torch.Tensor) -> LightTables:
+    """Prefilter a cube map of radiance (6, N, N, 3), float32 or float64, on any device; differentiable once."""
+    size = radiance.shape[1]
+    return LightTables(_Filter.apply(radiance.reshape(-1, 3), size), operator(size).layout)

@@ -1,1 +1,0 @@
-"""2D Gaussian surfels with a discretized SDF, and their training."""

@@ -1,1 +1,0 @@
-"""From surfels to a mesh."""

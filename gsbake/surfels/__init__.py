@@ -1,0 +1,1 @@
+"""2D Gaussian surfels with a discretized signed distance field."""

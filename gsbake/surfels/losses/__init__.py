@@ -1,0 +1,1 @@
+"""Training losses: plain PyTorch terms and their fused kernels."""

@@ -1,0 +1,1 @@
+"""The differentiable rasteriser of surfels: projection, binning, blending; Numba, PyTorch reference and CUDA."""

@@ -1,0 +1,1 @@
+"""The training loop, its optimiser, checkpoints, early stopping and pose refinement."""

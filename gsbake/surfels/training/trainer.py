@@ -1,0 +1,258 @@
+"""Training: one loop over photos that fits surfels, their SDF samples, materials and the light (Zhu et al., ICCV 2025).
+
+The schedule is the paper's in shares of the run (of 30 000 steps: median, projection and distortion from 1 000, densify 500
+to 15 000), with the
+first part at half resolution. All state is in `state()`: a run resumed from a checkpoint ends with the same result.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from gsbake.surfels.densification.clone_split import Statistics, densify, placement, prune
+from gsbake.surfels.densification.policies import GROWING, PRUNING
+from gsbake.surfels.losses import image as image_loss
+from gsbake.surfels.losses import projection as projection_loss
+from gsbake.surfels.losses import terms as losses
+from gsbake.surfels.losses.terms import ImageWeights
+from gsbake.surfels.model import Surfels
+from gsbake.surfels.raster.gbuffer import picture, rasterise
+from gsbake.surfels.raster.rasterise import Rendered
+from gsbake.surfels.training.adam import Adam
+from gsbake.surfels.training.early_stopping import stands_still
+from gsbake.surfels.training.finite import broken
+from gsbake.surfels.training.views import TrainView
+
+#: Shares of the run: SDF losses start, densifying starts and ends.
+SDF_FROM, DENSIFY_FROM, DENSIFY_TO = 1 / 30, 1 / 60, 0.6
+DENSIFY_EVERY = 100
+#: Share of the steps that a run which stops early cools down in.
+COOL_DOWN = 0.1
+#: A surfel larger than this (unit frame) is dropped; larger than LARGE it is split rather than cloned.
+LARGEST = 0.25
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What a run of the trainer needs to know: the profile's sections and which kind of run it is.
+
+    `densify`: whether surfels come and go at all; `growth`: the rule of `policies.GROWING` by which they multiply.
+    `converged` is `skip.converged`: "auto" stops early when nothing moves any more, "always" as soon as the run may, "never" does not.
+    """
+
+    train: Any
+    splat: Any
+    loss: Any
+    iterations: int
+    coarse_share: float
+    densify: bool
+    seed: int
+    converged: str = "never"
+    growth: str = "gradient"
+
+
+class Trainer:
+    """Holds the state; `step()` does one iteration and returns its live figures."""
+
+    def __init__(self, plan: Plan, surfels: Surfels, light: Any, views: list[TrainView], half: list[TrainView], held: list[int]) -> None:
+        """`views` and `half` are all photos at full and half training size; `held` the indices kept out; `light` an EnvironmentLight
+        or None."""
+        self.plan, self.surfels, self.light = plan, surfels, light
+        self.views, self.half = views, half
+        self.held = held
+        self.used = [i for i in range(len(views)) if i not in set(held)]
+        self.adam = Adam()
+        self.generator = torch.Generator().manual_seed(plan.seed)
+        self.stats = Statistics.zeros(len(surfels), surfels.position.device)
+        self.start_count = len(surfels)
+        self.done = 0
+        self.end = plan.iterations
+        self.cooling_from: int | None = None
+        self.standing = "not looked at"  # how far from converged it is, in words
+        self.queue: list[int] = []
+        self.log: list[dict[str, float]] = []
+        self.masked = all(v.mask is not None for v in views)
+        self.background = torch.stack([v.colour().mean((1, 2)) for v in views]).mean(0)
+
+    # -- one step -----------------------------------------------------------------------------------------------------------------
+
+    def _next_view(self) -> TrainView:
+        if not self.queue:
+            self.queue = [self.used[i] for i in torch.randperm(len(self.used), generator=self.generator).tolist()]
+        index = self.queue.pop()
+        return self.half[index] if self.coarse() else self.views[index]
+
+    def coarse(self) -> bool:
+        """Whether the run is still at half resolution."""
+        return self.done < self.plan.coarse_share * self.plan.iterations
+
+    def _background(self, view: TrainView) -> Tensor:
+        """Colour (3,) behind picture and photo: a new one for every step where masks tell the object from what is behind it."""
+        if not self.masked:
+            return self.background
+        return torch.rand(3, generator=self.generator).to(view.rgb.device)
+
+    def _loss(self, out: Rendered, view: TrainView, tables: Any) -> tuple[Tensor, Tensor]:
+        """Weighted sum of all losses, and the colour loss alone."""
+        w, s = self.plan.loss, self.surfels
+        late = self.done >= SDF_FROM * self.plan.iterations
+        weights = ImageWeights(w.ssim, w.normal, w.mask, w.distortion if late else 0.0, w.smoothness)
+        total, colour = image_loss.image(out.planes, tables, view, self.masked, self._background(view), weights)
+        if tables is not None and w.white_light:
+            from gsbake.shading.colour import colourfulness
+
+            total = total + w.white_light * colourfulness(self.light.radiance())
+        if late and w.median:
+            total = total + w.median * losses.median_sharpness(s.sdf, s.gamma, s.transfer)
+        if late and w.projection:
+            total = total + w.projection * projection_loss.projection(
+                s.position, out.normal, s.sdf, out.visible, out.depth, out.alpha, view.R, view.t, view.pinhole
+            )
+        return total, colour
+
+    def rates(self) -> dict[str, float]:
+        """Adam's rate per tensor at this step: exponential decay of positions (to 1/100) and of materials and light (to 1/10)."""
+        t, n = self.plan.train, self.plan.iterations
+        share = self.done / max(1, n)
+        if self.cooling_from is not None:  # early stop: the rest of the decay in the cool-down
+            begin = self.cooling_from / max(1, n)
+            share = begin + (1 - begin) * (self.done - self.cooling_from) / max(1, self.end - self.cooling_from)
+        slow, fast = 0.1**share, 0.01**share
+        rates = {
+            "position": t.lr_position * fast, "quaternion": t.lr_rotation * slow, "log_scale": t.lr_scale * slow,
+            "sdf": t.lr_sdf * slow, "gamma": t.lr_gamma * slow,
+        }  # fmt: skip
+        return rates | {f"attributes.{k}": t.lr_material * slow for k in self.surfels.attributes} | {"light": t.lr_light * slow}
+
+    def step(self) -> dict[str, float]:
+        """One iteration on one photo."""
+        view = self._next_view()
+        leaves = self.surfels.tensors()
+        for x in leaves.values():
+            x.requires_grad_()
+            x.grad = None
+        tables = None
+        if self.light is not None:
+            for p in self.light.parameters():
+                p.grad = None
+            tables = self.light.prefilter()
+        out = rasterise(self.surfels, view)
+        loss, colour = self._loss(out, view, tables)
+        loss.backward()
+        value = float(loss.detach())
+        if not math.isfinite(value):
+            lights = {} if self.light is None else {f"light.{k}": p for k, p in self.light.named_parameters()}
+            what = broken(leaves | lights)
+            blame = "" if what is None else f": {what} is not finite"
+            raise FloatingPointError(f"the loss became {value} at step {self.done} on photo {view.name}{blame}")
+        rates = self.rates()
+        with torch.no_grad():
+            grad = out.screen.grad
+            assert grad is not None
+            if "touched" in out.stats:
+                self.stats.add(grad, out.stats["touched"], max(view.pinhole.width, view.pinhole.height))
+            for name, x in leaves.items():
+                if x.grad is not None:
+                    self._update(name, x, rates[name], leaves)
+                x.requires_grad_(False)
+            self.surfels.gamma.clamp_min_(1e-3)
+            if self.light is not None:
+                for name, p in self.light.named_parameters():
+                    if p.grad is not None:
+                        self.adam.step(f"light.{name}", p.data, p.grad, rates["light"])
+        self.done += 1
+        self._adapt()
+        return {"loss": value, "colour": float(colour.detach()), "surfels": float(len(self.surfels))}
+
+    def _update(self, name: str, x: Tensor, rate: float, leaves: dict[str, Tensor]) -> None:
+        """One optimiser update; what is not finite is named, the cause (a tensor still to come, as it was in the picture) before its
+        effect."""
+        assert x.grad is not None
+        try:
+            self.adam.step(name, x, x.grad, rate)
+        except FloatingPointError as effect:
+            names = list(leaves)
+            cause = broken({k: leaves[k] for k in names[names.index(name) + 1 :]})
+            blame = f"{cause} is not finite: " if cause else ""
+            raise FloatingPointError(f"{blame}{effect} (step {self.done})") from effect
+
+    # -- adding and dropping ------------------------------------------------------------------------------------------------------
+
+    def _adapt(self) -> None:
+        n = self.plan.iterations
+        every = max(DENSIFY_EVERY, len(self.used))  # every photo has its say before anything is dropped
+        if not self.plan.densify or self.done % every or self.done < max(every, DENSIFY_FROM * n):
+            return
+        if self.done > DENSIFY_TO * n:
+            return
+        share = (self.done / n - DENSIFY_FROM) / (DENSIFY_TO - DENSIFY_FROM)
+        budget = int(self.start_count + (self.plan.splat.max_surfels - self.start_count) * min(1.0, share))
+        off = PRUNING[self.plan.train.prune](placement(self.surfels))
+        self.surfels, keep, _ = prune(self.surfels, self.adam, self.stats, LARGEST, off)
+        kept = Statistics(self.stats.gradient[keep], self.stats.views[keep], self.stats.weight[keep])
+        large = float(self.surfels.scale.max(1).values.median()) if len(self.surfels) else 0.01
+        score = GROWING[self.plan.growth](kept.mean_gradient(), placement(self.surfels))
+        self.surfels = densify(self.surfels, self.adam, score, budget, large, self.generator)
+        self.stats = Statistics.zeros(len(self.surfels), self.surfels.position.device)
+
+    # -- quality ------------------------------------------------------------------------------------------------------------------
+
+    @torch.no_grad()
+    def evaluate(self, most: int = 6) -> float:
+        """PSNR in dB over held-out photos (over training photos when none is held out), inside the mask where there is one."""
+        chosen = self.held[:most] or self.used[:: max(1, len(self.used) // most)][:most]
+        views = self.half if self.coarse() else self.views
+        tables = None if self.light is None else self.light.prefilter()
+        total = []
+        for i in chosen:
+            view = views[i]
+            out = rasterise(self.surfels, view)
+            photo, mask = view.colour(), view.cover()
+            cover = torch.ones_like(out.alpha) if mask is None or not self.masked else mask
+            background = self.background[:, None, None]
+            error = (picture(out.planes, view, tables) + background * (1 - out.alpha) - photo * cover - background * (1 - cover)) ** 2
+            inside = (cover > 0.5) | (out.alpha > 0.5)
+            total.append(-10 * math.log10(max(float(error.mean(0)[inside].mean()), 1e-10)))
+        return sum(total) / len(total)
+
+    def record(self) -> dict[str, float]:
+        """Evaluate, append to the log, and decide on the early stop."""
+        row = {
+            "step": float(self.done), "psnr": self.evaluate(), "surfels": float(len(self.surfels)),
+            "sdf_median": float(self.surfels.sdf.abs().median()) if len(self.surfels) else 0.0, "gamma": float(self.surfels.gamma),
+        }  # fmt: skip
+        self.log.append(row)
+        adapting = self.plan.densify and self.done < DENSIFY_TO * self.plan.iterations
+        if self.plan.converged != "never" and self.cooling_from is None and self.done < self.end and not self.coarse() and not adapting:
+            still, self.standing = stands_still(self.log)
+            if still or self.plan.converged == "always":
+                self.cooling_from = self.done
+                self.end = min(self.end, self.done + int(COOL_DOWN * self.plan.iterations))
+        return row
+
+    # -- checkpoints --------------------------------------------------------------------------------------------------------------
+
+    def state(self) -> dict[str, Any]:
+        """Everything that decides how the run goes on."""
+        return {
+            "surfels": self.surfels.tensors(), "adam": self.adam.state(), "generator": self.generator.get_state(),
+            "light": None if self.light is None else self.light.state_dict(), "queue": self.queue, "log": self.log, "done": self.done,
+            "end": self.end, "cooling_from": self.cooling_from, "standing": self.standing, "start_count": self.start_count,
+            "stats": (self.stats.gradient, self.stats.views, self.stats.weight),
+        }  # fmt: skip
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Go on from what `state` returned."""
+        self.surfels = Surfels.of(state["surfels"], self.surfels.transfer)
+        self.adam.load(state["adam"])
+        self.generator.set_state(state["generator"])
+        if self.light is not None:
+            self.light.load_state_dict(state["light"])
+        self.queue, self.log, self.done, self.end = state["queue"], state["log"], state["done"], state["end"]
+        self.cooling_from, self.standing, self.start_count = state["cooling_from"], state["standing"], state["start_count"]
+        self.stats = Statistics(*state["stats"])

@@ -1,0 +1,73 @@
+"""Training views: photos as 8-bit tensors at the working sizes, and which of them are held out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+
+from gsbake.capture.posed_photos import PosedPhotos
+from gsbake.geometry.cameras import Camera
+from gsbake.surfels.raster.projection import Pinhole
+
+
+def held_out(count: int, every: int) -> list[int]:
+    """Indices of the photos kept out of training: every n-th in the order of the camera set, none for 0 or tiny sets."""
+    if every <= 0 or count < 2 * every:
+        return []
+    return list(range(every // 2, count, every))
+
+
+@dataclass(frozen=True)
+class TrainView:
+    """One photo at one size: `rgb` (3, h, w) and `mask` (h, w) or None as 8-bit tensors, world→camera pose, intrinsics."""
+
+    name: str
+    rgb: Tensor
+    mask: Tensor | None
+    R: Tensor
+    t: Tensor
+    centre: Tensor
+    pinhole: Pinhole
+
+    def to(self, device: str | torch.device) -> TrainView:
+        """The view with all tensors on `device`."""
+        mask = None if self.mask is None else self.mask.to(device)
+        rgb, r, t, c = (x.to(device) for x in (self.rgb, self.R, self.t, self.centre))
+        return TrainView(self.name, rgb, mask, r, t, c, self.pinhole)
+
+    def colour(self) -> Tensor:
+        """Photo as sRGB floats (3, h, w) in 0..1."""
+        return self.rgb.float() / 255
+
+    def cover(self) -> Tensor | None:
+        """Mask as floats (h, w) in 0..1, or None."""
+        return None if self.mask is None else self.mask.float() / 255
+
+
+def pose_of(camera: Camera) -> tuple[Tensor, Tensor, Tensor, Pinhole]:
+    """float32 R (3, 3), t (3,), centre (3,) and intrinsics of a camera."""
+    r, t, c = (torch.from_numpy(np.asarray(x, np.float32).copy()) for x in (camera.R, camera.t, camera.centre))
+    return r, t, c, Pinhole(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
+
+
+def _make(camera: Camera, rgb: np.ndarray, mask: np.ndarray | None) -> TrainView:
+    r, t, c, pinhole = pose_of(camera)
+    planes = torch.from_numpy(np.ascontiguousarray(rgb.transpose(2, 0, 1)))
+    return TrainView(camera.name, planes, None if mask is None else torch.from_numpy(mask), r, t, c, pinhole)
+
+
+def load_views(posed: PosedPhotos, max_size: int) -> tuple[list[TrainView], list[TrainView]]:
+    """All photos at `max_size`, and the same at half of it (area filter)."""
+    full, half = [], []
+    for i in range(len(posed)):
+        view = posed.view(i, max_size)
+        full.append(_make(view.camera, view.rgb, view.mask))
+        w, h = max(1, view.camera.width // 2), max(1, view.camera.height // 2)
+        rgb = cv2.resize(view.rgb, (w, h), interpolation=cv2.INTER_AREA)
+        mask = None if view.mask is None else cv2.resize(view.mask, (w, h), interpolation=cv2.INTER_AREA)
+        half.append(_make(view.camera.scaled(w, h), rgb, mask))
+    return full, half

@@ -1,1 +1,0 @@
-"""UV atlas and baked textures."""

@@ -1,0 +1,1 @@
+"""UV atlas, projection of photos, inpainting, ambient occlusion and the normal map."""

@@ -1,0 +1,110 @@
+"""Ambient occlusion per texel: the cosine-weighted share of the hemisphere that the object itself leaves open.
+
+Directions follow the additive R2 sequence, shifted per texel by a hash (Cranley-Patterson rotation): stratified, noise that a small filter
+removes, and the same result on every machine. A light filter then averages neighbouring texels of the same surface and orientation.
+
+Roberts, *The unreasonable effectiveness of quasirandom sequences*, 2018 (R2); Malley's method for cosine-weighted directions (Pharr, Jakob
+& Humphreys, *Physically Based Rendering*, section 13.6).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from gsbake.geometry.raycast import RayCaster
+from gsbake.texturing.texels import Texels
+
+Floats = NDArray[np.float32]
+
+#: Steps of the R2 sequence: 1/g and 1/g² of the plastic number g.
+R2 = (0.7548776662466927, 0.5698402909980532)
+#: Half width of the filter in texels.
+FILTER = 2
+
+
+def occlusion(
+    position: NDArray[Any],
+    normal: NDArray[Any],
+    caster: RayCaster,
+    rays: int,
+    offset: float,
+    each: Callable[[int, int], None] | None = None,
+) -> Floats:
+    """Open share (n,) in 0..1 of the hemisphere over each `position` (n, 3) with unit `normal` (n, 3); 1 is fully open.
+
+    Rays start `offset` (mesh units) above the surface; `each(done, total)` is called after every round of one ray per texel.
+    """
+    p = np.ascontiguousarray(np.asarray(position, np.float64) + offset * np.asarray(normal, np.float64))
+    n = np.ascontiguousarray(normal, np.float32)
+    blocked = np.zeros(len(p), np.int32)
+    directions = np.zeros((len(p), 3), np.float32)
+    for k in range(rays):
+        _directions(n, k, rays, directions)
+        blocked += caster.occluded(p, directions)
+        if each is not None:
+            each(k + 1, rays)
+    return (1 - blocked / max(rays, 1)).astype(np.float32)
+
+
+@numba.njit(cache=True, parallel=True, error_model="numpy")
+def _directions(normal: Floats, k: int, rays: int, out: Floats) -> None:
+    """The k-th of `rays` cosine-weighted directions (n, 3) about each `normal` (n, 3)."""
+    for i in numba.prange(normal.shape[0]):
+        h = np.uint32(i) * np.uint32(747796405) + np.uint32(2891336453)
+        h = ((h >> ((h >> np.uint32(28)) + np.uint32(4))) ^ h) * np.uint32(277803737)
+        h = (h >> np.uint32(22)) ^ h
+        shift_a = (h & np.uint32(0xFFFF)) / 65536.0
+        shift_b = ((h >> np.uint32(16)) & np.uint32(0xFFFF)) / 65536.0
+        a = (0.5 + k * R2[0] + shift_a) % 1.0
+        b = (0.5 + k * R2[1] + shift_b) % 1.0
+        radius, turn = np.sqrt(a), 2 * np.pi * b
+        x, y, z = radius * np.cos(turn), radius * np.sin(turn), np.sqrt(max(0.0, 1 - a))
+        nx, ny, nz = normal[i, 0], normal[i, 1], normal[i, 2]
+        # Branch-free basis about the normal: Duff et al., JCGT 2017.
+        sign = np.float32(1 if nz >= 0 else -1)
+        c = -1 / (sign + nz)
+        d = nx * ny * c
+        out[i, 0] = x * (1 + sign * nx * nx * c) + y * d + z * nx
+        out[i, 1] = x * sign * d + y * (sign + ny * ny * c) + z * ny
+        out[i, 2] = -x * sign * nx + -y * ny + z * nz
+
+
+def smoothed(texels: Texels, value: Floats, position: NDArray[Any], normal: NDArray[Any], reach: float) -> Floats:
+    """`value` (n,) averaged over neighbouring texels within `reach` (mesh units) whose normals agree."""
+    values = texels.image(value, np.nan)[..., 0]
+    out = _filter(values, texels.image(position), texels.image(normal), np.float32(reach))
+    return np.asarray(out.ravel()[texels.index], np.float32)
+
+
+@numba.njit(cache=True, parallel=True, error_model="numpy")
+def _filter(value: Floats, position: Floats, normal: Floats, reach: np.float32) -> Floats:
+    """Mean of `value` (s, s; NaN where empty) over near texels, weighted by distance and agreement of normals."""
+    size = value.shape[0]
+    out = value.copy()
+    for j in numba.prange(size):
+        for i in range(size):
+            if not value[j, i] >= 0:
+                continue
+            total: Any = 0.0
+            weight: Any = 0.0
+            for y in range(max(0, j - FILTER), min(size, j + FILTER + 1)):
+                for x in range(max(0, i - FILTER), min(size, i + FILTER + 1)):
+                    if not value[y, x] >= 0:
+                        continue
+                    gap, turn = 0.0, 0.0
+                    for c in range(3):
+                        gap += (position[y, x, c] - position[j, i, c]) ** 2
+                        turn += normal[y, x, c] * normal[j, i, c]
+                    if gap > reach * reach or turn < 0.8:
+                        continue
+                    w = (turn - 0.8) * (1.0001 - gap / (reach * reach))
+                    total += w * value[y, x]
+                    weight += w
+            if weight > 0:
+                out[j, i] = total / weight
+    return out

@@ -1,0 +1,105 @@
+"""Smooth vertex normals, and the tangent-space normal map of a dense surface seen from a light mesh.
+
+From each texel's point of the light mesh a ray goes both ways along its normal; the nearer hit on the dense surface within a bound, if that
+surface faces the same way, gives its smooth normal, which is written in the texel's MikkTSpace frame (OpenGL: +Y up in the image). The
+bound follows from the distances found: the decimation error itself. A texel without such a hit stays flat.
+
+Vertex normals are weighted by corner angle: Thürmer & Wüthrich, *Computing vertex normals from polygonal facets*, JGT 1998.
+Cohen, Olano & Manocha, *Appearance-preserving simplification*, SIGGRAPH 1998 (normal maps of simplified surfaces).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gsbake.geometry.raycast import Hits, RayCaster
+from gsbake.geometry.tangents import world_to_frame
+
+Floats = NDArray[np.float64]
+
+#: Widest search along the normal, as a share of the light mesh's bounding-box diagonal.
+WIDEST = 0.05
+#: The bound on accepted distances is this many times the 95th percentile of the distances found.
+BOUND = 2.0
+#: A dense surface that turns from the light mesh by more than this (cosine) is another sheet, not detail.
+SAME_SIDE = 0.2
+
+
+@dataclass(frozen=True)
+class Detail:
+    """The dense surface at each of n texels.
+
+    `found` (n,) where there is one; `position` (n, 3) and unit `normal` (n, 3) in the mesh's frame, those of the light mesh where there is
+    none; `bound` the farthest accepted distance.
+    """
+
+    found: NDArray[np.bool_]
+    position: Floats
+    normal: Floats
+    bound: float
+
+
+def vertex_normals(vertices: NDArray[Any], faces: NDArray[Any]) -> Floats:
+    """Unit normals (v, 3) of `vertices` (v, 3) under `faces` (f, 3): face normals weighted by the corner angle; +z for an unused vertex."""
+    p, triangles = np.asarray(vertices, np.float64), np.asarray(faces, np.int64)
+    corner = p[triangles]
+    out = np.zeros_like(p)
+    face = _unit(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]))
+    for k in range(3):
+        e1, e2 = _unit(corner[:, (k + 1) % 3] - corner[:, k]), _unit(corner[:, (k + 2) % 3] - corner[:, k])
+        angle = np.arccos(np.clip(np.einsum("nd,nd->n", e1, e2), -1, 1))
+        for axis in range(3):
+            out[:, axis] += np.bincount(triangles[:, k], angle * face[:, axis], len(p))
+    length = np.linalg.norm(out, axis=1, keepdims=True)
+    return np.where(length > 1e-12, out / np.maximum(length, 1e-12), np.array([0.0, 0.0, 1.0]))
+
+
+def find_detail(position: NDArray[Any], normal: NDArray[Any], dense: RayCaster, dense_normals: NDArray[Any], diagonal: float) -> Detail:
+    """The dense surface along the normals of n texels: `position` (n, 3), `normal` (n, 3) of the light mesh.
+
+    `dense_normals` (v, 3) belong to the dense mesh's vertices; `diagonal` is the light mesh's bounding-box diagonal.
+    """
+    p, n = np.asarray(position, np.float64), _unit(np.asarray(normal, np.float64))
+    widest = WIDEST * diagonal
+    slip = 1e-3 * widest  # so that a surface exactly at the texel is met by at least one of the two rays
+    distance = np.full(len(p), np.inf)
+    place, turned = p.copy(), n.copy()
+    for side in (1.0, -1.0):
+        hits = dense.first_hit(p - side * slip * n, side * n)
+        away = np.abs(hits.distance - slip)
+        smooth = _smooth_normal(hits, dense, dense_normals)
+        take = hits.hit & (away < distance) & (away < widest) & (np.einsum("nd,nd->n", smooth, n) > SAME_SIDE)
+        distance[take] = away[take]
+        place[take] = dense.points(hits)[take]
+        turned[take] = smooth[take]
+    near = distance[np.isfinite(distance)]
+    bound = float(min(widest, BOUND * np.quantile(near, 0.95) + 2 * slip)) if len(near) else 0.0
+    found = distance <= bound
+    place[~found], turned[~found] = p[~found], n[~found]
+    return Detail(found, place, turned, bound)
+
+
+def normal_map(detail: Detail, normal: NDArray[Any], tangent: NDArray[Any]) -> NDArray[np.float32]:
+    """Tangent-space normals (n, 3) coded 0..1 (0.5 is zero, +Y up); flat where no detail was found.
+
+    `normal` (n, 3) and `tangent` (n, 4) are the light mesh's, interpolated at the texels and not normalised.
+    """
+    local = world_to_frame(detail.normal, normal, tangent)
+    usable = detail.found & np.isfinite(local).all(1) & (local[:, 2] > 0.05)
+    local[~usable] = (0.0, 0.0, 1.0)
+    return (0.5 * local + 0.5).astype(np.float32)
+
+
+def _smooth_normal(hits: Hits, dense: RayCaster, normals: NDArray[Any]) -> Floats:
+    """Interpolated unit normals (n, 3) at hits; 0 on a miss."""
+    corners = np.asarray(normals, np.float64)[dense.faces[np.maximum(hits.face, 0)]]
+    return _unit(np.einsum("nk,nkd->nd", hits.bary.astype(np.float64), corners))
+
+
+def _unit(x: Floats) -> Floats:
+    """Rows of (n, 3) at unit length; 0 stays 0."""
+    return x / np.maximum(np.linalg.norm(x, axis=1, keepdims=True), 1e-20)

@@ -1,0 +1,75 @@
+"""Exposure told by tie points: real changes are found, shining points and clipped values do not count as one."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gsbake.capture.photos.decode import srgb_decode, srgb_encode
+from gsbake.capture.photos.exposure import LEAST_IN_ALL, TiePoints
+from gsbake.capture.poses.colmap_model import read_tracks
+from gsbake.geometry.cameras import Camera
+
+PHOTOS, POINTS, SIDE = 9, 400, 400
+
+
+def tie_points(gain: np.ndarray, shining: float = 0.0, count: int = POINTS) -> TiePoints:
+    """Photos with `gain` (photos,) of `count` points of many paints; a `shining` share of them is of another brightness in each."""
+    rng = np.random.default_rng(4)
+    columns = int(np.ceil(np.sqrt(count)))
+    x, y = np.divmod(np.arange(count), columns)
+    points = np.column_stack([(x + 0.5) / columns - 0.5, (y + 0.5) / columns - 0.5, np.zeros(count)])
+    paint = rng.uniform(0.05, 0.3, count)
+    shines = rng.random(count) < shining
+    names = [f"p{k}" for k in range(len(gain))]
+    seen = {name: np.sort(rng.choice(count, int(0.6 * count), replace=False)) for name in names}
+    tied = TiePoints(points, seen)
+    edge = SIDE // columns
+    for k, name in enumerate(names):
+        camera = Camera(name, SIDE, SIDE, SIDE, SIDE, SIDE / 2, SIDE / 2, np.eye(3), np.array([0, 0, 1.0]))
+        colour = paint * np.where(shines, rng.uniform(0.7, 2.5, count), 1) * gain[k]
+        grid = np.zeros((columns, columns))
+        grid[y, x] = colour
+        image = np.kron(grid, np.ones((edge, edge)))
+        full = np.full((SIDE, SIDE), 0.1)
+        full[: image.shape[0], : image.shape[1]] = image
+        tied.add(camera, srgb_decode(srgb_encode(np.repeat(np.clip(full, 0, 1)[..., None], 3, 2))))
+    return tied
+
+
+def test_one_exposure_is_seen_as_one() -> None:
+    assert tie_points(np.ones(PHOTOS)).spread() == pytest.approx(1, abs=0.01)
+
+
+def test_shining_points_are_no_change_of_exposure() -> None:
+    assert tie_points(np.ones(PHOTOS), shining=0.3).spread() == pytest.approx(1, abs=0.03)
+
+
+def test_the_spread_is_that_of_most_photos() -> None:
+    gain = np.array([1 / 1.4] * 3 + [1.0] * 3 + [1.4] * 3)
+    assert tie_points(gain).spread() == pytest.approx(1.4, rel=0.03)
+    one = np.ones(20)
+    one[7] = 3.0
+    assert tie_points(one).spread() == pytest.approx(1, abs=0.02)
+
+
+def test_tracks_of_a_model_are_read(tmp_path: Path) -> None:
+    from gsbake.capture.sfm.colmap import pycolmap
+
+    options = pycolmap.SyntheticDatasetOptions()
+    options.num_points3D = 50
+    model = pycolmap.synthesize_dataset(options)
+    model.write(str(tmp_path))
+    points, seen = read_tracks(tmp_path)
+    assert points.shape == (50, 3) and len(seen) == model.num_images()
+    assert sum(map(len, seen.values())) == sum(p.track.length() for p in model.points3D.values())
+    image = next(iter(model.images.values()))
+    first = next(p for p in image.points2D if p.has_point3D())
+    at = model.points3D[first.point3D_id].xyz
+    assert np.abs(points[seen[Path(image.name).stem]] - at).sum(1).min() < 1e-9
+
+
+def test_too_few_points_say_nothing() -> None:
+    assert tie_points(np.ones(PHOTOS), count=LEAST_IN_ALL - 50).spread() is None

@@ -1,0 +1,223 @@
+"""Pose formats against values worked out by hand."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from gsbake.capture.photos.decode import orient
+from gsbake.capture.poses.frames import PhotoSize, fit_to_photo, match_frame, upright
+from gsbake.capture.poses.given import read_poses
+from gsbake.capture.sfm.colmap import pycolmap
+from gsbake.geometry.cameras import Camera, CameraSet, Similarity
+from gsbake.pipeline.errors import BadInputError
+
+SIZES = {"a.jpg": PhotoSize(200, 100), "b.jpg": PhotoSize(200, 100)}
+
+
+def write_transforms(path: Path, matrix: Any, **extra: Any) -> Path:
+    frames = [{"file_path": "./images/a.jpg", "transform_matrix": matrix}]
+    path.write_text(json.dumps({"fl_x": 150.0, "w": 200, "h": 100, "frames": frames} | extra))
+    return path
+
+
+def looking_along_minus_x() -> np.ndarray[Any, Any]:
+    """OpenGL camera-to-world: camera at (5, 0, 1), looking along −x, z up; its axes right = +y, up = +z, back = +x."""
+    return np.array([[0, 0, 1, 5], [1, 0, 0, 0], [0, 1, 0, 1], [0, 0, 0, 1]], float)
+
+
+def test_transforms_by_hand(tmp_path: Path) -> None:
+    path = write_transforms(tmp_path / "transforms.json", looking_along_minus_x().tolist(), k1=0.1, p2=0.01, cx=90, cy=60)
+    given = read_poses(path, ["a.jpg", "b.jpg"], SIZES)
+    assert list(given.cameras) == ["a.jpg"] and given.missing == ()
+    camera = given.cameras["a.jpg"]
+    assert camera.centre == pytest.approx([5, 0, 1]) and camera.view_direction == pytest.approx([-1, 0, 0])
+    assert (camera.fx, camera.fy, camera.cx, camera.cy, camera.distortion) == (150, 150, 90, 60, (0.1, 0.0, 0.0, 0.01))
+    # A point 5 before the camera, 1 to its right (+y) and 1 above: right of and above the principal point by 30 px.
+    pixel, depth = camera.project(np.array([[0.0, 1.0, 2.0]]))
+    assert pixel[0] == pytest.approx([120, 30]) and depth == pytest.approx([5])
+
+
+def test_transforms_angle_suffixless_and_frame_wins(tmp_path: Path) -> None:
+    frames = [
+        {"file_path": "./train/a", "transform_matrix": looking_along_minus_x().tolist()},
+        {"file_path": "./train/b", "transform_matrix": looking_along_minus_x().tolist(), "camera_angle_x": math.pi / 2},
+        {"file_path": "./train/c", "transform_matrix": looking_along_minus_x().tolist()},
+    ]
+    path = tmp_path / "transforms_train.json"
+    path.write_text(json.dumps({"camera_angle_x": 2 * math.atan(0.5), "frames": frames}))
+    given = read_poses(path, [], SIZES)
+    assert given.missing == ("./train/c",)
+    assert [given.cameras[n].fx for n in ("a.jpg", "b.jpg")] == pytest.approx([200, 100])
+    assert (given.cameras["a.jpg"].cx, given.cameras["a.jpg"].cy) == (100, 50)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"at": (0, 3), "value": float("nan")}, r"images/a\.jpg.*NaN"),
+        ({"at": (1, 1), "value": float("inf")}, r"images/a\.jpg.*NaN or infinite"),
+        ({"scale": 2.0}, r"images/a\.jpg.*no rigid"),
+        ({"mirror": True}, r"images/a\.jpg.*no rigid"),
+        ({"at": (3, 3), "value": 2.0}, r"images/a\.jpg.*last row"),
+    ],
+)
+def test_unusable_matrices(tmp_path: Path, change: dict[str, Any], words: str) -> None:
+    matrix = looking_along_minus_x()
+    if "at" in change:
+        matrix[change["at"]] = change["value"]
+    if "scale" in change:
+        matrix[:3, :3] *= change["scale"]
+    if "mirror" in change:
+        matrix[:3, 0] *= -1
+    with pytest.raises(BadInputError, match=words):
+        read_poses(write_transforms(tmp_path / "t.json", matrix.tolist()), [], SIZES)
+
+
+@pytest.mark.parametrize(
+    ("extra", "words"),
+    [
+        ({"camera_model": "OPENCV_FISHEYE"}, "not a perspective"),
+        ({"k4": 0.1}, "k4"),
+        ({"fl_x": None}, "no focal length"),
+        ({"fl_x": -3.0}, "unusable"),
+        ({"w": 100, "h": 200}, "100x200.*200x100"),
+    ],
+)
+def test_unusable_intrinsics(tmp_path: Path, extra: dict[str, Any], words: str) -> None:
+    with pytest.raises(BadInputError, match=words):
+        read_poses(write_transforms(tmp_path / "t.json", looking_along_minus_x().tolist(), **extra), [], SIZES)
+
+
+def test_not_a_transforms_file(tmp_path: Path) -> None:
+    for text in ("{", "[]", '{"frames": [{"x": 1}]}', '{"frames": [{"file_path": "a.jpg", "transform_matrix": "no"}]}'):
+        (tmp_path / "t.json").write_text(text)
+        with pytest.raises(BadInputError):
+            read_poses(tmp_path / "t.json", [], SIZES)
+    with pytest.raises(BadInputError, match="No frame"):
+        read_poses(write_transforms(tmp_path / "t.json", np.eye(4).tolist()), [], {"z.jpg": PhotoSize(200, 100)})
+
+
+def test_llff_by_hand(tmp_path: Path) -> None:
+    # The same camera: down = −z, right = +y, back = +x, at (5, 0, 1); calibrated at twice the photo's size.
+    matrix = np.array([[0, 0, 1, 5, 200], [0, 1, 0, 0, 400], [-1, 0, 0, 1, 300]], float)
+    rows = np.stack([np.concatenate([matrix.ravel(), [1.0, 9.0]])] * 3)
+    rows[0, 3] = 7.0
+    np.save(tmp_path / "poses_bounds.npy", rows)
+    given = read_poses(tmp_path / "poses_bounds.npy", ["0.jpg", "a.jpg", "b.jpg"], SIZES)  # 0.jpg could not be read
+    camera = given.cameras["a.jpg"]
+    assert camera.centre == pytest.approx([5, 0, 1]) and camera.view_direction == pytest.approx([-1, 0, 0])
+    assert (camera.width, camera.height, camera.fx, camera.cx, camera.cy) == (200, 100, 150, 100, 50)
+    assert camera.project(np.array([[0.0, 1.0, 2.0]]))[0][0] == pytest.approx([130, 20])
+    with pytest.raises(BadInputError, match="3 poses but there are 2 photos"):
+        read_poses(tmp_path / "poses_bounds.npy", ["a.jpg", "b.jpg"], SIZES)
+    rows[1, 7] = np.nan
+    np.save(tmp_path / "poses_bounds.npy", rows)
+    with pytest.raises(BadInputError, match=r"frame a\.jpg.*NaN"):
+        read_poses(tmp_path / "poses_bounds.npy", ["0.jpg", "a.jpg", "b.jpg"], SIZES)
+    np.save(tmp_path / "poses_bounds.npy", np.zeros((3, 4)))
+    with pytest.raises(BadInputError, match="17 numbers"):
+        read_poses(tmp_path / "poses_bounds.npy", ["0.jpg", "a.jpg", "b.jpg"], SIZES)
+
+
+def colmap_text(folder: Path, tx: str = "0") -> Path:
+    """A text model with one camera that looks along −x from (5, 0, 1): world→camera rows are right +y, down −z, forward −x."""
+    folder.mkdir(exist_ok=True)
+    (folder / "cameras.txt").write_text("1 OPENCV 200 100 150 160 90 60 0.1 0.02 0.003 0.004\n")
+    rotation = np.array([[0, 1, 0], [0, 0, -1], [-1, 0, 0]], float)
+    t = -rotation @ (5, 0, 1)
+    # Quaternion of that rotation: trace 0, axis from the antisymmetric part (−1, 1, −1)/(4 w) with w = ½.
+    quaternion = (0.5, (0 - -1) / 2, (0 - -1) / 2, (0 - 1) / 2)
+    pose = " ".join(str(v) for v in (*quaternion, *t))
+    pose = pose if tx == "0" else " ".join([*pose.split()[:4], tx, *pose.split()[5:]])
+    (folder / "images.txt").write_text(f"1 {pose} 1 left/a.jpg\n90.0 60.0 1\n")
+    (folder / "points3D.txt").write_text("1 0.0 0.0 1.0 10 20 30 0.5 1 0\n")
+    return folder
+
+
+def test_colmap_text_and_binary(tmp_path: Path) -> None:
+    text = colmap_text(tmp_path / "text")
+    binary = tmp_path / "binary"
+    binary.mkdir()
+    pycolmap.Reconstruction(str(text)).write_binary(str(binary))
+    for folder in (text, binary):
+        given = read_poses(folder, [], SIZES)
+        camera = given.cameras["a.jpg"]
+        assert camera.centre == pytest.approx([5, 0, 1]) and camera.view_direction == pytest.approx([-1, 0, 0])
+        assert (camera.fx, camera.fy, camera.distortion) == (150, 160, (0.1, 0.02, 0.003, 0.004))
+        assert given.points is not None and given.points.tolist() == [[0, 0, 1]]
+        assert given.colours is not None and given.colours.tolist() == [[10, 20, 30]]
+
+
+def test_broken_colmap_models(tmp_path: Path) -> None:
+    with pytest.raises(BadInputError, match=r"left/a\.jpg.*NaN|cannot be read"):
+        read_poses(colmap_text(tmp_path / "nan", "nan"), [], SIZES)
+    folder = colmap_text(tmp_path / "fish")
+    (folder / "cameras.txt").write_text("1 OPENCV_FISHEYE 200 100 150 160 90 60 0 0 0 0\n")
+    with pytest.raises(BadInputError, match="OPENCV_FISHEYE.*undistort"):
+        read_poses(folder, [], SIZES)
+    (folder / "images.txt").unlink()
+    with pytest.raises(BadInputError, match="cannot be read"):
+        read_poses(folder, [], SIZES)
+
+
+def test_frames_find_their_photos() -> None:
+    photos = ["left/0.jpg", "right/0.jpg", "1.jpg"]
+    assert match_frame("images/right/0.jpg", photos) == "right/0.jpg"
+    assert match_frame("C:\\shots\\1.png", photos) == "1.jpg"
+    assert match_frame("2.jpg", photos) is None
+    with pytest.raises(BadInputError, match="could mean any"):
+        match_frame("0.jpg", photos)
+
+
+@pytest.mark.parametrize("orientation", [3, 6, 8])
+def test_camera_turns_with_its_photo(orientation: int) -> None:
+    """A camera of the stored photo, turned upright, sees each point at the pixel that the turned photo shows it at."""
+    turn = cv2.Rodrigues(np.array([0.2, -0.3, 0.4]))[0]
+    lens = (0.1, -0.05, 0.01, -0.02, 0.03)
+    stored = Camera("a", 60, 40, 50.0, 55.0, 28.0, 21.0, np.asarray(turn, float), np.array([0.1, 0.2, 4.0]), lens)
+    point = np.array([[0.3, -0.2, 0.5]])
+
+    def pixel(camera: Camera) -> np.ndarray[Any, Any]:
+        k = np.asarray(camera.distortion)
+        return np.asarray(cv2.projectPoints(point, cv2.Rodrigues(camera.R)[0], camera.t, camera.K, k)[0]).ravel()
+
+    raised = upright(stored, orientation)
+    x, y = pixel(stored)
+    columns, rows = np.meshgrid(np.arange(60) + 0.5, np.arange(40) + 0.5)
+    near = np.hypot(orient(columns, orientation) - x, orient(rows, orientation) - y)  # where the stored pixel comes to lie
+    row, column = np.unravel_index(near.argmin(), near.shape)
+    assert (raised.width, raised.height) == near.shape[::-1]
+    assert pixel(raised) == pytest.approx([column + 0.5, row + 0.5], abs=0.51)
+    assert raised.centre == pytest.approx(stored.centre)
+
+
+def test_camera_of_the_stored_photo_is_recognised() -> None:
+    camera = Camera("a", 60, 40, 50, 50, 30, 20, np.eye(3), np.zeros(3))
+    assert fit_to_photo(camera, PhotoSize(80, 120, 6), "x").fx == 100
+    with pytest.raises(BadInputError):
+        fit_to_photo(camera, PhotoSize(80, 120, 1), "x")
+
+
+def test_camera_set_round_trip_and_moves(tmp_path: Path) -> None:
+    turn = np.asarray(cv2.Rodrigues(np.array([0.1, 0.7, -0.3]))[0], float)
+    camera = Camera("a", 200, 100, 150.0, 151.0, 99.0, 52.0, turn, np.array([0.1, -0.2, 5.0]), (0.1, 0.0, 0.0, 0.0))
+    frame = Similarity(2.5, np.asarray(cv2.Rodrigues(np.array([0.3, 0.0, 0.2]))[0], float), np.array([1.0, 2.0, 3.0]))
+    CameraSet((camera,), frame, "solved", True).save(tmp_path / "c.json")
+    back = CameraSet.load(tmp_path / "c.json")
+    assert back.poses == "solved" and back.metric and back.cameras[0].distortion == camera.distortion
+    assert np.allclose(back.cameras[0].R, camera.R) and back.to_world.matrix() == pytest.approx(frame.matrix())
+    points = np.random.default_rng(0).normal(size=(5, 3))
+    here, depth = camera.project(points)
+    there, far = camera.moved(frame).project(frame.apply(points))
+    assert there == pytest.approx(here) and far == pytest.approx(2.5 * depth)
+    assert frame.inverse().apply(frame.apply(points)) == pytest.approx(points)
+    assert frame.then(frame.inverse()).matrix() == pytest.approx(np.eye(4))
+    R, t = Camera.pose_from_opengl(camera.camera_to_world_opengl())
+    assert pytest.approx(camera.R) == R and t == pytest.approx(camera.t)

@@ -1,0 +1,155 @@
+"""Paint and metal told apart under a known light."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+
+from gsbake.materials.metallic import DARKEST_METAL, LEAST_PHOTOS, Evidence, as_around, find_metals
+from gsbake.shading.environment import EnvironmentLight
+from gsbake.shading.split_sum import shade
+from tests.support.monte_carlo import render
+
+TEXELS, PHOTOS = 60, 24
+
+
+def windows(directions: NDArray[np.float64]) -> NDArray[np.float64]:
+    """A room with four windows of different colours."""
+    out = np.full((len(directions), 3), 0.1)
+    for k, (axis, colour) in enumerate(
+        (((1, 0, 0.3), (4, 3, 2)), ((-1, 0.5, 0), (1, 3, 4)), ((0, -1, 0.4), (3, 3, 3)), ((0, 0.2, 1), (2, 4, 2)))
+    ):
+        toward = np.asarray(axis) / np.linalg.norm(axis)
+        out += np.exp((10 + 5 * k) * (directions @ toward - 1))[:, None] * np.asarray(colour)
+    return out
+
+
+class Wall:
+    """Texels with normals of their own under one light, seen from many sides."""
+
+    def __init__(self) -> None:
+        rng = np.random.default_rng(3)
+        self.tables = EnvironmentLight.from_function(windows, 16).prefilter()
+        normal = rng.normal(size=(TEXELS, 3))
+        self.normal = torch.as_tensor(normal / np.linalg.norm(normal, axis=1, keepdims=True), dtype=torch.float32)
+        self.towards = []
+        for _ in range(PHOTOS):
+            side = torch.nn.functional.normalize(torch.as_tensor(rng.normal(size=(TEXELS, 3)), dtype=torch.float32), dim=1)
+            self.towards.append(torch.nn.functional.normalize(side + 1.3 * self.normal, dim=1))
+
+    def colours(self, towards: torch.Tensor, base: NDArray[np.float32], rough: NDArray[np.float32], metallic: float) -> NDArray[np.float32]:
+        with torch.no_grad():
+            constant = (torch.as_tensor(base), torch.as_tensor(rough), torch.full((TEXELS,), metallic))
+            return np.asarray(shade(self.normal, towards, *constant, self.tables).numpy())
+
+    def photos(self, base: NDArray[np.float32], roughness: float, metallic: float) -> list[Evidence]:
+        """What photos of that material are, and how to shade any other."""
+        found = []
+        for towards in self.towards:
+
+            def shaded(value: float, rough: NDArray[np.float32], metal: float, towards: torch.Tensor = towards) -> NDArray[np.float32]:
+                return self.colours(towards, np.full((TEXELS, 3), value, np.float32), rough, metal)
+
+            colour = self.colours(towards, base, np.full(TEXELS, roughness, np.float32), metallic)
+            found.append(Evidence(np.arange(TEXELS), colour, np.ones(TEXELS, np.float32), np.zeros(TEXELS, np.int32), shaded))
+        return found
+
+    def reference(self, base: NDArray[np.float32], roughness: float, metallic: float) -> list[Evidence]:
+        """The same, the photos taken by the Monte Carlo renderer, which shares no code with what explains them."""
+        normal = self.normal.numpy().astype(np.float64)
+        shown = [render(normal, t.numpy(), base, np.full(TEXELS, roughness), np.full(TEXELS, metallic), windows) for t in self.towards]
+        return [replace(e, colour=c.astype(np.float32)) for e, c in zip(self.photos(base, roughness, metallic), shown, strict=True)]
+
+
+@pytest.fixture(scope="module")
+def wall() -> Wall:
+    return Wall()
+
+
+def test_metals_in_reference_photos(wall: Wall) -> None:
+    gold = np.tile(np.array([1.0, 0.77, 0.34], np.float32), (TEXELS, 1))
+    metals = find_metals(wall.reference(gold, 0.35, 1.0), np.full(TEXELS, 0.8, np.float32))
+    assert len(metals.texel) == TEXELS
+    assert np.abs(metals.base - gold).mean() < 0.05
+    assert np.abs(metals.roughness - 0.35).max() < 0.21  # the next value tried
+    paint = np.random.default_rng(1).uniform(0.1, 0.8, (TEXELS, 3)).astype(np.float32)
+    for roughness in (0.1, 0.35, 0.9):
+        assert len(find_metals(wall.reference(paint, roughness, 0.0), np.full(TEXELS, roughness, np.float32)).texel) == 0
+
+
+def test_metal_is_found_with_its_colour_and_roughness(wall: Wall) -> None:
+    gold = np.tile(np.array([1.0, 0.77, 0.34], np.float32), (TEXELS, 1))
+    metals = find_metals(wall.photos(gold, 0.35, 1.0), np.full(TEXELS, 0.8, np.float32))
+    assert len(metals.texel) == TEXELS
+    np.testing.assert_allclose(metals.base, gold, atol=1e-3)  # no noise: least squares gives it back
+    np.testing.assert_allclose(metals.roughness, 0.35)
+
+
+@pytest.mark.parametrize("roughness", [0.1, 0.35, 0.9])
+def test_paint_is_left_alone(wall: Wall, roughness: float) -> None:
+    paint = np.random.default_rng(1).uniform(0.1, 0.8, (TEXELS, 3)).astype(np.float32)
+    assert len(find_metals(wall.photos(paint, roughness, 0.0), np.full(TEXELS, roughness, np.float32)).texel) == 0
+
+
+def test_black_gloss_is_no_dark_metal(wall: Wall) -> None:
+    black = np.full((TEXELS, 3), 0.004, np.float32)
+    photos = wall.photos(black, 0.1, 0.0)
+    # A metal of base colour .04 reflects nearly as black gloss does: only what metals can look like rules it out.
+    assert DARKEST_METAL > 0.04
+    assert len(find_metals(photos, np.full(TEXELS, 0.5, np.float32)).texel) == 0
+
+
+def test_texels_hardly_seen_are_left_alone(wall: Wall) -> None:
+    gold = np.tile(np.array([1.0, 0.77, 0.34], np.float32), (TEXELS, 1))
+    weight = np.where(np.arange(TEXELS) < 5, 1e-3, 1).astype(np.float32)
+    dim = [replace(e, weight=weight) for e in wall.photos(gold, 0.2, 1.0)]
+    found = find_metals(dim, np.full(TEXELS, 0.2, np.float32))
+    assert found.texel.min() == 5
+
+
+def test_what_few_photos_saw_is_left_alone(wall: Wall) -> None:
+    gold = np.tile(np.array([1.0, 0.77, 0.34], np.float32), (TEXELS, 1))
+    photos = wall.photos(gold, 0.2, 1.0)
+    own = np.full(TEXELS, 0.2, np.float32)
+    assert len(find_metals(photos[: LEAST_PHOTOS - 1], own).texel) == 0
+    assert len(find_metals(photos[:LEAST_PHOTOS], own).texel) == TEXELS
+
+
+def test_neighbours_decide_together(wall: Wall) -> None:
+    """One texel of metal among paint is outvoted, and one of paint among metal: the metal's own colour is kept."""
+    gold = np.tile(np.array([1.0, 0.77, 0.34], np.float32), (TEXELS, 1))
+    own = np.full(TEXELS, 0.2, np.float32)
+    metal, paint = wall.photos(gold, 0.2, 1.0), wall.photos(gold, 0.2, 0.0)
+
+    def all_alike(left: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.full(TEXELS, left.sum())
+
+    for few, many, found in ((metal, paint, 0), (paint, metal, TEXELS)):
+        mixed = [replace(m, colour=np.where(np.arange(TEXELS)[:, None] == 7, f.colour, m.colour)) for f, m in zip(few, many, strict=True)]
+        assert len(find_metals(mixed, own, all_alike).texel) == found
+
+
+def test_a_spoiled_place_goes_with_its_surroundings() -> None:
+    place = np.arange(40)
+    kernel = np.exp(-np.abs(place[:, None] - place) / 3.0)
+    better = (place >= 20) & (place != 30) | (place == 8)
+    known = place != 35
+    found = as_around(better, known, lambda x: kernel @ x)
+    np.testing.assert_array_equal(np.flatnonzero(found), [*range(20, 35), *range(36, 40)])
+
+
+def test_what_is_clipped_at_white_does_not_hide_a_metal(wall: Wall) -> None:
+    gold = np.tile(np.array([1.0, 0.77, 0.34], np.float32), (TEXELS, 1))
+
+    def four_times(e: Evidence) -> Evidence:
+        return replace(e, colour=np.minimum(4 * e.colour, 1), shade=lambda base, rough, metal: 4 * e.shade(base, rough, metal))
+
+    photos = [four_times(e) for e in wall.photos(gold, 0.2, 1.0)]
+    assert np.mean([e.colour >= 1 for e in photos]) > 0.3
+    found = find_metals(photos, np.full(TEXELS, 0.2, np.float32))
+    assert len(found.texel) == TEXELS
+    np.testing.assert_allclose(found.base, gold, atol=1e-3)

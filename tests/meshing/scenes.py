@@ -1,0 +1,76 @@
+"""Analytic shapes seen by known cameras: depth maps by sphere tracing, independent of the code under test."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gsbake.geometry.cameras import Camera
+
+Array = NDArray[np.float64]
+Shape = Callable[[Array], Array]
+
+
+def sphere(p: Array) -> Array:
+    return np.linalg.norm(p, axis=-1) - 0.6
+
+
+def torus(p: Array) -> Array:
+    return np.hypot(np.hypot(p[..., 0], p[..., 1]) - 0.55, p[..., 2]) - 0.22
+
+
+def box_with_rod(p: Array) -> Array:
+    q = np.abs(p - np.array([0, 0, -0.2])) - np.array([0.45, 0.3, 0.25])
+    box = np.linalg.norm(np.maximum(q, 0), axis=-1) + np.minimum(q.max(-1), 0)
+    along = np.clip(p[..., 2], 0, 0.7)
+    rod = np.sqrt((p[..., 0] - 0.1) ** 2 + p[..., 1] ** 2 + (p[..., 2] - along) ** 2) - 0.03
+    return np.minimum(box, rod)
+
+
+def cylinder(p: Array) -> Array:
+    q = np.stack([np.hypot(p[..., 0], p[..., 1]) - 0.45, np.abs(p[..., 2]) - 0.45], -1)
+    return np.linalg.norm(np.maximum(q, 0), axis=-1) + np.minimum(q.max(-1), 0)
+
+
+def camera_at(eye: Array, name: str, size: int = 160) -> Camera:
+    """A camera at `eye` that looks at the origin, z up."""
+    z = -eye / np.linalg.norm(eye)
+    x = np.cross(z, [0, 0, 1.0])
+    x /= np.linalg.norm(x)
+    rotation = np.stack([x, np.cross(z, x), z])
+    # The principal point is off the middle on purpose.
+    return Camera(name, size, size - 10, size * 1.2, size * 1.2, size / 2 + 1.3, size / 2 - 6.7, rotation, -rotation @ eye)
+
+
+def cameras_around(elevations: tuple[float, ...] = (-35, 10, 50), each: int = 6, size: int = 160) -> list[Camera]:
+    """Rings of cameras at a distance of 3."""
+    out = []
+    for ring, elevation in enumerate(np.radians(elevations)):
+        for i in range(each):
+            a = 2 * np.pi * (i + ring / 3) / each
+            eye = 3 * np.array([np.cos(a) * np.cos(elevation), np.sin(a) * np.cos(elevation), np.sin(elevation)])
+            out.append(camera_at(eye, f"{ring}-{i}", size))
+    return out
+
+
+def gradient(shape: Shape, points: Array) -> Array:
+    """Unit outward normals (…, 3) by central differences."""
+    step = 1e-5
+    out = np.stack([shape(points + step * e) - shape(points - step * e) for e in np.eye(3)], -1)
+    return out / np.maximum(np.linalg.norm(out, axis=-1, keepdims=True), 1e-12)
+
+
+def trace(shape: Shape, camera: Camera) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+    """z-depth (h, w; 0 = none), unit normals (h, w, 3) and |cosine| (h, w) through the pixel centres."""
+    rays = camera.rays()
+    slant = np.linalg.norm(rays, axis=-1)
+    z = np.full(slant.shape, 1.0)
+    for _ in range(120):
+        z = np.minimum(z + 0.95 * shape(camera.centre + z[..., None] * rays) / slant, 20)
+    points = camera.centre + z[..., None] * rays
+    hit = np.abs(shape(points)) < 1e-3
+    normal = gradient(shape, points) * hit[..., None]
+    cosine = np.abs((normal * rays).sum(-1)) / slant
+    return np.where(hit, z, 0).astype(np.float32), normal.astype(np.float32), cosine.astype(np.float32)

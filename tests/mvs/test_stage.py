@@ -1,0 +1,193 @@
+"""The stereo stage from files to files: what it writes, what it skips, going on after an interruption, and surfels started from it."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+
+from gsbake.capture.hull.visual_hull import Hull, visual_hull
+from gsbake.capture.posed_photos import PosedPhotos
+from gsbake.config.schema import Profile
+from gsbake.geometry.cameras import CameraSet
+from gsbake.mvs.depth_maps import read_depth
+from gsbake.mvs.initial_points import in_air, start_points, thin
+from gsbake.mvs.point_cloud import StereoCloud
+from gsbake.mvs.view_selection import choose
+from gsbake.stages.stereo import STAGE
+from tests.mvs.scenes import RADIUS, arc, camera_at, photo, sphere_depth
+
+#: Half of the ring is dense enough to be matched; the other photos only bound the hull.
+CAMERAS = [
+    *arc(5),
+    *[camera_at(3.0 * np.array(d) / np.linalg.norm(d), f"far{i}") for i, d in enumerate([(-1, 0.4, 0.2), (-1, -0.8, -0.2), (0, 1, -1.2)])],
+]
+
+
+class Stopped(Exception):
+    pass
+
+
+class Run:
+    """A context that records what the stage says, and stops after some progress when asked to."""
+
+    def __init__(self, poses: Path, root: Path, name: str, stop_after: int | None = None, **stereo: Any) -> None:
+        self.out, self.checkpoint = root / f"{name}-out", root / f"{name}-checkpoint"
+        self.out.mkdir()
+        self.checkpoint.mkdir(exist_ok=True)
+        self.inputs = {"poses": poses}
+        profile = Profile()
+        self.settings = profile.model_copy(update={"stereo": profile.stereo.model_copy(update=stereo)})
+        self.seed, self.threads, self.device = 0, 2, "cpu"
+        self.decisions: dict[str, tuple[str, str]] = {}
+        self.stop_after = stop_after
+
+    @contextlib.contextmanager
+    def part(self, name: str) -> Iterator[None]:
+        yield
+
+    def progress(self, done: int, total: int, text: str = "", **live: float) -> None:
+        assert 0 < done <= total
+        if self.stop_after is not None and text == "matching" and done >= self.stop_after:
+            raise Stopped
+
+    def stop_requested(self) -> bool:
+        return False
+
+    def check_stop(self) -> None:
+        return
+
+    def decide(self, what: str, choice: str, evidence: str, saved: float | None = None) -> None:
+        self.decisions[what] = (choice, evidence)
+
+    def warn(self, text: str) -> None:
+        raise AssertionError(text)
+
+
+@pytest.fixture(scope="module")
+def poses(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("capture") / "poses"
+    for folder in ("photos", "masks"):
+        (root / folder).mkdir(parents=True)
+    CameraSet(tuple(CAMERAS)).save(root / "cameras.json")
+    for camera in CAMERAS:
+        seen = photo(camera, sphere_depth(camera))
+        cv2.imwrite(str(root / "photos" / f"{camera.name}.png"), np.repeat(seen.grey[..., None], 3, 2))
+        cv2.imwrite(str(root / "masks" / f"{camera.name}.png"), seen.inside * 255)
+    return root
+
+
+@pytest.fixture(scope="module")
+def done(poses: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
+    run = Run(poses, tmp_path_factory.mktemp("done"), "full")
+    return run.out, STAGE.run(run)
+
+
+def test_what_it_writes(done: tuple[Path, dict[str, Any]]) -> None:
+    out, results = done
+    cloud = StereoCloud.load(out / "points.ply")
+    assert results["points"] == len(cloud) > 1000 and 0.1 < results["settled_share"] < 1
+    assert np.median(np.abs(np.linalg.norm(cloud.points, axis=1) - RADIUS)) < 0.004
+    assert sorted(p.stem for p in (out / "depth").iterdir()) == sorted(c.name for c in CAMERAS)
+    for camera in CAMERAS[:5]:
+        depth, confidence = read_depth(out / "depth" / f"{camera.name}.npz")
+        truth = sphere_depth(camera)
+        known = depth > 0
+        assert depth.shape == truth.shape and not known[cv2.erode((truth == 0).astype(np.uint8), np.ones((5, 5), np.uint8)) > 0].any()
+        assert np.median(np.abs(depth - truth)[known & (truth > 0)]) < 0.006
+        assert ((confidence > 0) == known).all() and confidence.max() <= 1
+
+
+def test_the_hull_goes_with_it(poses: Path, done: tuple[Path, dict[str, Any]]) -> None:
+    kept, whole = Hull.load(done[0] / "hull.npz"), visual_hull(PosedPhotos.open(poses))
+    # A ball has no concave place: what is taken away lies outside the ball, where few photos bound the hull.
+    assert not (kept.occupancy & ~whole.occupancy).any()
+    points = kept.lower + (np.argwhere(whole.occupancy & ~kept.occupancy) + 0.5) * kept.cell
+    assert (np.linalg.norm(points, axis=1) > RADIUS - kept.cell).all()
+
+
+def test_it_goes_on_where_it_stopped(poses: Path, done: tuple[Path, dict[str, Any]], tmp_path: Path) -> None:
+    with pytest.raises(Stopped):
+        STAGE.run(Run(poses, tmp_path, "cut", stop_after=3))
+    kept = {p.name: p.stat().st_mtime_ns for p in (tmp_path / "cut-checkpoint" / "planes").glob("*.npy") if ".tmp" not in p.name}
+    assert 3 <= len(kept) < len(CAMERAS) + 1
+    (tmp_path / "cut-out").rmdir()
+    again = Run(poses, tmp_path, "cut")
+    again.threads = 1
+    STAGE.run(again)
+    assert all((tmp_path / "cut-checkpoint" / "planes" / n).stat().st_mtime_ns == t for n, t in kept.items())
+    # The hull's field may differ in its last bit between runs, and a few pixels with it; planes from the same bounds are equal to the bit.
+    one, other = StereoCloud.load(again.out / "points.ply"), StereoCloud.load(done[0] / "points.ply")
+    assert len(one) == pytest.approx(len(other), rel=0.01)
+    distance, match = cKDTree(other.points).query(one.points)
+    assert (distance < 1e-5).mean() > 0.97 and (one.views == other.views[match]).mean() > 0.97
+
+
+def test_it_is_skipped(poses: Path, tmp_path: Path) -> None:
+    never = Run(poses, tmp_path, "never", enabled="never")
+    assert STAGE.run(never) == {"points": 0} and not list(never.out.iterdir())
+    few = tmp_path / "few"
+    few.mkdir()
+    CameraSet(tuple(CAMERAS[:3])).save(few / "cameras.json")
+    auto = Run(few, tmp_path, "auto")
+    assert STAGE.run(auto) == {"points": 0} and "3 photos" in auto.decisions["stereo"][1]
+
+
+def test_start_is_stereo_and_hull_in_its_holes(poses: Path, done: tuple[Path, dict[str, Any]]) -> None:
+    posed = PosedPhotos.open(poses)
+    begun = start_points(posed, done[0], 1500, 0)
+    assert begun is not None
+    assert 500 < begun.stereo <= 1500 and len(begun.points) > begun.stereo
+    off = np.linalg.norm(begun.points, axis=1) - RADIUS
+    assert np.median(np.abs(off[: begun.stereo])) < 0.003
+    from_stereo, from_hull = begun.points[: begun.stereo], begun.points[begun.stereo :]
+    # The matched side looks along +x; the hull fills the other one.
+    assert from_stereo[:, 0].mean() > 0.3 > from_hull[:, 0].mean()
+    assert ((begun.normals * begun.points).sum(1) > 0).mean() > 0.95
+    assert start_points(posed, poses, 100, 0) is None  # no stereo there
+
+
+def test_surfels_begin_from_stereo(poses: Path, done: tuple[Path, dict[str, Any]]) -> None:
+    from gsbake.surfels.initialisation import begin
+
+    profile = Profile()
+    train = profile.train.model_copy(update={"init_surfels": 800})
+    surfels, kind, why = begin(PosedPhotos.open(poses), train, profile.splat, 0, done[0])
+    assert kind == "stereo" and "stereo points" in why and len(surfels) > 400
+    _, kind, _ = begin(PosedPhotos.open(poses), train, profile.splat, 0, poses)
+    assert kind == "hull"
+
+
+def test_points_before_a_measured_depth_are_air(poses: Path) -> None:
+    maps = [(c, sphere_depth(c).astype(np.float32)) for c in CAMERAS[:5]]
+    points = np.array([[0.9, 0, 0], [0.69, 0, 0], [0.5, 0, 0], [-0.7, 0, 0]])
+    assert in_air(points, iter(maps), 0.05).tolist() == [True, False, False, False]
+    assert not in_air(points, iter(maps[:1]), 0.05).any()
+
+
+def test_thinning_is_even_and_keeps_both_sides_of_a_sheet() -> None:
+    rng = np.random.default_rng(0)
+    crowd = np.concatenate([rng.uniform(0, 1, (3000, 2)), rng.uniform(0, 0.2, (9000, 2))])
+    points = np.concatenate([np.c_[crowd, np.zeros(12000)], np.c_[crowd, np.full(12000, 1e-3)]])
+    normals = np.zeros((24000, 3))
+    normals[:12000, 2], normals[12000:, 2] = -1, 1
+    kept, turned, _ = thin(points, normals, np.full((24000, 3), 0.5), np.ones(24000), 800)
+    assert 500 < len(kept) <= 800 and (turned[:, 2] > 0.99).sum() == pytest.approx(len(kept) / 2, rel=0.05)
+    assert (kept[:, :2].max(1) < 0.2).mean() < 0.12  # the crowded corner is 4 % of the area
+
+
+def test_neighbours_are_five_to_thirty_degrees_away() -> None:
+    ring = [camera_at(3 * np.array([np.cos(a), np.sin(a), 0.1]), str(i)) for i, a in enumerate(np.radians(np.arange(0, 360, 10)))]
+    matched, asked = choose(ring, np.zeros((1, 3)), None, 4, 8)
+    for i in range(36):
+        apart = [min((i - j) % 36, (j - i) % 36) * 10 for j in matched[i]]
+        assert max(apart) <= 30 and len(matched[i]) == 4
+        assert any((j - i) % 36 < 18 for j in matched[i]) and any((i - j) % 36 < 18 for j in matched[i])  # both sides
+        assert asked[i][:4] == matched[i] and len(asked[i]) == 8
+    assert choose([ring[0], ring[18]], np.zeros((1, 3)), None, 4, 8)[0] == [[], []]

@@ -1,0 +1,59 @@
+"""When training stops early: the evidence alone, and what the trainer does with it."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from gsbake.config.schema import Profile
+from gsbake.surfels.initialisation import fibonacci_sphere
+from gsbake.surfels.model import create
+from gsbake.surfels.raster.projection import Pinhole
+from gsbake.surfels.training.early_stopping import ROWS, STILL_DB, stands_still
+from gsbake.surfels.training.trainer import COOL_DOWN, Plan, Trainer
+from gsbake.surfels.training.views import TrainView
+
+STEPS = 200
+
+
+def rows(psnr: list[float], median: list[float]) -> list[dict[str, float]]:
+    return [{"step": 10.0 * i, "psnr": p, "sdf_median": m} for i, (p, m) in enumerate(zip(psnr, median, strict=True))]
+
+
+@pytest.mark.parametrize(
+    ("psnr", "median", "still"),
+    [
+        ([30.0, 30.1, 30.1, 30.12], [0.01] * 4, True),
+        ([30.0, 30.1, 30.1, 30.1 + STILL_DB + 0.01], [0.01] * 4, False),  # still gains
+        ([30.0, 30.1, 30.1, 30.1], [0.01, 0.01, 0.01, 0.0097], False),  # the surface still gets sharper
+        ([30.0, 30.1, 30.1], [0.01] * 3, False),  # too early to tell
+        ([20.0, 25.0, 30.0, 30.1, 30.1, 30.1], [0.1, 0.05, 0.01, 0.01, 0.01, 0.01], True),  # only the last rows count
+    ],
+)
+def test_evidence(psnr: list[float], median: list[float], still: bool) -> None:
+    holds, evidence = stands_still(rows(psnr, median))
+    assert holds is still and (f"{len(psnr)} evaluations" in evidence or "dB" in evidence)
+
+
+def trainer(mode: str) -> Trainer:
+    """A trainer of a few surfels and one black photo, which is never asked to train."""
+    p = Profile()
+    points = fibonacci_sphere(20)
+    black = torch.zeros(3, 8, 8, dtype=torch.uint8)
+    away = torch.tensor([0.0, 0.0, 3.0])
+    view = TrainView("a", black, None, torch.eye(3), away, -away, Pinhole(8, 8, 8.0, 8.0, 4.0, 4.0))
+    surfels = create(points, points, torch.full((20,), 0.1).numpy(), None, "colour", 0, 0.01, 5.0)
+    return Trainer(Plan(p.train, p.splat, p.loss, STEPS, 0.1, False, 0, mode), surfels, None, [view], [view], [])
+
+
+@pytest.mark.parametrize(("mode", "gain", "stop"), [("auto", 0.0, 80), ("auto", 1.0, None), ("never", 0.0, None), ("always", 1.0, 20)])
+def test_the_trainer_cools_down_when_nothing_moves(monkeypatch: pytest.MonkeyPatch, mode: str, gain: float, stop: int | None) -> None:
+    t = trainer(mode)
+    monkeypatch.setattr(t, "evaluate", lambda: 30.0 + gain * t.done)
+    stopped = None
+    for done in range(20, STEPS + 1, 20):  # at full resolution from the first evaluation on; the fourth has ROWS to compare
+        t.done = done
+        t.record()
+        stopped = done if stopped is None and t.cooling_from is not None else stopped
+    assert stopped == stop and ROWS == 4
+    assert t.end == (STEPS if stop is None else stop + int(COOL_DOWN * STEPS))

@@ -1,0 +1,152 @@
+"""Projection and fusion against a sphere painted by a formula."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import trimesh
+
+from gsbake.geometry.cameras import Camera
+from gsbake.geometry.raycast import RayCaster
+from gsbake.texturing.projection import ProjectionBlender, edge_weights, mask_weights
+
+SIZE = 160
+
+
+def paint(p: np.ndarray) -> np.ndarray:
+    return 0.35 + 0.15 * np.sin(np.stack([5 * p[:, 0], 4 * p[:, 1] + 1, 6 * p[:, 2]], 1))
+
+
+def camera(direction: np.ndarray, name: str = "view") -> Camera:
+    """A camera three units from the origin, looking at it."""
+    z = -direction / np.linalg.norm(direction)
+    x = np.cross(z, [0.1, 0.2, 1.0])
+    x /= np.linalg.norm(x)
+    rotation = np.stack([x, np.cross(z, x), z])
+    return Camera(name, SIZE, SIZE, 200, 200, SIZE / 2, SIZE / 2, rotation, -rotation @ (-3 * z))
+
+
+def photo(view: Camera, highlight: float = 0.0, gain: float = 1.0) -> np.ndarray:
+    """The unit sphere as seen: paint, a highlight where it mirrors the camera, times an exposure; blue surround."""
+    ray = view.rays().reshape(-1, 3)
+    ray /= np.linalg.norm(ray, axis=1, keepdims=True)
+    b = ray @ view.centre
+    root = b * b - (view.centre @ view.centre - 1)
+    p = view.centre + (-b - np.sqrt(np.maximum(root, 0)))[:, None] * ray
+    colour = paint(p)
+    half = view.centre / np.linalg.norm(view.centre) + [0.3, 0, 0.2]
+    colour = colour + highlight * (p @ (half / np.linalg.norm(half)) > 0.985)[:, None]
+    colour = np.where(root[:, None] > 0, gain * colour, [0.0, 0.0, 1.0])
+    return np.clip(colour, 0, 1).reshape(SIZE, SIZE, 3).astype(np.float32)
+
+
+@pytest.fixture(scope="module")
+def sphere() -> RayCaster:
+    ball = trimesh.creation.icosphere(subdivisions=5)
+    return RayCaster(ball.vertices, ball.faces)
+
+
+def directions(n: int) -> np.ndarray:
+    k = np.arange(n) + 0.5
+    z, turn = 1 - 2 * k / n, np.pi * (1 + 5**0.5) * k
+    return np.stack([np.sqrt(1 - z * z) * np.cos(turn), np.sqrt(1 - z * z) * np.sin(turn), z], 1)
+
+
+def points(n: int = 3000) -> np.ndarray:
+    return directions(n)
+
+
+def test_highlights_and_exposures_fall_away(sphere: RayCaster) -> None:
+    p = points()
+    blender = ProjectionBlender(p, p, sphere, 3, 0.02)
+    gains = np.exp(np.random.default_rng(0).normal(0, 0.1, 30))
+    gains /= np.exp(np.log(gains).mean())
+    for d, gain in zip(directions(30), gains, strict=True):
+        blender.add(camera(d), photo(camera(d), highlight=0.5, gain=gain))
+    solved = blender.result(solve_exposure=True)
+    assert solved.seen.all()
+    assert solved.explained > 0.5
+    assert np.abs(np.log(solved.gains[:, 0] / gains)).max() < 0.02
+    error = np.abs(solved.values - paint(p)).max(1)
+    assert np.median(error) < 0.004 and np.quantile(error, 0.98) < 0.015
+    plain = blender.result(solve_exposure=False)
+    assert np.median(np.abs(plain.values - paint(p)).max(1)) > 0.01
+
+
+def test_reflections_are_no_exposures(sphere: RayCaster) -> None:
+    """Four times brighter at one place from each side: gains of up to a tenth are found, but they explain little."""
+    p = points()
+    blender = ProjectionBlender(p, p, sphere, 3, 0.02)
+    for d in directions(30):
+        shown = photo(camera(d))
+        y, x = np.mgrid[0:SIZE, 0:SIZE] / SIZE - 0.5
+        lobe = 1 + 3 * np.exp(-((x - 0.1 * d[0]) ** 2 + (y - 0.1 * d[1]) ** 2) / 0.01)
+        blender.add(camera(d), np.clip(0.2 * shown * lobe[..., None], 0, 1).astype(np.float32))
+    assert blender.result(solve_exposure=True).explained < 0.1
+
+
+def test_surround_never_reaches_the_surface(sphere: RayCaster) -> None:
+    """Even with poses a little wrong, so that some rim pixels show the surround."""
+    p = points()
+    blender = ProjectionBlender(p, p, sphere, 3, 0.02)
+    rng = np.random.default_rng(1)
+    for d in directions(30):
+        blender.add(camera(d + rng.normal(0, 0.01, 3)), photo(camera(d)))
+    assert np.quantile(blender.result().values[:, 2], 0.999) < 0.6
+
+
+def test_only_what_a_view_sees_is_seen(sphere: RayCaster) -> None:
+    p = points()
+    blender = ProjectionBlender(p, p, sphere, 3, 0.02)
+    d = np.array([0.0, 1.0, 0.0])
+    blender.add(camera(d), photo(camera(d)))
+    seen = blender.result().seen
+    assert seen[p[:, 1] > 0.6].all()
+    assert not seen[p[:, 1] < 1 / 3 - 0.02].any()  # the horizon of a camera at three radii
+
+
+def test_what_stands_in_front_hides(sphere: RayCaster) -> None:
+    ball = trimesh.creation.icosphere(subdivisions=3, radius=0.3)
+    ball.apply_translation([0, 1.5, 0])
+    both = trimesh.util.concatenate([trimesh.Trimesh(sphere.vertices, sphere.faces), ball])
+    p = points()
+    blender = ProjectionBlender(p, p, RayCaster(both.vertices, both.faces), 3, 0.02)
+    d = np.array([0.0, 1.0, 0.0])
+    blender.add(camera(d), photo(camera(d)))
+    seen = blender.result().seen
+    # The ball of radius 0.3 at distance 1.5 shades a cone of tan = 0.3 / sqrt(1.5² - 0.3²).
+    off = np.hypot(p[:, 0], p[:, 2]) / (3 - p[:, 1])
+    slope = 0.3 / np.sqrt(1.5**2 - 0.3**2)
+    front = p[:, 1] > 0.6
+    assert not seen[front & (off < slope - 0.02)].any() and seen[front & (off > slope + 0.03)].all()
+
+
+def test_masked_pixels_are_never_used(sphere: RayCaster) -> None:
+    p = points()
+    blender = ProjectionBlender(p, p, sphere, 3, 0.02)
+    d = np.array([0.0, 1.0, 0.0])
+    mask = np.full((SIZE, SIZE), 255, np.uint8)
+    mask[:, : SIZE // 2] = 0
+    blender.add(camera(d), photo(camera(d)), mask_weights(mask, 2))
+    pixels, _ = camera(d).project(p)
+    seen = blender.result().seen
+    assert not seen[pixels[:, 0] < SIZE / 2 - 1].any()
+    assert seen[(pixels[:, 0] > SIZE / 2 + 1) & (p[:, 1] > 0.6)].all()
+
+
+def test_fine_photos_are_filtered_to_the_texture(sphere: RayCaster) -> None:
+    """A photo of single-pixel checks must come out grey on a coarse texture, not as moiré."""
+    p = points(500)
+    blender = ProjectionBlender(p, p, sphere, 1, 0.2)
+    checks = np.indices((SIZE, SIZE)).sum(0) % 2
+    d = np.array([0.0, 1.0, 0.0])
+    blender.add(camera(d), checks[..., None].astype(np.float32))
+    blended = blender.result()
+    assert np.abs(blended.values[blended.seen] - 0.5).max() < 0.1
+
+
+def test_depth_edges_weigh_little_but_not_nothing() -> None:
+    depth = np.zeros((20, 40), np.float32)
+    depth[5:15, 5:35] = 2
+    weight = edge_weights(depth, 0.1, 4)
+    assert weight[10, 20] == 1 and 0 < weight[5, 20] < 0.01 and weight[6, 20] < weight[8, 20]
