@@ -66,7 +66,7 @@ def training(steps: int = 200, size: int = 128) -> dict[str, float]:
         rgb, mask = ((255 * x).clamp(0, 255).byte() for x in (out.features, out.alpha))
         views.append(TrainView(f"{i}", rgb, mask, turn, t, -turn.T @ t, pinhole))
     profile = Profile()
-    plan = Plan(profile.train, profile.splat, profile.loss, steps, 0.0, False, 0)
+    plan = Plan(profile.train, profile.surfels, profile.loss, steps, 0.0, False, 0)
     found = {}
     for device in ("cpu", "cuda"):
         start = Surfels(

@@ -80,10 +80,10 @@ def bake(photos: int, edge: int, target: str, out: Path, threads: int, rounds: i
         "stereo.enabled=always",
         f"train.iterations={STEPS}",
         f"refine.iterations={STEPS // 5}",
-        "skip.settled=never",
-        "skip.photos=never",
+        "skip.confirmed_steps=never",
+        "skip.redundant_photos=never",
         "skip.resolution=never",
-        "skip.converged=never",
+        "skip.converged_steps=never",
     ]
     best: dict[str, tuple[float, float]] = {}
     for number in range(rounds):

@@ -33,7 +33,7 @@ from benchmarks.skip import CpuClock, reuse, write
 from benchmarks.timeline import CAPTURES, ROOT, manifests, names
 from gsbake.cli.options import Options
 from gsbake.cli.session import open_session
-from gsbake.pipeline.errors import GsbakeError, UsageError
+from gsbake.errors import GsbakeError, UsageError
 
 RESULTS = ROOT / "benchmarks" / "results" / "materials.csv"
 #: The scorer's folder and interpreter, where `make score` has them.
@@ -43,12 +43,12 @@ TO_MESH = ("ingest", "poses", "stereo", "train", "refine", "mesh")
 #: Rows and what each sets beside the profile.
 NO_PRIORS = tuple(f"bake.{prior}_prior=0" for prior in ("smooth", "dark", "metal", "white", "parsimony"))
 STEPS: dict[str, tuple[str, ...]] = {
-    "projected": ("splat.shading=pbr", "bake.materials=surfels"),
+    "projected": ("surfels.shading=pbr", "bake.materials=surfels"),
     "fit": ("bake.materials=fit", "bake.visibility=none", *NO_PRIORS),
     "visibility": ("bake.materials=fit", "bake.visibility=directional", *NO_PRIORS),
     "bounce": ("bake.materials=fit", "bake.visibility=bounce", *NO_PRIORS),
     "reflections": ("bake.materials=fit", "bake.visibility=reflections", *NO_PRIORS),
-    "priors": ("bake.materials=fit", "bake.visibility=reflections", "bake.parsimony_prior=0"),
+    "priors": ("bake.materials=fit", "bake.visibility=reflections", "bake.sparsity=0"),
     "parsimony": ("bake.materials=fit", "bake.visibility=reflections"),
 }
 

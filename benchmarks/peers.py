@@ -23,7 +23,7 @@ from pathlib import Path
 
 from benchmarks.rows import Row
 from benchmarks.truth import Array, Figures, measure_aligned, measure_file, read_mesh, read_truth
-from gsbake.pipeline.errors import UsageError
+from gsbake.errors import UsageError
 
 ROOT = Path(__file__).resolve().parents[1]
 PEER = Path(os.environ.get("GSBAKE_PEER", ROOT / ".peer"))

@@ -31,10 +31,10 @@ from benchmarks.truth import measure_stage, read_truth
 from gsbake.cli.options import Options
 from gsbake.cli.session import open_session
 from gsbake.config.schema import Skip
+from gsbake.errors import BadInputError, UsageError
+from gsbake.monitor import SKIP_PREFIX
 from gsbake.pipeline.engine import Observer
-from gsbake.pipeline.errors import BadInputError, UsageError
 from gsbake.pipeline.plan import StageState
-from gsbake.pipeline.skip import PREFIX
 
 RESULTS = ROOT / "benchmarks" / "results" / "skip.csv"
 #: Stages that `--reuse` takes from another run.
@@ -112,7 +112,7 @@ def reuse(run: Path, out: Path, stages: Sequence[str] = EARLY) -> None:
 
 def measure_run(folder: Path, profile: str, rule: str, mode: str, out: Path, threads: int) -> Row:
     """Run everything with one rule set, or take what is cached, and measure it."""
-    overrides = [f"{PREFIX}{rule}={mode}"] if rule else []
+    overrides = [f"{SKIP_PREFIX}{rule}={mode}"] if rule else []
     options = Options(photos=folder, out=out, profile=profile, overrides=overrides, device="cpu", threads=threads)
     clock = CpuClock(out / "cpu.json")
     try:
@@ -121,7 +121,7 @@ def measure_run(folder: Path, profile: str, rule: str, mode: str, out: Path, thr
         return Row(folder.name, profile, rule, mode, "cannot be had", str(error))
     done = manifests(states)
     folders = {s.name: s.artifact.folder for s in states if s.artifact is not None}
-    mine = [d for m in done.values() for d in m["decisions"] if d["what"] == PREFIX + rule]
+    mine = [d for m in done.values() for d in m["decisions"] if d["what"] == SKIP_PREFIX + rule]
     said = [d["saved_s"] for d in mine if "saved_s" in d]
     figures = None
     try:

@@ -71,15 +71,15 @@ def trainer(surfels: int, size: int, materials: bool) -> Trainer:
     """A trainer in the middle of its run on the sphere of `benchmarks.raster`."""
     inputs, pinhole, rotation, translation = sphere(surfels, 3, size)
     points, iterations = inputs[0].numpy(), 1_000_000
-    profile = Profile.model_validate({"train": {"iterations": iterations, "max_size": size}, "splat": {"max_surfels": surfels}})
+    profile = Profile.model_validate({"train": {"iterations": iterations, "max_size": size}, "surfels": {"max_count": surfels}})
     photo = torch.randint(0, 256, (3, size, size), generator=torch.Generator().manual_seed(0), dtype=torch.uint8)
     mask = torch.full((size, size), 255, dtype=torch.uint8)
     view = TrainView("noise", photo, mask, rotation, translation, -rotation.T @ translation, pinhole)
     state = create(points, points, np.ones(surfels), None, "pbr" if materials else "colour", 1, 0.01, 20.0)
     state.log_scale = inputs[2].clone()
     state.sdf = state.transfer.distance(inputs[3], state.gamma)
-    light = EnvironmentLight(profile.splat.env_size) if materials else None
-    plan = Plan(profile.train, profile.splat, profile.loss, iterations, 0.0, False, 0)
+    light = EnvironmentLight(profile.light.size) if materials else None
+    plan = Plan(profile.train, profile.surfels, profile.loss, iterations, 0.0, False, 0)
     made = Trainer(plan, state, light, [view], [view], [])
     made.done = iterations // 2
     return made

@@ -30,7 +30,7 @@ from benchmarks.truth import measure_stage, read_truth
 from gsbake.cli.options import Options
 from gsbake.cli.session import Session, open_session
 from gsbake.config.load import load_profile
-from gsbake.pipeline.errors import BadInputError, UsageError
+from gsbake.errors import BadInputError, UsageError
 from gsbake.pipeline.plan import StageState
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -28,9 +28,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from gsbake.errors import UsageError
 from gsbake.geometry.cameras import CameraSet, Similarity
 from gsbake.geometry.raycast import RayCaster
-from gsbake.pipeline.errors import UsageError
 
 Array = NDArray[np.float64]
 

@@ -1,4 +1,4 @@
-"""Stage refine: SDF-guided pruning and densifying of the trained surfels, then a short fine-tune."""
+"""Stage refine: pruning, densification and fine-tuning of the trained surfels."""
 
 from __future__ import annotations
 
@@ -8,33 +8,25 @@ from gsbake.pipeline.stage import Context, Stage
 
 
 def run(ctx: Context) -> dict[str, Any]:
-    """Prune, densify and fine-tune; writes the same files as train and reports the counts before and after."""
-    from gsbake.capture.posed_photos import PosedPhotos
-    from gsbake.surfels.densification.refinement import prune_and_densify
-    from gsbake.surfels.model import Surfels
-    from gsbake.surfels.training.session import Session
+    """See `gsbake.surfels.training.run.refine_surfels`."""
+    from gsbake.surfels.training.run import RefineOptions, refine_surfels
+    from gsbake.surfels.training.session import TrainOptions
 
-    settings = ctx.settings
-    posed = PosedPhotos.open(ctx.inputs["poses"], ctx.inputs["train"])
-    surfels = Surfels.load(ctx.inputs["train"] / "surfels.safetensors")
-    light = None
-    if (ctx.inputs["train"] / "light.safetensors").exists():
-        from gsbake.shading.environment import EnvironmentLight
-
-        light = EnvironmentLight.load(ctx.inputs["train"] / "light.safetensors")
-    with ctx.part("prune and densify"):
-        surfels, counts = prune_and_densify(surfels, posed, settings.refine, settings.train.max_size, ctx.seed)
-    session = Session(ctx, posed, surfels, light, settings.refine.iterations, 0.0, None, ctx.inputs["train"])
-    return session.run() | {"counts": counts}
+    s = ctx.settings
+    training = TrainOptions(s.train, s.surfels, s.loss, converged_steps=s.skip.converged_steps)
+    return refine_surfels(
+        ctx.inputs["poses"], ctx.inputs["train"], ctx.out, RefineOptions(s.refine, training),
+        seed=ctx.seed, threads=ctx.threads, device=ctx.device, scratch=ctx.checkpoint, monitor=ctx,
+    )  # fmt: skip
 
 
 STAGE = Stage(
     name="refine",
     version=2,
-    title="refine surfels",
+    title="Surfel refinement",
     run=run,
     needs=("poses", "train"),
-    settings=("refine.*", "train.max_size", "train.holdout", "train.lr_*", "splat.*", "loss.*", "skip.converged"),
+    settings=("refine.*", "train.max_size", "train.holdout", "train.lr_*", "surfels.*", "loss.*", "skip.converged_steps"),
     uses_device=True,
     seeded=True,
 )

@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from gsbake.pipeline.errors import BadInputError
+from gsbake.errors import BadInputError
 
 #: What counts as a photo, by the end of the file name.
 PHOTO_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".exr", ".webp"})

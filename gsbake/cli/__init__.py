@@ -9,7 +9,7 @@ from types import FrameType
 
 def main() -> None:
     """Entry point of `gsbake`: every end has a documented exit code (0, 2, 42, 75; 1 for the unforeseen) and one sentence on stderr."""
-    from gsbake.pipeline.errors import GsbakeError, InterruptedRun
+    from gsbake.errors import GsbakeError, InterruptedRun
 
     def interrupted(number: int, frame: FrameType | None) -> None:
         raise InterruptedRun("Stopped on request; the same command goes on from here.")

@@ -9,11 +9,11 @@ from typing import Any
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
-from gsbake.cli.formatting import duration, figure, figures, size
 from gsbake.pipeline.engine import Observer
 from gsbake.pipeline.lease import Holder
 from gsbake.pipeline.plan import StageState
 from gsbake.pipeline.stage import Stage
+from gsbake.text import duration, figures, number, size
 
 #: Seconds between progress lines where there is no terminal.
 LINE_EVERY = 10.0
@@ -159,7 +159,7 @@ def _summary(state: StageState) -> str:
 
 
 def _live(live: Mapping[str, float]) -> str:
-    return " ".join(f"{name} {figure(value)}" for name, value in live.items())
+    return " ".join(f"{name} {number(value)}" for name, value in live.items())
 
 
 def _clock(seconds: float) -> str:

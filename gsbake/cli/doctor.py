@@ -19,8 +19,8 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from gsbake.cli.formatting import size
 from gsbake.pipeline.machine import cpu_name, cuda_devices, default_threads, resolve_device, torch_cuda_build, versions
+from gsbake.text import size
 
 #: Library (as pip calls it) → module that is imported to see whether it works.
 MODULES = {

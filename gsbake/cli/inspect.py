@@ -11,11 +11,11 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from gsbake.cli.formatting import duration, figures, size
 from gsbake.cli.options import Options
 from gsbake.cli.session import Session, open_session
 from gsbake.config.load import LoadedProfile, bounds, fields, load_profile, shipped
 from gsbake.pipeline.plan import StageState
+from gsbake.text import duration, figures, size
 
 _WORDS = {"cached": "cached", "replaced": "by hand", "run": "will run", "waits": "will run"}
 _STYLES = {"cached": "green", "replaced": "cyan", "run": "yellow", "waits": "yellow"}

@@ -9,7 +9,7 @@ import typer
 
 from gsbake.cli.options import Options
 from gsbake.cli.session import open_session
-from gsbake.pipeline.errors import BadInputError, UsageError
+from gsbake.errors import BadInputError, UsageError
 from gsbake.pipeline.replace import folder_files, replace_output, undo_replacement
 from gsbake.pipeline.store import Artifact
 

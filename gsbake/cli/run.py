@@ -8,15 +8,15 @@ from typing import Any
 import typer
 
 from gsbake.cli.display import choose_display, close_display
-from gsbake.cli.formatting import duration
 from gsbake.cli.inspect import plan_document, print_plan
 from gsbake.cli.options import Options
 from gsbake.cli.publish import publish_results
 from gsbake.cli.session import open_session
+from gsbake.errors import BadInputError
 from gsbake.pipeline.engine import artifacts_of
-from gsbake.pipeline.errors import BadInputError
 from gsbake.pipeline.files import disk_error, open_output
 from gsbake.pipeline.plan import StageState
+from gsbake.text import duration
 
 
 def run_pipeline(options: Options, target: str | None) -> None:

@@ -8,9 +8,9 @@ from pathlib import Path
 from gsbake.capture.sources import PHOTO_FOLDERS, discover, list_photos
 from gsbake.cli.options import Options
 from gsbake.config.load import DEFAULT, LoadedProfile, load_profile
+from gsbake.errors import UsageError
 from gsbake.pipeline.digest import list_files
 from gsbake.pipeline.engine import Engine, Observer
-from gsbake.pipeline.errors import UsageError
 from gsbake.pipeline.machine import default_threads, resolve_device
 from gsbake.pipeline.plan import Request
 from gsbake.pipeline.project import Project

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import typer
 
-from gsbake.cli.formatting import duration
-from gsbake.pipeline.errors import BadInputError
+from gsbake.errors import BadInputError
 from gsbake.pipeline.files import disk_error
+from gsbake.text import duration
 
 
 def synth(

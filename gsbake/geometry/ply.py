@@ -1,33 +1,87 @@
-"""Coloured point clouds as binary PLY (Turk 1994)."""
+"""Points and triangle meshes as binary little-endian PLY (Turk, *The PLY polygon file format*, 1994)."""
 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-_ROW = np.dtype([("xyz", "<f4", 3), ("rgb", "u1", 3)])
-_HEADER = (
-    "ply\nformat binary_little_endian 1.0\nelement vertex {}\nproperty float x\nproperty float y\nproperty float z\n"
-    "property uchar red\nproperty uchar green\nproperty uchar blue\nend_header\n"
-)
+#: Property names of a record's vector fields; a scalar field is its own property.
+PROPERTIES = {"position": ("x", "y", "z"), "normal": ("nx", "ny", "nz"), "colour": ("red", "green", "blue")}
+#: PLY's names of the scalar types in use.
+TYPES = {"<f4": "float", "|u1": "uchar"}
+
+#: A coloured point.
+COLOURED = np.dtype([("position", "<f4", 3), ("colour", "u1", 3)])
+
+
+def _header(record: np.dtype[Any], count: int) -> bytes:
+    """The header of `count` points whose fields are those of `record`."""
+    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]
+    for name in record.names or ():
+        kind = TYPES[record[name].base.str]
+        lines += [f"property {kind} {prop}" for prop in PROPERTIES.get(name, (name,))]
+    return "\n".join([*lines, "end_header", ""]).encode("ascii")
+
+
+def write_points(path: Path, rows: NDArray[Any]) -> None:
+    """Write the structured array `rows` (n,): vector fields as in `PROPERTIES`, scalar fields of 32-bit floats or bytes."""
+    path.write_bytes(_header(rows.dtype, len(rows)) + rows.tobytes())
+
+
+def read_points(path: Path, record: np.dtype[Any]) -> NDArray[Any]:
+    """The structured array (n,) that `write_points` wrote. Raises ValueError for a PLY with other properties."""
+    data = path.read_bytes()
+    end = data.find(b"end_header\n") + len(b"end_header\n")
+    count = next((int(line.split()[2]) for line in data[:end].splitlines() if line.startswith(b"element vertex")), 0)
+    if data[:end] != _header(record, count) or len(data) - end != count * record.itemsize:
+        raise ValueError(f"{path} does not hold points with {', '.join(record.names or ())}")
+    return np.frombuffer(data, record, count, end)
 
 
 def write_cloud(path: Path, points: ArrayLike, colours: ArrayLike) -> None:
     """Write `points` (n, 3) and 8-bit `colours` (n, 3)."""
     xyz = np.asarray(points, float).reshape(-1, 3)
-    rows = np.zeros(len(xyz), _ROW)
-    rows["xyz"], rows["rgb"] = xyz, np.asarray(colours, np.uint8).reshape(-1, 3)
-    path.write_bytes(_HEADER.format(len(rows)).encode("ascii") + rows.tobytes())
+    rows = np.zeros(len(xyz), COLOURED)
+    rows["position"], rows["colour"] = xyz, np.asarray(colours, np.uint8).reshape(-1, 3)
+    write_points(path, rows)
 
 
 def read_cloud(path: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
     """Points (n, 3) and colours (n, 3) that `write_cloud` wrote. Raises ValueError for any other PLY."""
-    data = path.read_bytes()
-    end = data.find(b"end_header\n") + len(b"end_header\n")
-    count = next((int(line.split()[2]) for line in data[:end].splitlines() if line.startswith(b"element vertex")), 0)
-    if data[:end] != _HEADER.format(count).encode("ascii") or len(data) - end != count * _ROW.itemsize:
-        raise ValueError(f"{path} is no point cloud of this program")
-    rows = np.frombuffer(data, _ROW, count, end)
-    return rows["xyz"].astype(np.float64), rows["rgb"].copy()
+    rows = read_points(path, COLOURED)
+    return rows["position"].astype(np.float64), rows["colour"].copy()
+
+
+def write_mesh(path: Path, vertices: ArrayLike, faces: ArrayLike) -> None:
+    """Write `vertices` (v, 3), in single precision, and triangles `faces` (f, 3)."""
+    points = np.asarray(vertices, "<f4").reshape(-1, 3)
+    corners = np.asarray(faces, "<i4").reshape(-1, 3)
+    rows = np.zeros(len(corners), np.dtype([("count", "u1"), ("corners", "<i4", 3)]))
+    rows["count"] = 3
+    rows["corners"] = corners
+    header = (
+        "ply\nformat binary_little_endian 1.0\n"
+        f"element vertex {len(points)}\nproperty float x\nproperty float y\nproperty float z\n"
+        f"element face {len(corners)}\nproperty list uchar int vertex_indices\nend_header\n"
+    )
+    path.write_bytes(header.encode("ascii") + points.tobytes() + rows.tobytes())
+
+
+def read_mesh(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Vertices (v, 3) and triangles (f, 3) of a PLY mesh of any program.
+
+    Raises ValueError when it is not readable, has no triangles, or positions that are not finite.
+    """
+    import trimesh
+
+    try:
+        mesh: Any = trimesh.load(path, process=False)
+        vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
+    except (OSError, ValueError, AttributeError, IndexError, KeyError) as error:
+        raise ValueError(f"{path} is not a readable triangle mesh ({error})") from error
+    if len(faces) == 0 or not np.isfinite(vertices).all():
+        raise ValueError(f"{path} has no triangles or positions that are not finite")
+    return vertices, faces

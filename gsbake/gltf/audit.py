@@ -13,8 +13,8 @@ from typing import Any, Literal
 
 import numpy as np
 
+from gsbake.errors import BadInputError
 from gsbake.gltf.read import GltfAsset, parse_glb
-from gsbake.pipeline.errors import BadInputError
 from gsbake.texturing.texels import overlapping
 
 Severity = Literal["error", "warning", "info"]

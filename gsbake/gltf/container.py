@@ -9,7 +9,7 @@ import json
 import struct
 from typing import Any
 
-from gsbake.pipeline.errors import BadInputError
+from gsbake.errors import BadInputError
 
 MAGIC, VERSION = 0x46546C67, 2
 JSON_CHUNK, BINARY_CHUNK = 0x4E4F534A, 0x004E4942

@@ -9,7 +9,7 @@ import numpy as np
 import OpenImageIO as oiio
 from numpy.typing import NDArray
 
-from gsbake.pipeline.errors import BadInputError
+from gsbake.errors import BadInputError
 
 #: Every file says it was captured then: the time of writing would change the file's digest from run to run.
 EPOCH = "1970:01:01 00:00:00"

@@ -121,27 +121,49 @@ class Fitted:
     levels: tuple[Level, ...]
 
 
+@dataclass(frozen=True)
+class FitSurface:
+    """What the fit knows of the n texels of a texture.
+
+    `position`, unit `normal` (n, 3) in the mesh's frame; `pairs` (m, 2) neighbouring texels, mixed as `gsbake.materials.adjacency` does;
+    `occlusion` (n,) ambient occlusion, 1 = open; `base_color` (n, 3) the initial linear base colour. With `visibility` shadows follow the
+    light, with `indirect` texels light each other as well.
+    """
+
+    texels: Texels
+    position: NDArray[Any]
+    pairs: NDArray[np.int64]
+    normal: NDArray[Any]
+    occlusion: NDArray[Any]
+    base_color: NDArray[Any]
+    visibility: Visibility | None = None
+    indirect: bool = True
+
+
+@dataclass(frozen=True)
+class FitSchedule:
+    """What a fit does in `iterations` steps of one photo each, whose order follows from `seed`.
+
+    Without `metallic` no metals are searched for, nor on an object that is `diffuse`. Without `emission` nothing is emissive, without
+    `intensity` the light's intensity is left to gradient steps, without `sparsity` materials may be as many as there are texels.
+    """
+
+    iterations: int
+    seed: int = 0
+    metallic: bool = True
+    emission: bool = True
+    intensity: bool = True
+    sparsity: bool = True
+    diffuse: bool = False
+
+
 class MaterialFit:
     """Holds texels and light while they are fitted."""
 
-    def __init__(
-        self,
-        texels: Texels,
-        at: NDArray[Any],
-        pairs: NDArray[np.int64],
-        normal: NDArray[Any],
-        occlusion: NDArray[Any],
-        base: NDArray[Any],
-        light_size: int,
-        priors: Priors,
-        roughness: float,
-        visibility: Visibility | None = None,
-        bounce: bool = True,
-    ) -> None:
-        """The n texels lie `at` (n, 3) with unit normals `normal` (n, 3), both in the mesh's frame; `pairs` (m, 2) of them are neighbours,
-        mixed as `gsbake.materials.adjacency` does; `occlusion` (n,) is their open share, `base` (n, 3) linear colours and `roughness` what
-        they start from; `light_size` is the edge of the environment cube map. With `visibility` shadows follow the light, with `bounce`
-        texels light each other as well."""
+    def __init__(self, surface: FitSurface, light_size: int, priors: Priors, roughness: float) -> None:
+        """`light_size` is the edge of the environment map's faces in texels, `roughness` the initial value of all texels."""
+        texels, at, pairs, normal = surface.texels, surface.position, surface.pairs, surface.normal
+        occlusion, base = surface.occlusion, surface.base_color
         n = len(texels)
         logits = torch.zeros(n, 5)
         logits[:, :3] = torch.logit(torch.as_tensor(np.clip(base, *BASE_RANGE), dtype=torch.float32))
@@ -153,7 +175,7 @@ class MaterialFit:
         open_share = torch.as_tensor(np.ascontiguousarray(occlusion, np.float32))[:, None]
         self._around = torch.cat([open_share, open_share, torch.zeros(n, AROUND - 2)], 1)
         self._texels, self._at, self._shown = texels, np.asarray(at, np.float64), base
-        self._visibility, self._bounce = visibility, bounce
+        self._visibility, self._bounce = surface.visibility, surface.indirect
         self._light = EnvironmentLight(light_size)
         self._priors = priors
         self._common: torch.Tensor | None = None
@@ -168,21 +190,11 @@ class MaterialFit:
         self,
         photos: list[Pixels],
         held: list[Pixels],
-        steps: int,
-        seed: int,
+        schedule: FitSchedule,
         each: Callable[[int, int], None] | None = None,
-        metals: bool = True,
-        glow: bool = True,
-        level: bool = True,
-        parsimony: bool = True,
-        matte: bool = False,
     ) -> Fitted:
-        """Fit to `photos` in `steps` steps of one photo each, in an order drawn from `seed`; `held` only tell how good it got.
-
-        Without `metals` none are looked for, nor on things that are `matte`. Without `glow` nothing glows, without `level` the light's
-        brightness is left to the steps, without `parsimony` materials may be as many as there are texels.
-        """
-        generator = torch.Generator().manual_seed(seed)
+        """Fit to `photos`; the pixels `held` are only used to measure the result. `each(done, total)` is called after every step."""
+        steps, generator = schedule.iterations, torch.Generator().manual_seed(schedule.seed)
         batches = [Batch.of(p, self._normal) for p in photos if len(p)]
         order: list[int] = []
         metal, glowing = np.zeros(len(self._logits), bool), 0
@@ -190,18 +202,18 @@ class MaterialFit:
         self._common, self._unexplained = None, torch.zeros(2)
         for step in range(steps if batches else 0):
             anew = step % COMMON_ANEW == 0
-            if glow and step == int(GLOW_AT * steps):
+            if schedule.emission and step == int(GLOW_AT * steps):
                 glowing = self._set_glow(batches)
-            if level and step in {int(share * steps) for share in LEVEL_AT}:
-                levels.append(self._set_level(batches, generator, not matte or len(levels) < TINTED_MATT, not levels))
+            if schedule.intensity and step in {int(share * steps) for share in LEVEL_AT}:
+                levels.append(self._set_level(batches, generator, not schedule.diffuse or len(levels) < TINTED_MATT, not levels))
                 anew = True
-            if metals and not matte and step in {int(share * steps) for share in METALS_AT}:
+            if schedule.metallic and not schedule.diffuse and step in {int(share * steps) for share in METALS_AT}:
                 metal = self._set_metals(batches)
                 anew = True
             if step % RENEWED == 0:
                 self._renew()
                 self._unexplained *= KEPT
-            if parsimony and self._priors.parsimony and anew and step >= COMMON_AT * steps:
+            if schedule.sparsity and self._priors.parsimony and anew and step >= COMMON_AT * steps:
                 self._common = self._find_common()
             order = order or torch.randperm(len(batches), generator=generator).tolist()
             self._step(batches[order.pop()], 0.1 ** (step / steps), generator)

@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
-from gsbake.materials.fit import Fitted, MaterialFit
+from gsbake.materials.fit import FitSchedule, Fitted, MaterialFit
 from gsbake.materials.map_selection import without_metal
 from gsbake.materials.pixels import Pixels
 
@@ -60,7 +60,7 @@ def best_fit(
     starts = rivals(trials) or [TRIALS[-1] if matte else TRIALS[1]]
     starts = starts if judged else starts[:1]
     fits = [make(roughness) for roughness in starts]
-    results = [fit.run(photos, held, steps, seed, each, matte=matte) for fit in fits]
+    results = [fit.run(photos, held, FitSchedule(steps, seed, diffuse=matte), each) for fit in fits]
     best = max(range(len(fits)), key=lambda k: results[k].held_out or 0.0)
     chosen, fitted, made = fits[best], results[best], len(fits)
     why = ", ".join(f"{score:.2f} dB from {roughness:g}" for roughness, score in trials.items())
@@ -70,7 +70,7 @@ def best_fit(
     bare = chosen.psnr(held, without_metal(fitted.values)) if fitted.metal.any() else None
     if bare is not None and fitted.held_out is not None and bare > fitted.held_out - DOUBTED:
         again = make(starts[best])
-        other = again.run(photos, held, steps, seed, each, metals=False)
+        other = again.run(photos, held, FitSchedule(steps, seed, metallic=False), each)
         made += 1
         evidence = f"held-out photos are shown to {fitted.held_out:.2f} dB with them, fitted without to {other.held_out or 0.0:.2f} dB"
         if (other.held_out or 0.0) > fitted.held_out:
@@ -91,7 +91,8 @@ def trial_roughness(
     judges, rest = few[::TRIAL_PHOTO], [p for i, p in enumerate(few) if i % TRIAL_PHOTO]
     found: dict[float, float] = {}
     for turn, roughness in enumerate(TRIALS):
-        score = make(roughness).run(rest, judges, TRIAL_STEPS, seed, metals=False, glow=False, level=False, parsimony=False).held_out
+        schedule = FitSchedule(TRIAL_STEPS, seed, metallic=False, emission=False, intensity=False, sparsity=False)
+        score = make(roughness).run(rest, judges, schedule).held_out
         if score is not None:
             found[roughness] = score
         if each is not None:

@@ -57,7 +57,8 @@ class StereoRun:
         """Load the photos and choose their neighbours."""
         self.photos = self.parallel(lambda i: levels(load_photo(self.posed, i, self.settings.max_size)), "photos")
         points, normals = self._surface()
-        self.matched, self.asked = choose(self.posed.cameras.cameras, points, normals, self.settings.neighbours, self.settings.confirming)
+        cameras, settings = self.posed.cameras.cameras, self.settings
+        self.matched, self.asked = choose(cameras, points, normals, settings.neighbours, settings.consistency_views)
 
     def _surface(self) -> tuple[Array, Array | None]:
         """Sample points of the object, with normals where they are known."""
@@ -129,7 +130,7 @@ class StereoRun:
 
         `shared` keeps the depths (h, w; 0 = none) of each photo that others agreed with in the first round.
         """
-        least = self.settings.min_views
+        least = self.settings.min_consistent_views
 
         def ask(index: int, good: Sequence[NDArray[np.uint8]]) -> Any:
             others = [(self.photos[j][-1].camera, self._planes(j).plane, good[j]) for j in self.asked[index]]

@@ -1,4 +1,4 @@
-"""The fused points: oriented, coloured, with size and trust, as binary PLY (Turk 1994)."""
+"""The fused point cloud: oriented, coloured, with pixel size and confidence."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from gsbake.geometry.ply import read_points, write_points
+
 Array = NDArray[np.float64]
 
-_ROW = np.dtype([("xyz", "<f4", 3), ("normal", "<f4", 3), ("rgb", "u1", 3), ("radius", "<f4"), ("confidence", "<f4"), ("views", "u1")])
-_HEADER = (
-    "ply\nformat binary_little_endian 1.0\nelement vertex {}\nproperty float x\nproperty float y\nproperty float z\n"
-    "property float nx\nproperty float ny\nproperty float nz\nproperty uchar red\nproperty uchar green\nproperty uchar blue\n"
-    "property float radius\nproperty float confidence\nproperty uchar views\nend_header\n"
+#: One point in the file.
+RECORD = np.dtype(
+    [("position", "<f4", 3), ("normal", "<f4", 3), ("colour", "u1", 3), ("radius", "<f4"), ("confidence", "<f4"), ("views", "u1")]
 )
 
 
@@ -44,19 +44,15 @@ class StereoCloud:
 
     def save(self, path: Path) -> None:
         """Write as PLY."""
-        rows = np.zeros(len(self), _ROW)
-        rows["xyz"], rows["normal"], rows["rgb"] = self.points, self.normals, self.colours
+        rows = np.zeros(len(self), RECORD)
+        rows["position"], rows["normal"], rows["colour"] = self.points, self.normals, self.colours
         rows["radius"], rows["confidence"], rows["views"] = self.radius, self.confidence, self.views
-        path.write_bytes(_HEADER.format(len(rows)).encode("ascii") + rows.tobytes())
+        write_points(path, rows)
 
     @staticmethod
     def load(path: Path) -> StereoCloud:
         """Read what `save` wrote. Raises ValueError for any other PLY."""
-        data = path.read_bytes()
-        end = data.find(b"end_header\n") + len(b"end_header\n")
-        count = next((int(line.split()[2]) for line in data[:end].splitlines() if line.startswith(b"element vertex")), 0)
-        if data[:end] != _HEADER.format(count).encode("ascii") or len(data) - end != count * _ROW.itemsize:
-            raise ValueError(f"{path} is no cloud of the stereo stage")
-        rows = np.frombuffer(data, _ROW, count, end)
-        wide = {k: rows[k].astype(np.float64) for k in ("xyz", "normal", "radius", "confidence")}
-        return StereoCloud(wide["xyz"], wide["normal"], rows["rgb"].copy(), wide["radius"], wide["confidence"], rows["views"].copy())
+        rows = read_points(path, RECORD)
+        wide = {k: rows[k].astype(np.float64) for k in ("position", "normal", "radius", "confidence")}
+        colours, views = rows["colour"].copy(), rows["views"].copy()
+        return StereoCloud(wide["position"], wide["normal"], colours, wide["radius"], wide["confidence"], views)

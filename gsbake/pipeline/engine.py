@@ -9,7 +9,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from gsbake.pipeline.errors import GsbakeError, InterruptedRun
+from gsbake.errors import GsbakeError, InterruptedRun
 from gsbake.pipeline.events import EventLog, now
 from gsbake.pipeline.files import disk_error, open_output, remove_tree
 from gsbake.pipeline.key import HASH_FORMAT, SHORT, Ingredients

@@ -9,7 +9,7 @@ import uuid
 from contextlib import suppress
 from pathlib import Path
 
-from gsbake.pipeline.errors import BadInputError, UsageError
+from gsbake.errors import BadInputError, UsageError
 
 #: errno values that mean the disk (or the quota) is full.
 FULL = frozenset({errno.ENOSPC, errno.EDQUOT})

@@ -18,7 +18,7 @@ from typing import Any
 
 import psutil
 
-from gsbake.pipeline.errors import UsageError
+from gsbake.errors import UsageError
 
 #: The libraries whose versions are kept in manifests and shown by `doctor`.
 LIBRARIES = (

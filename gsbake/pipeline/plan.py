@@ -9,8 +9,8 @@ from typing import Any, Literal
 
 from pydantic import BaseModel
 
+from gsbake.errors import BadInputError
 from gsbake.pipeline.digest import tree_digest
-from gsbake.pipeline.errors import BadInputError
 from gsbake.pipeline.key import Ingredients
 from gsbake.pipeline.settings import declared, defaults, flatten
 from gsbake.pipeline.stage import Stage

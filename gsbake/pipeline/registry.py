@@ -8,7 +8,7 @@ from __future__ import annotations
 import importlib
 from collections.abc import Mapping
 
-from gsbake.pipeline.errors import UsageError
+from gsbake.errors import UsageError
 from gsbake.pipeline.stage import Stage
 
 

@@ -7,8 +7,8 @@ import shutil
 from collections.abc import Mapping
 from pathlib import Path
 
+from gsbake.errors import UsageError
 from gsbake.pipeline.digest import list_files, tree_digest
-from gsbake.pipeline.errors import UsageError
 from gsbake.pipeline.events import now
 from gsbake.pipeline.files import remove_tree, write_atomic
 from gsbake.pipeline.lease import Lease

@@ -19,8 +19,8 @@ from typing import Any
 
 import psutil
 
-from gsbake.pipeline import errors
-from gsbake.pipeline.errors import BadInputError, GsbakeError, InterruptedRun
+from gsbake import errors
+from gsbake.errors import BadInputError, GsbakeError, InterruptedRun
 from gsbake.pipeline.machine import thread_environment
 from gsbake.pipeline.worker import Job
 

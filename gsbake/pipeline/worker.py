@@ -26,7 +26,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from gsbake.pipeline.errors import GsbakeError, InterruptedRun
+from gsbake.errors import GsbakeError, InterruptedRun
 from gsbake.pipeline.files import disk_error
 from gsbake.pipeline.machine import peak_memory
 from gsbake.pipeline.registry import load_stage

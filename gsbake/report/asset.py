@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
+from gsbake.errors import BadInputError
 from gsbake.gltf.read import GltfAsset, read_glb
-from gsbake.pipeline.errors import BadInputError
 from gsbake.report.render import Asset, Floats, decode_srgb
 
 #: glTF's sampler value for clamping to the edge.

@@ -7,6 +7,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
 
+from gsbake.text import duration
+
 #: Points per curve in the page; more cannot be seen.
 CURVE_POINTS = 240
 
@@ -149,23 +151,3 @@ def number(value: float, digits: int = 3) -> str:
     if abs(value) < 1e-3:
         return f"{value:.{digits - 3}e}".replace("e-0", "e-")
     return f"{value:.{digits}g}"
-
-
-def duration(seconds: float) -> str:
-    """Seconds as a person reads them: 0.4 s, 12 s, 3 min 05 s, 1 h 12 min."""
-    if seconds < 10:
-        return f"{seconds:.1f} s"
-    whole = round(seconds)
-    if whole < 60:
-        return f"{whole} s"
-    if whole < 3600:
-        return f"{whole // 60} min {whole % 60:02d} s"
-    return f"{whole // 3600} h {whole % 3600 // 60:02d} min"
-
-
-def size(count: float) -> str:
-    """Bytes as a person reads them: 812 kB, 3.4 MB, 1.9 GB."""
-    for unit, step in (("GB", 1e9), ("MB", 1e6)):
-        if count >= step:
-            return f"{count / step:.{0 if count >= 100 * step else 1}f} {unit}"
-    return f"{count / 1e3:.0f} kB"

@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 
 from gsbake.capture.posed_photos import PosedPhotos
 from gsbake.geometry.cameras import Camera
-from gsbake.report.charts import duration, size
 from gsbake.report.html import Comparison, Figure, Light, Panel, hdr_base64, picture_uri
 from gsbake.report.lights import PROCEDURAL, LitShader, procedural
 from gsbake.report.manifests import Manifests, peak, total_seconds
 from gsbake.report.quality import Likeness, compare
 from gsbake.report.render import Asset, Renderer, Shader, unlit
 from gsbake.shading.environment import EnvironmentLight
+from gsbake.text import duration, size
 
 Array = NDArray[np.float64]
 

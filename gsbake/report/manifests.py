@@ -12,10 +12,11 @@ from pathlib import Path
 from typing import Any
 
 from gsbake.config.schema import Skip
-from gsbake.pipeline.errors import BadInputError
-from gsbake.pipeline.skip import PREFIX
-from gsbake.report.charts import Bar, Curve, bars, duration, lines, size
+from gsbake.errors import BadInputError
+from gsbake.monitor import SKIP_PREFIX
+from gsbake.report.charts import Bar, Curve, bars, lines
 from gsbake.report.html import Check, Decision, LeftOut, StageRow, Warned
+from gsbake.text import duration, size
 
 #: Stages in the order they run in.
 ORDER = ("ingest", "poses", "stereo", "train", "refine", "mesh", "bake", "export")
@@ -71,7 +72,7 @@ def decisions(manifests: Manifests) -> tuple[Decision, ...]:
     return tuple(
         Decision(stage, *(str(d.get(k, "")) for k in ("what", "choice", "evidence")))
         for stage, d in _decided(manifests)
-        if not str(d.get("what", "")).startswith(PREFIX)
+        if not str(d.get("what", "")).startswith(SKIP_PREFIX)
     )
 
 
@@ -80,10 +81,10 @@ def left_out(manifests: Manifests) -> tuple[LeftOut, ...]:
     found: dict[str, list[LeftOut]] = {}
     for stage, d in _decided(manifests):
         what, saved = str(d.get("what", "")), d.get("saved_s")
-        if what.startswith(PREFIX):
+        if what.startswith(SKIP_PREFIX):
             time = "" if saved is None else f"about {duration(float(saved))}"
             found.setdefault(what, []).append(LeftOut(what, stage, str(d.get("choice", "")), str(d.get("evidence", "")), time))
-    rules = dict.fromkeys([*(PREFIX + rule for rule in Skip.model_fields), *found]) if found else {}
+    rules = dict.fromkeys([*(SKIP_PREFIX + rule for rule in Skip.model_fields), *found]) if found else {}
     return tuple(row for rule in rules for row in found.get(rule, [LeftOut(rule, "", "not asked", "this run has no such step", "")]))
 
 

@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from skimage.metrics import structural_similarity
 
 from gsbake.capture.posed_photos import View
+from gsbake.errors import BadInputError
 from gsbake.geometry.cameras import Camera
-from gsbake.pipeline.errors import BadInputError
 from gsbake.report.render import Floats, Picture
 
 #: Grey (sRGB value) behind photo and render.

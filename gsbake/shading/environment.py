@@ -16,7 +16,7 @@ import safetensors.torch
 import torch
 from numpy.typing import NDArray
 
-from gsbake.pipeline.errors import BadInputError
+from gsbake.errors import BadInputError
 from gsbake.shading import cubemap, panorama
 from gsbake.shading.cubemap import Array
 from gsbake.shading.light_tables import LightTables, filter_cube

@@ -21,7 +21,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from gsbake.pipeline.errors import UsageError
+from gsbake.errors import UsageError
 from gsbake.shading.cubemap import Array
 
 Convention = Literal["blender", "gltf"]

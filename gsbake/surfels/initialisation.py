@@ -70,14 +70,14 @@ def _unit(v: Floats) -> Floats:
     return np.asarray(v / np.maximum(np.linalg.norm(v, axis=-1, keepdims=True), 1e-12))
 
 
-def begin(posed: PosedPhotos, train: Any, splat: Any, seed: int, stereo: Path | None = None) -> tuple[Surfels, str, str]:
+def begin(posed: PosedPhotos, train: Any, model: Any, seed: int, stereo: Path | None = None) -> tuple[Surfels, str, str]:
     """Surfels to start from, the source taken ("stereo", "hull", "points", "sphere") and the evidence for it.
 
-    `train` and `splat` are the profile's sections, `stereo` is the folder of the stereo stage. With "auto" stereo wins where it found
+    `train` and `model` are the profile's sections, `stereo` is the folder of the stereo stage. With "auto" stereo wins where it found
     enough points, then the hull when every photo has a mask, then SfM points (200 or more), then the sphere.
     """
     if train.init in ("auto", "stereo") and stereo is not None:
-        begun = _from_stereo(posed, train, splat, seed, stereo)
+        begun = _from_stereo(posed, train, model, seed, stereo)
         if begun is not None:
             return begun
     cloud = posed.points()
@@ -101,8 +101,8 @@ def begin(posed: PosedPhotos, train: Any, splat: Any, seed: int, stereo: Path | 
         sdf = 0.01
     elif kind == "points" and cloud is not None:
         points, rgb = cloud
-        if len(points) > splat.max_surfels:
-            keep = rng.permutation(len(points))[: splat.max_surfels]
+        if len(points) > model.max_count:
+            keep = rng.permutation(len(points))[: model.max_count]
             points, rgb = points[keep], rgb[keep]
         centres = np.stack([c.centre for c in posed.cameras.cameras])
         normals = _cloud_normals(points, centres)
@@ -111,14 +111,14 @@ def begin(posed: PosedPhotos, train: Any, splat: Any, seed: int, stereo: Path | 
         points = SPHERE_RADIUS * fibonacci_sphere(train.init_surfels)
         normals, colours, sdf = points / SPHERE_RADIUS, None, 0.2
     gap = np.minimum(spacing(points), 0.3)
-    return create(points, normals, gap, colours, splat.shading, splat.sh_degree, sdf, 1.0, splat.transfer), kind, why
+    return create(points, normals, gap, colours, model.shading, model.sh_degree, sdf, 1.0, model.transfer), kind, why
 
 
-def _from_stereo(posed: PosedPhotos, train: Any, splat: Any, seed: int, folder: Path) -> tuple[Surfels, str, str] | None:
+def _from_stereo(posed: PosedPhotos, train: Any, model: Any, seed: int, folder: Path) -> tuple[Surfels, str, str] | None:
     """Surfels on the stereo points and on the hull in their holes, or None when stereo found too few."""
     from gsbake.mvs.initial_points import start_points
 
-    begun = start_points(posed, folder, min(train.init_surfels, splat.max_surfels), seed)
+    begun = start_points(posed, folder, min(train.init_surfels, model.max_count), seed)
     if begun is None:
         return None
     points, normals, colours = begun.points, begun.normals, begun.colours
@@ -128,4 +128,4 @@ def _from_stereo(posed: PosedPhotos, train: Any, splat: Any, seed: int, folder: 
     gap = np.minimum(spacing(points), 0.3)
     why = f"{begun.stereo} evenly spread stereo points, {filled} hull points in their holes"
     # One sample for all: at the starting sharpness of 1 every one of them is opaque.
-    return create(points, normals, gap, colours, splat.shading, splat.sh_degree, STEREO_SDF, 1.0, splat.transfer), "stereo", why
+    return create(points, normals, gap, colours, model.shading, model.sh_degree, STEREO_SDF, 1.0, model.transfer), "stereo", why

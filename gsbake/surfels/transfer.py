@@ -31,7 +31,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from gsbake.pipeline.errors import BadInputError
+from gsbake.errors import BadInputError
 
 #: |s| (unit frame) below which the sharpness aimed at no longer follows the median, and the share of the peak it aims at there.
 SETTLED, SETTLED_SHARE = 0.1, 0.95
@@ -82,7 +82,7 @@ def _neus(x: Tensor) -> Tensor:
     return (_EC - 1 / _EC) * t / (1 + _EC * t)
 
 
-#: The transfers by name, as `splat.transfer` of a profile names them.
+#: The transfers by name, as `surfels.transfer` of a profile names them.
 TRANSFERS = {
     t.name: t
     for t in (

@@ -15,8 +15,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from gsbake.errors import UsageError
 from gsbake.geometry.cameras import Camera, CameraSet
-from gsbake.pipeline.errors import UsageError
 from gsbake.synth import scene
 from gsbake.synth.shade import Rig, render, studio
 

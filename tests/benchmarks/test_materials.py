@@ -12,10 +12,10 @@ from PIL import Image
 from benchmarks.maps import _least_error, _true_values
 from benchmarks.materials import STEPS, Row, main, markdown, score, thinned, write
 from gsbake.config.load import load_profile
+from gsbake.errors import UsageError
 from gsbake.gltf.write import GltfImages, GltfMesh, build_glb
 from gsbake.imaging.png import encode_png
 from gsbake.imaging.srgb import decode
-from gsbake.pipeline.errors import UsageError
 
 
 def square() -> GltfMesh:

@@ -13,7 +13,7 @@ import pytest
 from PIL import Image
 
 from benchmarks.skip import CpuClock, Row, main, measure_run, reuse, write
-from gsbake.pipeline.errors import UsageError
+from gsbake.errors import UsageError
 from gsbake.pipeline.plan import StageState
 from gsbake.pipeline.store import Artifact
 

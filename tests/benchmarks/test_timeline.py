@@ -8,7 +8,7 @@ import pytest
 
 from benchmarks import timeline
 from benchmarks.rows import Row, read_csv, write_csv
-from gsbake.pipeline.errors import UsageError
+from gsbake.errors import UsageError
 
 OLD = Row("elsewhere", "gsbake", "preview", "hull", 10, 5.0, 1.0, 0.9, 9.0)
 

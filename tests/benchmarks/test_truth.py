@@ -24,8 +24,8 @@ from benchmarks.truth import (
     read_mesh,
     read_truth,
 )
+from gsbake.errors import UsageError
 from gsbake.geometry.cameras import Similarity
-from gsbake.pipeline.errors import UsageError
 
 AROUND = {str(i): 4.0 * v / np.linalg.norm(v) for i, v in enumerate(np.array(list(np.ndindex(3, 3, 3))) - 1.0) if v.any()}
 

@@ -1,82 +1,53 @@
-"""A stand-in for the engine: runs a stage in a folder and keeps what it said."""
+"""Reading and posing captures in a folder of the test, keeping what was reported."""
 
 from __future__ import annotations
 
 import os
-import time
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from gsbake.capture.estimate_poses import PoseOptions, estimate_poses
+from gsbake.capture.ingest import IngestOptions, ingest
 from gsbake.capture.sources import discover
-from gsbake.config.schema import Profile
+from gsbake.config.schema import Ingest, Poses
+from gsbake.monitor import Rule
+from tests.support.recorder import Recorder
 
 CAPTURES = Path(os.environ.get("GSBAKE_CAPTURES", Path(__file__).resolve().parents[3] / "shared" / "captures"))
 
 
-class FakeContext:
-    """The Context of a stage under test; `warnings` and `decisions` keep what it reported."""
+class Done(Recorder):
+    """What a step reported, and the folder it wrote."""
 
-    def __init__(self, out: Path, inputs: Mapping[str, Path], settings: Any, checkpoint: Path) -> None:
+    def __init__(self, out: Path) -> None:
+        super().__init__()
+        self.out = out
         out.mkdir(parents=True)
-        checkpoint.mkdir(parents=True, exist_ok=True)
-        self.out, self.inputs, self.settings, self.checkpoint = out, inputs, settings, checkpoint
-        self.seed, self.threads, self.device = 0, 2, "cpu"
-        self.warnings: list[str] = []
-        self.decisions: dict[str, str] = {}
-        self.parts: dict[str, float] = {}
-        self.progressed: list[tuple[int, int, str]] = []
-
-    @contextmanager
-    def part(self, name: str) -> Iterator[None]:
-        start = time.perf_counter()
-        try:
-            yield
-        finally:
-            self.parts[name] = self.parts.get(name, 0.0) + time.perf_counter() - start
-
-    def progress(self, done: int, total: int, text: str = "", **live: float) -> None:
-        self.progressed.append((done, total, text))
-
-    def stop_requested(self) -> bool:
-        return False
-
-    def check_stop(self) -> None:
-        return None
-
-    def decide(self, what: str, choice: str, evidence: str, saved: float | None = None) -> None:
-        self.decisions[what] = f"{choice} ({evidence})"
-
-    def warn(self, text: str) -> None:
-        self.warnings.append(text)
 
 
 class Runner:
-    """Runs ingest and poses on a folder of photos."""
+    """Reads a capture and estimates its poses."""
 
     def __init__(self, root: Path) -> None:
         self.root = root
 
     def ingest(
-        self, photos: Path, masks: Path | None = None, poses: Path | None = None, skip: Mapping[str, str] | None = None, **settings: Any
-    ) -> tuple[dict[str, Any], FakeContext]:
-        from gsbake.stages.ingest import run
+        self, photos: Path, masks: Path | None = None, poses: Path | None = None, resolution: Rule = "auto",
+        settings: Mapping[str, Any] | None = None, **more: Any,
+    ) -> tuple[dict[str, Any], Done]:  # fmt: skip
+        found, done = discover(photos, masks, poses), Done(self.root / "ingest")
+        options = IngestOptions(Ingest(**{**(settings or {}), **more}), resolution)
+        return ingest(found.photos, done.out, options, masks=found.masks, poses=found.poses, monitor=done), done
 
-        found = discover(photos, masks, poses)
-        inputs = {k: v for k, v in {"photos": found.photos, "masks": found.masks, "poses": found.poses}.items() if v is not None}
-        ctx = FakeContext(self.root / "ingest", inputs, Profile.model_validate({"ingest": settings, "skip": skip or {}}), self.root / "c1")
-        return run(ctx), ctx
-
-    def poses(self, skip: Mapping[str, str] | None = None, **settings: Any) -> tuple[dict[str, Any], FakeContext]:
-        from gsbake.stages.poses import run
-
-        profile = Profile.model_validate({"poses": settings, "skip": skip or {}})
-        ctx = FakeContext(self.root / "poses", {"ingest": self.root / "ingest"}, profile, self.root / "c2")
-        return run(ctx), ctx
+    def poses(self, redundant_photos: Rule = "auto", **settings: Any) -> tuple[dict[str, Any], Done]:
+        done, scratch = Done(self.root / "poses"), self.root / "scratch"
+        scratch.mkdir(exist_ok=True)
+        options = PoseOptions(Poses(**settings), redundant_photos)
+        return estimate_poses(self.root / "ingest", done.out, options, scratch=scratch, monitor=done), done
 
 
 @pytest.fixture

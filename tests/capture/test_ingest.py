@@ -10,8 +10,8 @@ import pytest
 from PIL import Image
 
 from gsbake.capture.photos.quality import blur_effect, blurred, near_duplicates
+from gsbake.errors import BadInputError
 from gsbake.geometry.cameras import CameraSet
-from gsbake.pipeline.errors import BadInputError
 from tests.capture.conftest import Runner, picture
 
 
@@ -27,12 +27,12 @@ def listing(runner: Runner) -> dict[str, Any]:
 
 
 def test_plain_photos(tmp_path: Path, runner: Runner) -> None:
-    results, ctx = runner.ingest(photos(tmp_path / "images"), max_size=32)
-    assert results["photos"] == 4 and results["masks"] == 0 and results["poses"] == "none" and not ctx.warnings
+    results, done = runner.ingest(photos(tmp_path / "images"), max_size=32)
+    assert results["photos"] == 4 and results["masks"] == 0 and results["poses"] == "none" and not done.warnings
     entry = listing(runner)["photos"][1]
     assert (entry["name"], entry["width"], entry["height"], entry["source_width"], entry["mask"]) == ("p1", 32, 24, 64, None)
-    assert cv2.imread(str(ctx.out / entry["file"])).shape == (24, 32, 3)
-    assert not (ctx.out / "masks").exists() and not (ctx.out / "poses").exists()
+    assert cv2.imread(str(done.out / entry["file"])).shape == (24, 32, 3)
+    assert not (done.out / "masks").exists() and not (done.out / "poses").exists()
 
 
 def test_exposure_is_log2_of_light(tmp_path: Path, runner: Runner) -> None:
@@ -52,9 +52,9 @@ def test_truncated_jpeg_among_good_ones(tmp_path: Path, runner: Runner) -> None:
     folder = photos(tmp_path / "images", 4, "jpg")
     data = (folder / "p2.jpg").read_bytes()
     (folder / "p2.jpg").write_bytes(data[: len(data) * 2 // 3])
-    results, ctx = runner.ingest(folder)
+    results, done = runner.ingest(folder)
     assert results["photos"] == 3 and results["skipped"] == 1
-    assert any("p2.jpg" in w and "skipped" in w for w in ctx.warnings)
+    assert any("p2.jpg" in w and "skipped" in w for w in done.warnings)
     assert [s["source"] for s in listing(runner)["skipped"]] == ["p2.jpg"]
 
 
@@ -62,10 +62,10 @@ def test_copies_and_alike_photos(tmp_path: Path, runner: Runner) -> None:
     folder = photos(tmp_path / "images", 4)
     (folder / "copy.png").write_bytes((folder / "p0.png").read_bytes())
     Image.fromarray(picture(1)).save(folder / "again.jpg", quality=97)
-    results, ctx = runner.ingest(folder)
+    results, done = runner.ingest(folder)
     assert results["photos"] == 5 and results["skipped"] == 1 and results["near_duplicates"] == 1
     assert {e["name"]: e["duplicate_of"] for e in listing(runner)["photos"]}["p1"] == "again"
-    assert any("copy" in w for w in ctx.warnings) and any("p1 = again" in w for w in ctx.warnings)
+    assert any("copy" in w for w in done.warnings) and any("p1 = again" in w for w in done.warnings)
 
 
 def test_alpha_becomes_mask(tmp_path: Path, runner: Runner) -> None:
@@ -75,11 +75,11 @@ def test_alpha_becomes_mask(tmp_path: Path, runner: Runner) -> None:
         rgba = np.dstack([picture(i), np.zeros((48, 64), np.uint8)])
         rgba[10:30, 10:30, 3] = 255
         Image.fromarray(rgba).save(folder / f"p{i}.png")
-    results, ctx = runner.ingest(folder)
-    assert results["masks"] == 3 and "3 alpha channels" in ctx.decisions["skip.masks"]
-    mask = cv2.imread(str(ctx.out / "masks" / "p1.png"), cv2.IMREAD_GRAYSCALE)
+    results, done = runner.ingest(folder)
+    assert results["masks"] == 3 and "3 alpha channels" in done.line("masks")
+    mask = cv2.imread(str(done.out / "masks" / "p1.png"), cv2.IMREAD_GRAYSCALE)
     assert mask is not None and mask[20, 20] == 255 and mask[5, 5] == 0 and int((mask == 255).sum()) == 400
-    assert (cv2.imread(str(ctx.out / "photos" / "p1.png"))[47, 63] == 0).all()
+    assert (cv2.imread(str(done.out / "photos" / "p1.png"))[47, 63] == 0).all()
 
 
 def test_mask_files_of_both_names_and_inversion(tmp_path: Path, runner: Runner) -> None:
@@ -89,11 +89,11 @@ def test_mask_files_of_both_names_and_inversion(tmp_path: Path, runner: Runner) 
     mask[:, :16] = 255
     Image.fromarray(mask).save(masks / "p0.png")
     Image.fromarray(mask).save(masks / "p1.png.png")
-    results, ctx = runner.ingest(tmp_path, invert_masks=True)
+    results, done = runner.ingest(tmp_path, invert_masks=True)
     assert results["masks"] == 2
-    assert any("2 of 4 photos have no mask" in w for w in ctx.warnings)
+    assert any("2 of 4 photos have no mask" in w for w in done.warnings)
     for name in ("p0", "p1"):
-        written = cv2.imread(str(ctx.out / "masks" / f"{name}.png"), cv2.IMREAD_GRAYSCALE)
+        written = cv2.imread(str(done.out / "masks" / f"{name}.png"), cv2.IMREAD_GRAYSCALE)
         assert written is not None and (written == 255 - mask).all()
     assert folder.is_dir()
 
@@ -123,8 +123,8 @@ def test_mask_of_the_stored_photo_is_turned_with_it(tmp_path: Path, runner: Runn
     mask = np.zeros((48, 64), np.uint8)
     mask[:, :8] = 255  # left edge as stored comes to the top
     Image.fromarray(mask).save(masks / "turned.png")
-    _, ctx = runner.ingest(tmp_path)
-    written = cv2.imread(str(ctx.out / "masks" / "turned.png"), cv2.IMREAD_GRAYSCALE)
+    _, done = runner.ingest(tmp_path)
+    written = cv2.imread(str(done.out / "masks" / "turned.png"), cv2.IMREAD_GRAYSCALE)
     assert written is not None and written.shape == (64, 48) and written[:8].min() == 255 and written[8:].max() == 0
 
 
@@ -149,10 +149,10 @@ def transforms(path: Path, count: int, **extra: Any) -> dict[str, Any]:
 def test_poses_at_the_working_size(tmp_path: Path, runner: Runner) -> None:
     photos(tmp_path / "images")
     transforms(tmp_path / "transforms.json", 5)
-    results, ctx = runner.ingest(tmp_path, max_size=32)
+    results, done = runner.ingest(tmp_path, max_size=32)
     assert results["posed"] == 4 and results["frames_without_photo"] == 1
-    assert any("1 frames" in w for w in ctx.warnings)
-    camera = CameraSet.load(ctx.out / "poses" / "cameras.json").cameras[2]
+    assert any("1 frames" in w for w in done.warnings)
+    camera = CameraSet.load(done.out / "poses" / "cameras.json").cameras[2]
     assert (camera.name, camera.width, camera.height, camera.fx, camera.cx, camera.cy) == ("p2", 32, 24, 40.0, 15.0, 12.5)
     assert camera.centre == pytest.approx([0.2, 0, 3]) and camera.view_direction == pytest.approx([0, 0, -1])
 

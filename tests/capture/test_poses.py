@@ -13,10 +13,10 @@ from PIL import Image
 
 from gsbake.capture.posed_photos import PosedPhotos
 from gsbake.capture.sfm.process import Watch, run_job
+from gsbake.errors import BadInputError, InterruptedRun
 from gsbake.geometry.cameras import Camera, CameraSet
 from gsbake.geometry.ply import write_cloud
-from gsbake.pipeline.errors import BadInputError, InterruptedRun
-from tests.capture.conftest import FakeContext, Runner
+from tests.capture.conftest import Done, Runner
 
 
 def textured_board(size: int = 600) -> np.ndarray[Any, np.dtype[np.uint8]]:
@@ -80,9 +80,9 @@ def aligned_error(found: np.ndarray[Any, Any], true: np.ndarray[Any, Any]) -> fl
 def test_solved_poses_are_the_true_ones(tmp_path: Path, runner: Runner) -> None:
     true = board_capture(tmp_path / "cap")
     runner.ingest(tmp_path / "cap")
-    results, ctx = runner.poses(max_features=2000)
+    results, done = runner.poses(max_features=2000)
     assert results["registered"] == 8 and results["reprojection_px"] < 0.8 and results["poses"] == "solved"
-    posed = PosedPhotos.open(ctx.out)
+    posed = PosedPhotos.open(done.out)
     cameras = posed.cameras.cameras
     assert aligned_error(np.stack([c.centre for c in cameras]), np.stack([c.centre for c in true])) < 0.02
     assert [c.distortion for c in cameras] == [()] * 8
@@ -91,9 +91,9 @@ def test_solved_poses_are_the_true_ones(tmp_path: Path, runner: Runner) -> None:
     cloud = posed.points()
     assert cloud is not None and len(cloud[0]) > 200
     assert np.median(np.linalg.norm(cloud[0], axis=1)) < 1
-    assert {"cameras.bin", "images.bin", "points3D.bin"} <= {p.name for p in (ctx.out / "sparse").iterdir()}
-    assert {"features", "matching", "mapping", "undistortion", "normalisation"} <= set(ctx.parts)
-    assert any(text == "features" and done for done, _, text in ctx.progressed)
+    assert {"cameras.bin", "images.bin", "points3D.bin"} <= {p.name for p in (done.out / "sparse").iterdir()}
+    assert {"features", "matching", "mapping", "undistortion", "normalisation"} <= set(done.parts)
+    assert any(text == "features" and count for count, _, text in done.progressed)
     ups = np.stack([-c.R[1] for c in cameras]) @ posed.cameras.to_world.rotation.T
     assert ups[:, 2].mean() > 0.5
 
@@ -102,9 +102,9 @@ def test_given_poses_keep_their_frame_and_points_are_triangulated(tmp_path: Path
     true = board_capture(tmp_path / "cap")
     transforms(tmp_path / "cap", true)
     runner.ingest(tmp_path / "cap", max_size=160)
-    results, ctx = runner.poses(max_features=2000)
-    assert "left out" in ctx.decisions["skip.poses"] and "poses given" in ctx.decisions["skip.poses"]
-    posed = PosedPhotos.open(ctx.out)
+    results, done = runner.poses(max_features=2000)
+    assert done.line("pose source") == "given (given for 8 of 8 photos)"
+    posed = PosedPhotos.open(done.out)
     world = posed.cameras.to_world
     for camera, wanted in zip(posed.cameras.cameras, true, strict=True):
         back = camera.moved(world)
@@ -124,15 +124,15 @@ def test_photos_of_unrelated_places(tmp_path: Path, runner: Runner) -> None:
         photo = cv2.resize(rng.integers(0, 255, (30, 40, 3), np.uint8), (320, 240), interpolation=cv2.INTER_CUBIC)
         Image.fromarray(np.asarray(photo, np.uint8)).save(tmp_path / "images" / f"p{i}.png")
     runner.ingest(tmp_path)
-    with pytest.raises(BadInputError, match=r"placed only \d of 4 photos \(not p.*overlap"):
+    with pytest.raises(BadInputError, match=r"registered only \d of 4 photos \(not p.*overlap"):
         runner.poses(max_features=500)
 
 
 def test_too_few_given_poses(tmp_path: Path, runner: Runner) -> None:
     true = board_capture(tmp_path / "cap", 4)
     transforms(tmp_path / "cap", true[:2])
-    _, ctx = runner.ingest(tmp_path / "cap")
-    assert any("2 photos have no pose" in w for w in ctx.warnings)
+    _, done = runner.ingest(tmp_path / "cap")
+    assert any("2 photos have no pose" in w for w in done.warnings)
     with pytest.raises(BadInputError, match="Only 2 photos have a pose"):
         runner.poses()
 
@@ -172,11 +172,11 @@ def test_a_stopped_stage_says_so(tmp_path: Path, runner: Runner, monkeypatch: py
     board_capture(tmp_path / "cap", 4)
     runner.ingest(tmp_path / "cap")
 
-    def raised(self: FakeContext) -> None:
+    def raised(self: Done) -> None:
         raise InterruptedRun("Stopped on request.")
 
-    monkeypatch.setattr(FakeContext, "stop_requested", lambda self: True)
-    monkeypatch.setattr(FakeContext, "check_stop", raised)
+    monkeypatch.setattr(Done, "stop_requested", lambda self: True)
+    monkeypatch.setattr(Done, "check_stop", raised)
     with pytest.raises(InterruptedRun):
         runner.poses()
 
@@ -192,10 +192,10 @@ def test_masks_centre_the_object(tmp_path: Path, runner: Runner) -> None:
         Image.fromarray(np.dstack([noise, ball_mask(camera)])).save(tmp_path / "images" / f"{camera.name}.png")
     transforms(tmp_path, cameras)
     runner.ingest(tmp_path)
-    results, ctx = runner.poses(max_features=256)
+    results, done = runner.poses(max_features=256)
     assert results["centre"] == pytest.approx(CENTRE, abs=0.04) and results["radius"] == pytest.approx(RADIUS, rel=0.08)
-    assert "visual hull of 16 masks" in ctx.decisions["unit sphere"]
-    assert CameraSet.load(ctx.out / "cameras.json").to_world.scale == pytest.approx(results["radius"] / 0.9)
+    assert "visual hull of 16 masks" in done.line("unit frame")
+    assert CameraSet.load(done.out / "cameras.json").to_world.scale == pytest.approx(results["radius"] / 0.9)
 
 
 def test_a_mask_that_lacks_a_part_is_mended(tmp_path: Path, runner: Runner) -> None:
@@ -216,10 +216,10 @@ def test_a_mask_that_lacks_a_part_is_mended(tmp_path: Path, runner: Runner) -> N
     points = np.random.default_rng(0).normal(size=(800, 3))
     points = CENTRE + RADIUS * points / np.linalg.norm(points, axis=1, keepdims=True)
     write_cloud(runner.root / "ingest" / "poses" / "points.ply", points, np.full((800, 3), 90, np.uint8))
-    _, ctx = runner.poses()
-    assert ctx.decisions["masks mended"].startswith("1 of 16") and "c05" in ctx.decisions["masks mended"]
+    _, done = runner.poses()
+    assert done.line("mask completion").startswith("1 of 16") and "c05" in done.line("mask completion")
     for camera in cameras:
-        mended = cv2.imread(str(ctx.out / "masks" / f"{camera.name}.png"), cv2.IMREAD_GRAYSCALE)
+        mended = cv2.imread(str(done.out / "masks" / f"{camera.name}.png"), cv2.IMREAD_GRAYSCALE)
         assert mended is not None and ((mended > 127) != (ball_mask(camera) > 127)).mean() < 0.002
 
 

@@ -15,8 +15,8 @@ from gsbake.capture.photos.redundancy import ENOUGH, LEAST_PHOTOS, Coverage, cov
 from gsbake.capture.photos.sharpness import LOSSLESS, finer_than_sharp, loss_at_half
 from gsbake.capture.posed_photos import PosedPhotos
 from gsbake.capture.view_dependence import Changes, Sightings, exposures, looks_diffuse
+from gsbake.errors import BadInputError
 from gsbake.geometry.cameras import Camera, CameraSet
-from gsbake.pipeline.errors import BadInputError
 from tests.capture.conftest import Runner
 from tests.capture.test_poses import board_capture, transforms
 
@@ -174,23 +174,23 @@ def test_ingest_keeps_blurred_photos_at_half_their_size(tmp_path: Path, runner: 
     mask[:, 200:900] = 255
     for i in range(3):
         Image.fromarray(mask).save(tmp_path / "masks" / f"p{i}.png")
-    results, ctx = runner.ingest(tmp_path)
-    listed = json.loads((ctx.out / "photos.json").read_text())["photos"]
+    results, done = runner.ingest(tmp_path)
+    listed = json.loads((done.out / "photos.json").read_text())["photos"]
     assert {(e["width"], e["height"], e["source_width"]) for e in listed} == {(500, 500, 1000)} and results["masks"] == 3
-    written = cv2.imread(str(ctx.out / "photos" / "p2.png"), cv2.IMREAD_COLOR)
+    written = cv2.imread(str(done.out / "photos" / "p2.png"), cv2.IMREAD_COLOR)
     source = cv2.resize(cv2.imread(str(photos / "p2.png"), cv2.IMREAD_COLOR), (500, 500), interpolation=cv2.INTER_AREA)
     assert written.shape == source.shape and np.abs(written.astype(int) - source).mean() < 1.0
-    halved = cv2.imread(str(ctx.out / "masks" / "p2.png"), cv2.IMREAD_GRAYSCALE)
+    halved = cv2.imread(str(done.out / "masks" / "p2.png"), cv2.IMREAD_GRAYSCALE)
     assert halved.shape == (500, 500) and halved[5, 105] == 255 and halved[5, 95] == 0
-    assert "500 pixels" in ctx.decisions["skip.resolution"] and "3 of 3" in ctx.decisions["skip.resolution"]
-    assert "3 mask files" in ctx.decisions["skip.masks"]
+    assert "500 pixels" in done.line("skip.resolution") and "3 of 3" in done.line("skip.resolution")
+    assert "3 mask files" in done.line("masks")
 
 
 @pytest.mark.parametrize(("sharp", "mode", "width"), [(1, "auto", 1000), (0, "never", 1000), (3, "always", 500)])
 def test_ingest_keeps_the_size_of_sharp_photos(tmp_path: Path, runner: Runner, sharp: int, mode: str, width: int) -> None:
     soft_photos(tmp_path / "images", sharp)
-    _, ctx = runner.ingest(tmp_path, skip={"resolution": mode})
-    assert json.loads((ctx.out / "photos.json").read_text())["photos"][0]["width"] == width
+    _, done = runner.ingest(tmp_path, resolution=mode)
+    assert json.loads((done.out / "photos.json").read_text())["photos"][0]["width"] == width
 
 
 def test_masks_can_be_passed_over_or_asked_for(tmp_path: Path, runner: Runner) -> None:
@@ -200,22 +200,22 @@ def test_masks_can_be_passed_over_or_asked_for(tmp_path: Path, runner: Runner) -
         rgba = np.dstack([noise(i, 64, 2.0).astype(np.uint8)] * 3 + [np.full((64, 64), 255, np.uint8)])
         rgba[:20, :, 3] = 0 if i else 255
         Image.fromarray(rgba).save(folder / f"p{i}.png")
-    results, ctx = runner.ingest(folder, skip={"masks": "never"})
-    assert results["masks"] == 0 and not (ctx.out / "masks").exists() and "not read" in ctx.decisions["skip.masks"]
-    with pytest.raises(BadInputError, match=r"1 of 3 photos have no mask \(p0\), but skip\.masks is always"):
-        Runner(tmp_path / "again").ingest(folder, skip={"masks": "always"})
+    results, done = runner.ingest(folder, settings={"masks": "ignore"})
+    assert results["masks"] == 0 and not (done.out / "masks").exists() and "set by the profile" in done.line("masks")
+    with pytest.raises(BadInputError, match=r"1 of 3 photos have no mask \(p0\), but ingest\.masks is require"):
+        Runner(tmp_path / "again").ingest(folder, settings={"masks": "require"})
 
 
 def test_given_poses_can_be_passed_over_or_asked_for(tmp_path: Path, runner: Runner) -> None:
     true = board_capture(tmp_path / "cap")
     runner.ingest(tmp_path / "cap")
-    with pytest.raises(BadInputError, match=r"No poses were given, but skip\.poses is always"):
-        runner.poses(skip={"poses": "always"})
+    with pytest.raises(BadInputError, match=r"No poses were given, but poses\.source is given"):
+        runner.poses(source="given")
     transforms(tmp_path / "cap", true)
     again = Runner(tmp_path / "again")
     again.ingest(tmp_path / "cap")
-    results, ctx = again.poses(skip={"poses": "never"}, max_features=2000)
-    assert results["poses"] == "solved" and "poses given for 8 of 8" in ctx.decisions["skip.poses"]
+    results, done = again.poses(source="solve", max_features=2000)
+    assert results["poses"] == "solved" and "given for 8 of 8" in done.line("pose source")
 
 
 def test_poses_drops_a_photo_saved_twice(tmp_path: Path, runner: Runner) -> None:
@@ -225,7 +225,7 @@ def test_poses_drops_a_photo_saved_twice(tmp_path: Path, runner: Runner) -> None
     twin = Camera("again", *(getattr(true[2], k) for k in ("width", "height", "fx", "fy", "cx", "cy", "R", "t")))
     transforms(tmp_path / "cap", [*true, twin])
     runner.ingest(tmp_path / "cap")
-    results, ctx = runner.poses(max_features=1000)
-    names = [c.name for c in CameraSet.load(ctx.out / "cameras.json").cameras]
+    results, done = runner.poses(max_features=1000)
+    names = [c.name for c in CameraSet.load(done.out / "cameras.json").cameras]
     assert len(results["dropped_photos"]) == 1 and len(names) == 8 and {"again", "b2"} - set(names)
-    assert sorted(p.stem for p in (ctx.out / "photos").iterdir()) == sorted(names) and len(PosedPhotos.open(ctx.out)) == 8
+    assert sorted(p.stem for p in (done.out / "photos").iterdir()) == sorted(names) and len(PosedPhotos.open(done.out)) == 8

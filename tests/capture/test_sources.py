@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from gsbake.capture.sources import Sources, discover, list_photos
-from gsbake.pipeline.errors import BadInputError
+from gsbake.errors import BadInputError
 
 
 def touch(*paths: Path) -> None:

@@ -113,7 +113,7 @@ def test_status_explain_and_dry_run(run: Run, capture: Path, tmp_path: Path) -> 
     states = run("status", "--out", "o", "--set", "mesh.faces=700", "--json").json["stages"]
     assert [s["will_run"] for s in states] == [False, True, True, True]
     assert states[1]["reasons"] == ["mesh.faces: 30000 → 700"]
-    assert "decided skip.photos: all used (none twice)" in run("explain", "ingest", "--out", "o").out
+    assert "decided skip.redundant_photos: all used (none twice)" in run("explain", "ingest", "--out", "o").out
     text = run("status", "--out", "o", "--set", "mesh.faces=700").out
     assert "mesh.faces: 30000 → 700" in text and "mesh will run first" in text
     (capture / "images" / "b.jpg").write_text("other")
@@ -205,7 +205,7 @@ def test_profiles_lists_and_shows(run: Run) -> None:
     shown = run("profiles", "smoke", "--set", "mesh.faces=123", "--json").json
     assert shown["mesh.faces"]["value"] == 123 and shown["mesh.faces"]["origin"] == "--set"
     assert shown["train.iterations"]["origin"] == "smoke" and shown["ingest.min_photos"]["origin"] == "default"
-    assert "Training steps" in run("profiles", "smoke").out
+    assert "Training iterations" in run("profiles", "smoke").out
 
 
 def test_help_imports_nothing_heavy() -> None:

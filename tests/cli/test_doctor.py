@@ -9,7 +9,6 @@ import pytest
 import typer
 
 from gsbake.cli import doctor
-from gsbake.cli import formatting as wording
 
 
 def test_advice_names_the_debian_package() -> None:
@@ -33,9 +32,3 @@ def test_library_that_crashes_or_is_missing_is_found(
     assert not found["no-such-library"]["ok"] and found["no-such-library"]["found"] == "not installed"
     assert not found["typer"]["ok"] and "does not load" in found["typer"]["found"]
     assert found["Python"]["ok"] and "cores" in found["processor"]["found"]
-
-
-def test_figures_in_words() -> None:
-    assert [wording.duration(s) for s in (0.32, 42.4, 185, 7620)] == ["0.3 s", "42 s", "3 min 05 s", "2 h 07 min"]
-    assert [wording.size(b) for b in (480_000, 3_200_000, 1_250_000_000)] == ["480 kB", "3.2 MB", "1.25 GB"]
-    assert wording.figures({"psnr": 27.1234, "faces": 30000, "log": [1], "ok": True}) == "psnr 27.12, faces 30 000, ok yes"

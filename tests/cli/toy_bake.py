@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from typing import Any
 
-from gsbake.pipeline.errors import BadInputError
+from gsbake.errors import BadInputError
 from gsbake.pipeline.registry import Registry
 from gsbake.pipeline.stage import Context, Stage
 
@@ -16,7 +16,7 @@ def _ingest(ctx: Context) -> dict[str, Any]:
         raise BadInputError(f"There are {len(names)} photos; give more.")
     (ctx.out / "photos.json").write_text("\n".join(names) + str("masks" in ctx.inputs) + str(ctx.settings.ingest.invert_masks))
     ctx.warn("photo 3 is blurred")
-    ctx.decide("skip.photos", "all used", "none twice")
+    ctx.decide("skip.redundant_photos", "all used", "none twice")
     return {"photos": len(names)}
 
 

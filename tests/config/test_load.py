@@ -9,7 +9,7 @@ from pydantic import BaseModel
 
 from gsbake.config.load import DEFAULT, bounds, fields, load_profile, shipped
 from gsbake.config.schema import Profile
-from gsbake.pipeline.errors import BadInputError, GsbakeError, UsageError
+from gsbake.errors import BadInputError, GsbakeError, UsageError
 
 
 def write(path: Path, text: str) -> str:
@@ -39,13 +39,13 @@ def test_every_setting_has_help() -> None:
 def test_extends_origins_and_overrides(tmp_path: Path) -> None:
     write(tmp_path / "base.toml", 'extends = "preview"\n[mesh]\nfaces = 777\nsmooth = 1\n')
     mine = write(tmp_path / "mine.toml", 'extends = "base.toml"\n[mesh]\nfaces = 888\n')
-    loaded = load_profile(mine, ["bake.size=512", "mesh.holes=leave", "export.copyright=2031 me = you", "skip.converged=never"])
+    loaded = load_profile(mine, ["bake.size=512", "mesh.holes=leave", "export.copyright=2031 me = you", "skip.converged_steps=never"])
     profile, preview = loaded.profile, load_profile("preview").profile
-    assert (profile.mesh.faces, profile.mesh.smooth, profile.bake.size) == (888, 1, 512)
-    assert profile.mesh.holes == "leave" and profile.export.copyright == "2031 me = you" and profile.skip.converged == "never"
+    assert (profile.mesh.faces, profile.mesh.smoothing_iterations, profile.bake.size) == (888, 1, 512)
+    assert profile.mesh.holes == "leave" and profile.export.copyright == "2031 me = you" and profile.skip.converged_steps == "never"
     assert profile.train.iterations == preview.train.iterations
     origins = loaded.origins
-    assert origins["mesh.faces"] == mine and origins["mesh.smooth"] == str(tmp_path / "base.toml")
+    assert origins["mesh.faces"] == mine and origins["mesh.smoothing_iterations"] == str(tmp_path / "base.toml")
     assert origins["train.iterations"] == "preview" and origins["bake.size"] == "--set" and origins["export.max_triangles"] == "default"
     assert load_profile(mine.removesuffix(".toml")).profile.mesh.faces == 888
 
@@ -55,7 +55,7 @@ def test_extends_origins_and_overrides(tmp_path: Path) -> None:
     [
         ("[train]\niteration = 5\n", ["there is no setting 'train.iteration'", "the nearest is 'train.iterations'"]),
         ("[trian]\niterations = 5\n", ["'trian.iterations'", "the nearest is 'train.iterations'"]),
-        ('[skip]\nphotos = "sometimes"\n', ["skip.photos = 'sometimes'", "one of auto, always, never"]),
+        ('[skip]\nphotos = "sometimes"\n', ["skip.redundant_photos = 'sometimes'", "one of auto, always, never"]),
         ("[bake]\nfaces = 5\n", ["'bake.faces'", "the nearest is 'mesh.faces'"]),
         ("faces = 5\n", ["'faces'", "the nearest is 'mesh.faces'"]),
         ("[mesh]\nfaces = 5\n", ["mesh.faces = 5 will not do: it must be ≥ 100"]),
@@ -104,4 +104,4 @@ def test_unknown_profile() -> None:
 def test_bounds_in_words() -> None:
     known = fields()
     assert bounds(known["train.iterations"]) == "≥ 0" and bounds(known["mesh.holes"]) == "one of close, leave"
-    assert bounds(known["ingest.invert_masks"]) == "" and bounds(known["skip.poses"]) == "one of auto, always, never"
+    assert bounds(known["ingest.invert_masks"]) == "" and bounds(known["poses.source"]) == "one of auto, always, never"

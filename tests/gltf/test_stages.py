@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -17,65 +14,38 @@ import trimesh
 from safetensors.numpy import load_file
 from scipy.spatial import cKDTree
 
-from gsbake.config.schema import Bake, Export, Profile, Splat, Train
+from gsbake.config.schema import Bake, Export
+from gsbake.errors import BadInputError
 from gsbake.geometry.cameras import Camera, CameraSet, Similarity
+from gsbake.geometry.ply import write_mesh
 from gsbake.geometry.tangents import frame_to_world
+from gsbake.gltf.export import ExportOptions, export_asset
 from gsbake.gltf.read import GltfAsset, read_glb
 from gsbake.imaging.exr import read_exr, write_exr
 from gsbake.imaging.srgb import LINEAR, encode_bytes
-from gsbake.meshing.ply import write_ply
-from gsbake.pipeline.errors import BadInputError
-from gsbake.pipeline.settings import SettingsView
-from gsbake.pipeline.stage import Stage
+from gsbake.materials.bake import BakeOptions, bake_textures
+from gsbake.monitor import SILENT, Monitor
 from gsbake.shading.environment import EnvironmentLight
-from gsbake.stages import bake, export
 from gsbake.texturing.texels import rasterise
+from tests.support.recorder import Recorder
 
 SIZE, RADIUS, PHOTO = 256, 0.9, 240
 #: Unit frame to world: half a metre of the object is one unit, turned and moved.
 TO_WORLD = Similarity(2.0, np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), np.array([3.0, 4, 5]))
 
 
-@dataclass
-class Desk:
-    """A context without an engine."""
-
-    out: Path
-    inputs: dict[str, Path]
-    settings: Any
-    seed: int = 0
-    threads: int = 2
-    device: str = "cpu"
-    warnings: list[str] = field(default_factory=list)
-
-    @property
-    def checkpoint(self) -> Path:
-        return self.out
-
-    @contextmanager
-    def part(self, name: str) -> Iterator[None]:
-        yield
-
-    def progress(self, done: int, total: int, text: str = "", **live: float) -> None:
-        assert 0 <= done <= total
-
-    def stop_requested(self) -> bool:
-        return False
-
-    def check_stop(self) -> None:
-        pass
-
-    def decide(self, what: str, choice: str, evidence: str, saved: float | None = None) -> None:
-        pass
-
-    def warn(self, text: str) -> None:
-        self.warnings.append(text)
-
-
-def desk(stage: Stage, folder: Path, out: Path, **sections: Any) -> Desk:
+def bake(folder: Path, out: Path, mesh: Path | None = None, **settings: Any) -> dict[str, Any]:
+    """Bake the run in `folder` into the new folder `out`."""
     out.mkdir()
-    profile = Profile(bake=Bake(size=SIZE, occlusion_rays=8), train=Train(holdout=0)).model_copy(update=sections)
-    return Desk(out, {name: folder / name for name in stage.needs}, SettingsView(profile, stage.settings, stage.name))
+    options = BakeOptions(Bake(size=SIZE, occlusion_rays=8, **settings), holdout=0)
+    return bake_textures(folder / "poses", folder / "refine", mesh or folder / "mesh", out, options)
+
+
+def export(folder: Path, out: Path, monitor: Monitor = SILENT, materials: str = "none", **settings: Any) -> dict[str, Any]:
+    """Export the run in `folder`, baked, into the new folder `out`."""
+    out.mkdir()
+    options = ExportOptions(Export(**settings), materials, SIZE)
+    return export_asset(*(folder / name for name in ("ingest", "poses", "refine", "bake")), out, options, monitor=monitor)
 
 
 def radius(direction: np.ndarray) -> np.ndarray:
@@ -110,8 +80,8 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for name in ("ingest", "poses/photos", "mesh", "refine"):
         (folder / name).mkdir(parents=True)
     light, dense = trimesh.creation.icosphere(subdivisions=3), trimesh.creation.icosphere(subdivisions=5)
-    write_ply(folder / "mesh/mesh.ply", RADIUS * light.vertices, light.faces)
-    write_ply(folder / "mesh/dense.ply", dense.vertices * radius(dense.vertices)[:, None], dense.faces)
+    write_mesh(folder / "mesh/mesh.ply", RADIUS * light.vertices, light.faces)
+    write_mesh(folder / "mesh/dense.ply", dense.vertices * radius(dense.vertices)[:, None], dense.faces)
     k = np.arange(14) + 0.5
     height, turn = 1 - 2 * k / 14, np.pi * (1 + 5**0.5) * k
     around = np.stack([np.sqrt(1 - height**2) * np.cos(turn), np.sqrt(1 - height**2) * np.sin(turn), height], 1)
@@ -121,11 +91,11 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     CameraSet(cameras, TO_WORLD, "given", metric=True).save(folder / "poses/cameras.json")
     photos = [{"name": c.name, "source": f"/somewhere/{c.name.upper()}.JPG"} for c in cameras]
     (folder / "ingest/photos.json").write_text(json.dumps({"photos": photos}))
-    result = bake.run(desk(bake.STAGE, folder, folder / "bake"))
+    result = bake(folder, folder / "bake")
     assert result["unseen_share"] < 0.01 and result["detail_share"] > 0.99
-    context = desk(export.STAGE, folder, folder / "export", export=Export(copyright="me"))
-    result = export.run(context)
-    assert context.warnings == [] and result["scale"] == "metres" and result["triangles"] == 1280
+    monitor = Recorder()
+    result = export(folder, folder / "export", monitor, copyright="me")
+    assert monitor.warnings == [] and result["scale"] == "metres" and result["triangles"] == 1280
     return folder
 
 
@@ -192,13 +162,13 @@ def test_occlusion_is_alone_where_roughness_and_metallic_are_numbers(run: Path, 
 
 
 def test_colours_without_shading_look_the_same_under_their_light(run: Path, tmp_path: Path) -> None:
-    out = desk(bake.STAGE, run, tmp_path / "bake", bake=Bake(size=SIZE, occlusion_rays=8, materials="delit"))
-    bake.run(out)
-    mesh = load_file(out.out / "mesh.safetensors")
+    out = tmp_path / "bake"
+    bake(run, out, materials="delight")
+    mesh = load_file(out / "mesh.safetensors")
     texels = rasterise(mesh["uv"], mesh["faces"], SIZE)
     facing, points = (texels.interpolate(mesh[name], mesh["faces"]) for name in ("normal", "position"))
-    base, openness = (read_exr(out.out / name).reshape(SIZE * SIZE, 3)[texels.index] for name in ("base_color.exr", "orm.exr"))
-    light = EnvironmentLight.load(out.out / "light.safetensors").prefilter().diffuse(torch.as_tensor(facing)).detach().numpy()
+    base, openness = (read_exr(out / name).reshape(SIZE * SIZE, 3)[texels.index] for name in ("base_color.exr", "orm.exr"))
+    light = EnvironmentLight.load(out / "light.safetensors").prefilter().diffuse(torch.as_tensor(facing)).detach().numpy()
     seen = base * light * openness[:, :1]
     assert np.abs(seen - colour(points)).mean() < 0.01
     assert np.abs(base - colour(points)).mean() > 0.01
@@ -224,25 +194,23 @@ def test_trimesh_reads_the_same_surface(run: Path) -> None:
 
 
 def test_the_same_input_gives_the_same_bytes(run: Path, tmp_path: Path) -> None:
-    bake.run(desk(bake.STAGE, run, tmp_path / "bake"))
+    bake(run, tmp_path / "bake")
     assert (tmp_path / "bake/mesh.safetensors").read_bytes() == (run / "bake/mesh.safetensors").read_bytes()
     for name in ("base_color", "orm", "normal"):
         assert np.array_equal(read_exr(tmp_path / f"bake/{name}.exr"), read_exr(run / f"bake/{name}.exr"))
-    export.run(desk(export.STAGE, run, tmp_path / "export", export=Export(copyright="me")))
+    export(run, tmp_path / "export", copyright="me")
     assert (tmp_path / "export/asset.glb").read_bytes() == (run / "export/asset.glb").read_bytes()
 
 
 def test_an_asset_over_the_triangle_limit_fails(run: Path, tmp_path: Path) -> None:
     with pytest.raises(BadInputError, match="triangle count"):
-        export.run(desk(export.STAGE, run, tmp_path / "export", export=Export(max_triangles=1000)))
+        export(run, tmp_path / "export", max_triangles=1000)
 
 
 def test_a_damaged_mesh_is_told(run: Path, tmp_path: Path) -> None:
-    context = desk(bake.STAGE, run, tmp_path / "bake")
-    context.inputs["mesh"] = tmp_path
     (tmp_path / "mesh.ply").write_bytes((run / "mesh/mesh.ply").read_bytes()[:5000])
     with pytest.raises(BadInputError, match=r"mesh\.ply"):
-        bake.run(context)
+        bake(run, tmp_path / "bake", tmp_path)
 
 
 def test_masters_are_half_floats_and_come_back(tmp_path: Path) -> None:
@@ -276,7 +244,7 @@ class Painted:
 
 
 def test_materials_and_light_of_a_relightable_asset(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("gsbake.surfels.raster.render.SurfelRenderer", Painted)
+    monkeypatch.setattr("gsbake.texturing.photo_projection.SurfelRenderer", Painted)
     folder = tmp_path / "run"
     folder.mkdir()
     for name in ("ingest", "poses", "mesh"):
@@ -285,9 +253,8 @@ def test_materials_and_light_of_a_relightable_asset(run: Path, tmp_path: Path, m
     towards = TO_WORLD.rotation.T @ np.array([0.8, 0, 0.6])  # world +x, a little above
     light = EnvironmentLight.from_function(lambda d: np.tile(np.maximum(d @ towards, 0)[:, None] ** 40, (1, 3)) + 0.01, 32)
     light.save(folder / "refine/light.safetensors")
-    pbr = {"splat": Splat(shading="pbr"), "bake": Bake(size=SIZE, occlusion_rays=8, materials="surfels")}
-    bake.run(desk(bake.STAGE, folder, folder / "bake", **pbr))
-    result = export.run(desk(export.STAGE, folder, folder / "export", **pbr))
+    bake(folder, folder / "bake", materials="surfels")
+    result = export(folder, folder / "export", materials="surfels")
     assert result["audit_passed"] > 30
     asset = read_glb(folder / "export/asset.glb")
     p, texels, _ = unit_points(asset)

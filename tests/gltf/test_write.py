@@ -8,14 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from PIL import Image
 
+from gsbake.errors import BadInputError
 from gsbake.gltf.audit import audit, failed
 from gsbake.gltf.container import pack_glb, unpack_glb
 from gsbake.gltf.read import parse_glb
 from gsbake.gltf.write import GltfImages, GltfMesh, build_glb
 from gsbake.imaging.png import encode_png
-from gsbake.pipeline.errors import BadInputError
 from gsbake.report.asset import from_gltf
 from tests.support.node import gltf_issues
 
@@ -60,24 +59,6 @@ def test_small_meshes_use_short_indices_and_large_ones_do_not(images: GltfImages
         large = GltfMesh(column, column, np.zeros((count, 4), np.float32), column[:, :2], np.array([[0, 1, count - 1]], np.int32))
         asset = parse_glb(build_glb(large, images, "n", "g"), "n")
         assert asset.document["accessors"][4]["componentType"] == kind and asset.faces.tolist() == [[0, 1, count - 1]]
-
-
-@pytest.mark.parametrize("shape", [(1, 1, 3), (5, 7, 3), (64, 33, 3), (9, 16)])
-def test_png_is_read_back_by_pillow(shape: tuple[int, ...]) -> None:
-    rng = np.random.default_rng(1)
-    for pixels in (rng.integers(0, 256, shape, np.uint8), np.cumsum(np.ones(shape, np.uint8), 0, np.uint8), np.full(shape, 7, np.uint8)):
-        with Image.open(io.BytesIO(encode_png(pixels))) as image:
-            assert np.array_equal(np.asarray(image), pixels)
-            assert not image.info
-
-
-def test_smooth_png_is_no_larger_than_pillows() -> None:
-    x, y = np.meshgrid(np.arange(256), np.arange(256))
-    noise = np.random.default_rng(0).normal(0, 2, (256, 256))
-    pixels = np.clip(np.stack([x / 2 + noise, y / 2 + 40 + noise, (x + y) / 4 + noise], 2), 0, 255).astype(np.uint8)
-    other = io.BytesIO()
-    Image.fromarray(pixels).save(other, "PNG", optimize=True)
-    assert len(encode_png(pixels)) <= 1.03 * len(other.getvalue())
 
 
 def test_damaged_files_are_named() -> None:

@@ -18,7 +18,7 @@ from gsbake.geometry.cameras import Camera
 from gsbake.geometry.raycast import RayCaster
 from gsbake.imaging.srgb import decode, encode
 from gsbake.materials.adjacency import neighbours
-from gsbake.materials.fit import MaterialFit, Priors
+from gsbake.materials.fit import FitSchedule, FitSurface, MaterialFit, Priors
 from gsbake.materials.initialisation import TRIAL_PHOTO, trial_roughness
 from gsbake.materials.pixels import SAMPLES, PixelReader, Pixels
 from gsbake.shading.environment import EnvironmentLight
@@ -97,7 +97,8 @@ class Scene:
     def fit(self, roughness: float, priors: Priors = FREE) -> MaterialFit:
         n = len(self.texels)
         pairs = neighbours(self.texels, self.normal, self.normal)
-        return MaterialFit(self.texels, self.normal, pairs, self.normal, np.ones(n), np.full((n, 3), 0.3), 16, priors, roughness)
+        surface = FitSurface(self.texels, self.normal, pairs, self.normal, np.ones(n), np.full((n, 3), 0.3))
+        return MaterialFit(surface, 16, priors, roughness)
 
 
 @pytest.fixture(scope="module")
@@ -112,7 +113,7 @@ def rendered() -> Scene:
 
 def test_materials_come_back_from_reference_pictures(rendered: Scene) -> None:
     """Bounds are the worst of three seeds plus a quarter: base colours come back well, roughness comes out as .15 instead of .25."""
-    fitted = rendered.fit(0.2).run(rendered.photos[2:], rendered.photos[:2], 300, 0)
+    fitted = rendered.fit(0.2).run(rendered.photos[2:], rendered.photos[:2], FitSchedule(300))
     known = fitted.weight > 0.3
     paint, truth = fitted.values[known, :3], rendered.paint[known]
     gain = (paint * truth).sum(0) / (paint**2).sum(0)
@@ -125,7 +126,7 @@ def test_materials_come_back_from_reference_pictures(rendered: Scene) -> None:
 def test_a_lamp_is_found_in_reference_pictures(rendered: Scene) -> None:
     """Of what does not glow a tenth is taken for glowing: a highlight that the fit cannot place."""
     lamp, photos = with_lamp(rendered)
-    fitted = rendered.fit(0.2).run(photos, [], 300, 0)
+    fitted = rendered.fit(0.2).run(photos, [], FitSchedule(300))
     known = fitted.weight > 0.3
     found = fitted.glow.max(1) > 0.1
     assert found[known & lamp].mean() > 0.9 and found[known & ~lamp].mean() < 0.12
@@ -142,7 +143,7 @@ def with_lamp(scene: Scene) -> tuple[NDArray[np.bool_], list[Pixels]]:
 
 
 def test_paint_and_roughness_come_back(glossy: Scene) -> None:
-    fitted = glossy.fit(0.2).run(glossy.photos[2:], glossy.photos[:2], 300, 0)
+    fitted = glossy.fit(0.2).run(glossy.photos[2:], glossy.photos[:2], FitSchedule(300))
     known = fitted.weight > 0.3
     assert known.mean() > 0.4
     paint, truth = fitted.values[known, :3], glossy.paint[known]
@@ -157,13 +158,13 @@ def test_an_object_of_metal_alone_keeps_its_light(glossy: Scene) -> None:
     fit = glossy.fit(0.2)
     with torch.no_grad():
         fit._logits[:, 4] = 3.0
-    fitted = fit.run(glossy.photos, [], 4, 0, metals=False, glow=False)
+    fitted = fit.run(glossy.photos, [], FitSchedule(4, metallic=False, emission=False))
     assert len(fitted.levels) > 0 and all(level.gain == 0 for level in fitted.levels)
 
 
 def test_a_lamp_on_the_ball_is_told_from_paint(glossy: Scene) -> None:
     lamp, photos = with_lamp(glossy)
-    fitted = glossy.fit(0.2).run(photos, [], 300, 0)
+    fitted = glossy.fit(0.2).run(photos, [], FitSchedule(300))
     known = fitted.weight > 0.3
     found = fitted.glow.max(1) > 0.1
     assert fitted.glowing == 1
@@ -177,8 +178,9 @@ def test_wrong_normals_bend_towards_what_reflections_show(glossy: Scene) -> None
     lean = 0.15 * np.sin(3 * truth[:, 2:]) * np.array([0.3, -0.5, 0.8])
     wrong = (truth + lean) / np.linalg.norm(truth + lean, axis=1, keepdims=True)
     pairs = neighbours(glossy.texels, truth, wrong)
-    fit = MaterialFit(glossy.texels, truth, pairs, wrong, np.ones(n), np.full((n, 3), 0.3), 16, FREE, 0.2)
-    fitted = fit.run(glossy.photos, [], 300, 0)
+    surface = FitSurface(glossy.texels, truth, pairs, wrong, np.ones(n), np.full((n, 3), 0.3))
+    fit = MaterialFit(surface, 16, FREE, 0.2)
+    fitted = fit.run(glossy.photos, [], FitSchedule(300))
     known = fitted.weight > 0.3
     bent = wrong + fitted.bend
     bent /= np.linalg.norm(bent, axis=1, keepdims=True)
@@ -196,15 +198,15 @@ def test_trials_tell_smooth_from_rough(glossy: Scene) -> None:
 
 
 def test_same_seed_same_result_and_dark_prior_darkens(glossy: Scene) -> None:
-    first, again = (glossy.fit(0.2).run(glossy.photos, [], 30, 3) for _ in range(2))
+    first, again = (glossy.fit(0.2).run(glossy.photos, [], FitSchedule(30, 3)) for _ in range(2))
     assert np.array_equal(first.values, again.values)
     assert first.held_out is None
-    darker = glossy.fit(0.2, Priors(smooth=0.01, dark=0.3)).run(glossy.photos, [], 30, 3)
+    darker = glossy.fit(0.2, Priors(smooth=0.01, dark=0.3)).run(glossy.photos, [], FitSchedule(30, 3))
     assert darker.values[:, :3].mean() < 0.9 * first.values[:, :3].mean()
 
 
 def test_no_photo_leaves_the_start(glossy: Scene) -> None:
-    fitted = glossy.fit(0.4).run([], [], 10, 0)
+    fitted = glossy.fit(0.4).run([], [], FitSchedule(10))
     assert np.allclose(fitted.values[:, 3], 0.4, atol=1e-6)
     assert fitted.weight.max() == 0
 

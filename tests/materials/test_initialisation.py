@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from gsbake.materials.fit import Fitted
+from gsbake.materials.fit import FitSchedule, Fitted
 from gsbake.materials.initialisation import DOUBTED, RIVAL, TRIALS, Choice, best_fit, rivals
 from gsbake.shading.environment import EnvironmentLight
 
@@ -29,8 +29,8 @@ class Known:
     runs: list[tuple[float, bool]] = field(default_factory=list)
     metals: bool = False
 
-    def run(self, photos: Any, held: Any, steps: int, seed: int, each: Any = None, metals: bool = True, matte: bool = False) -> Fitted:
-        metals = metals and not matte
+    def run(self, photos: Any, held: Any, schedule: FitSchedule, each: Any = None) -> Fitted:
+        metals = schedule.metallic and not schedule.diffuse
         self.metals = metals and self.gain + self.bare != 0
         self.runs.append((self.roughness, metals))
         score = self.scores[self.roughness] + (self.gain if self.metals else 0)

@@ -13,7 +13,7 @@ from gsbake.geometry.cameras import Camera
 from gsbake.geometry.raycast import RayCaster
 from gsbake.imaging.srgb import encode
 from gsbake.materials.adjacency import neighbours
-from gsbake.materials.fit import MaterialFit, Priors
+from gsbake.materials.fit import FitSchedule, FitSurface, MaterialFit, Priors
 from gsbake.materials.pixels import PixelReader, Pixels
 from gsbake.materials.reflections import Mirrors
 from gsbake.materials.visibility import Visibility
@@ -115,9 +115,10 @@ def test_wall_mirrored_in_a_dark_floor_is_not_its_paint(corner: Corner) -> None:
     def error(traced: bool) -> float:
         pairs = neighbours(corner.texels, corner.at, corner.normal)
         start = np.full((n, 3), 0.3)
-        fit = MaterialFit(corner.texels, corner.at, pairs, corner.normal, openness, start, 8, Priors(), 0.2, visibility, True)
+        surface = FitSurface(corner.texels, corner.at, pairs, corner.normal, openness, start, visibility)
+        fit = MaterialFit(surface, 8, Priors(), 0.2)
         photos = [photo(k, traced) for k in range(16)]
-        fitted = fit.run(photos, [], 120, 0, metals=False, glow=False)
+        fitted = fit.run(photos, [], FitSchedule(120, metallic=False, emission=False))
         known = corner.floor & (fitted.weight > 0.3) & (corner.at[:, 1] < 0.8)
         return float(np.abs(encode(fitted.values[known, :3]) - encode(paint[known])).mean())
 

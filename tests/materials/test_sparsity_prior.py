@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from gsbake.imaging.srgb import decode, encode
-from gsbake.materials.fit import Priors
+from gsbake.materials.fit import FitSchedule, Priors
 from gsbake.materials.sparsity_prior import METAL, NEAR, common, shifted
 from tests.materials.test_fit import FREE, Scene
 
@@ -82,7 +82,7 @@ def stains(scene: Scene, size: float) -> Scene:
 
 def paint_spread(scene: Scene, priors: Priors) -> float:
     """How uneven (sRGB) each of the two paints ends up where photos show it: the median distance from its median colour."""
-    fitted = scene.fit(0.2, priors).run(scene.photos, [], 200, 0)
+    fitted = scene.fit(0.2, priors).run(scene.photos, [], FitSchedule(200))
     known = fitted.weight > 0.3
     red = scene.paint[:, 0] > 0.3
     shown = encode(fitted.values[:, :3])
@@ -100,7 +100,7 @@ def test_paints_of_every_shade_stay() -> None:
     truth = encode(scene.paint)
 
     def error(priors: Priors) -> float:
-        fitted = scene.fit(0.8, priors).run(scene.photos, [], 200, 0, matte=True)
+        fitted = scene.fit(0.8, priors).run(scene.photos, [], FitSchedule(200, diffuse=True))
         known = fitted.weight > 0.3
         gain = (fitted.values[known, :3] * scene.paint[known]).sum(0) / (fitted.values[known, :3] ** 2).sum(0)
         return float(np.abs(encode(fitted.values[known, :3] * gain) - truth[known]).mean())

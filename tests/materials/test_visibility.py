@@ -14,7 +14,7 @@ from gsbake.geometry.cameras import Camera
 from gsbake.geometry.raycast import RayCaster
 from gsbake.imaging.srgb import encode
 from gsbake.materials.adjacency import neighbours
-from gsbake.materials.fit import MaterialFit, Priors
+from gsbake.materials.fit import FitSchedule, FitSurface, MaterialFit, Priors
 from gsbake.materials.pixels import PixelReader, Pixels
 from gsbake.materials.visibility import Visibility, directions
 from gsbake.shading import cubemap
@@ -214,8 +214,8 @@ class Tray:
         ambient = np.ones(len(texels)) if visibility is None else visibility.openness(WHITE)
         start = np.full((len(texels), 3), 0.4)
         pairs = neighbours(texels, self.box.at, self.box.normal)
-        fit = MaterialFit(texels, self.box.at, pairs, self.box.normal, ambient, start, 16, priors, 0.5, visibility, bounce)
-        fitted = fit.run(self.photos, [], 120, 0)
+        surface = FitSurface(texels, self.box.at, pairs, self.box.normal, ambient, start, visibility, bounce)
+        fitted = MaterialFit(surface, 16, priors, 0.5).run(self.photos, [], FitSchedule(120))
         known = fitted.weight > 0.3
         gain = (fitted.values[known, :3] * self.paint[known]).sum(0) / (fitted.values[known, :3] ** 2).sum(0)
         known &= self.inside

@@ -6,8 +6,8 @@ import importlib.util
 
 import pytest
 
+from gsbake.errors import UsageError
 from gsbake.pipeline import machine
-from gsbake.pipeline.errors import UsageError
 
 
 def pretend(monkeypatch: pytest.MonkeyPatch, build: str | None, gpus: int, triton: bool) -> None:

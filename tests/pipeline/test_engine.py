@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from gsbake.pipeline.errors import BadInputError, UsageError
+from gsbake.errors import BadInputError, UsageError
 from gsbake.pipeline.files import disk_error
 from gsbake.pipeline.registry import Registry
 from gsbake.pipeline.supervise import StageFailed

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from gsbake.pipeline.errors import BadInputError, UsageError
+from gsbake.errors import BadInputError, UsageError
 from gsbake.pipeline.replace import folder_files, replace_output, undo_replacement
 from tests.pipeline.toy import engine
 

@@ -1,39 +1,29 @@
-"""Decisions on work left out: evidence against profile, what is logged, and that seconds saved reach the manifest."""
+"""Decisions on skipped work: evidence against profile, what is reported, and that seconds saved reach the manifest."""
 
 from __future__ import annotations
 
 import json
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
 import pytest
 
-from gsbake.pipeline.skip import leave_out, wanted
+from gsbake.monitor import Rule, decide_skip, skips
 from tests.pipeline.toy import engine
-
-
-class Log:
-    """As much of a context as a decision needs."""
-
-    def __init__(self, mode: str) -> None:
-        self.settings = SimpleNamespace(skip=SimpleNamespace(photos=mode))
-        self.said: list[tuple[Any, ...]] = []
-
-    def decide(self, *said: Any) -> None:
-        self.said.append(said)
+from tests.support.recorder import Recorder
 
 
 @pytest.mark.parametrize(
-    ("mode", "holds", "out"),
+    ("rule", "holds", "skip"),
     [("auto", True, True), ("auto", False, False), ("always", False, True), ("never", True, False)],
 )
-def test_the_profile_overrules_the_evidence(mode: str, holds: bool, out: bool) -> None:
-    log: Any = Log(mode)
-    assert wanted(log, "photos", holds) is out and leave_out(log, "photos", holds, "3 of 9", "dropped", "kept", 4.0) is out
-    ((what, choice, evidence, saved),) = log.said
-    assert what == "skip.photos" and choice == ("dropped" if out else "kept") and evidence.startswith("3 of 9")
-    assert ("the profile asks for it" in evidence) == (mode != "auto") and saved == (4.0 if out else None)
+def test_the_profile_overrules_the_evidence(rule: Rule, holds: bool, skip: bool) -> None:
+    monitor = Recorder()
+    assert skips(rule, holds) is skip
+    assert decide_skip(monitor, "redundant_photos", rule, holds, "3 of 9", "dropped", "kept", 4.0) is skip
+    choice, evidence = monitor.decisions["skip.redundant_photos"]
+    assert choice == ("dropped" if skip else "kept") and evidence.startswith("3 of 9")
+    assert ("set by the profile" in evidence) == (rule != "auto")
+    assert monitor.saved["skip.redundant_photos"] == (4.0 if skip else None)
 
 
 def test_seconds_saved_reach_manifest_and_log(tmp_path: Path) -> None:

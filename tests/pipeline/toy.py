@@ -13,8 +13,8 @@ from typing import Any
 
 from pydantic import BaseModel
 
+from gsbake.errors import BadInputError, GsbakeError
 from gsbake.pipeline.engine import Engine, Observer
-from gsbake.pipeline.errors import BadInputError, GsbakeError
 from gsbake.pipeline.plan import Request
 from gsbake.pipeline.registry import Registry
 from gsbake.pipeline.stage import Context, Stage

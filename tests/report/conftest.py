@@ -1,23 +1,24 @@
-"""A stage context without the engine, and a tiny finished run: a grey ball before eight cameras."""
+"""A tiny finished run: a grey ball before eight cameras."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 
+from gsbake.config.schema import Report
 from gsbake.geometry.cameras import Camera, CameraSet, Similarity
 from gsbake.gltf.write import GltfImages, GltfMesh, build_glb
+from gsbake.report.write import ReportOptions, write_report
 from gsbake.shading.environment import EnvironmentLight
 from tests.report.shapes import ball
+from tests.support.recorder import Recorder
 
 #: World (Z-up) to glTF (+Y up), by the contract of the export.
 WORLD_TO_ASSET = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
@@ -26,37 +27,17 @@ SIZE, VIEWS, RADIUS = 64, 8, 0.7
 
 
 @dataclass
-class FakeContext:
-    """What a stage sees of the engine."""
+class Finished:
+    """A finished run: the folders of its stages, the folder for the report, and what the report's step reported."""
 
+    folders: dict[str, Path]
     out: Path
-    inputs: Mapping[str, Path]
-    settings: Any
-    seed: int = 0
-    threads: int = 2
-    device: str = "cpu"
-    checkpoint: Path = Path()
-    warned: list[str] = field(default_factory=list)
-    reached: list[tuple[int, int]] = field(default_factory=list)
+    options: ReportOptions
+    monitor: Recorder = field(default_factory=Recorder)
 
-    @contextmanager
-    def part(self, name: str) -> Iterator[None]:
-        yield
-
-    def progress(self, done: int, total: int, text: str = "", **live: float) -> None:
-        self.reached.append((done, total))
-
-    def stop_requested(self) -> bool:
-        return False
-
-    def check_stop(self) -> None:
-        return None
-
-    def decide(self, what: str, choice: str, evidence: str, saved: float | None = None) -> None:
-        return None
-
-    def warn(self, text: str) -> None:
-        self.warned.append(text)
+    def report(self) -> dict[str, Any]:
+        """Write the report; its figures."""
+        return write_report(self.folders, self.out, self.options, monitor=self.monitor)
 
 
 def png(image: np.ndarray) -> bytes:
@@ -87,8 +68,8 @@ def photo_of_ball(camera: Camera, colour: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.fixture
-def make_run(tmp_path: Path) -> Callable[..., FakeContext]:
-    def make(materials: bool = False, masks: bool = True, holdout: int = 4, shift: float = 0.0) -> FakeContext:
+def make_run(tmp_path: Path) -> Callable[..., Finished]:
+    def make(materials: bool = False, masks: bool = True, holdout: int = 4, shift: float = 0.0) -> Finished:
         root = tmp_path / "run"
         folders = {s: root / s for s in ("ingest", "poses", "train", "refine", "mesh", "bake", "export")}
         for k, (stage, folder) in enumerate(folders.items()):
@@ -145,7 +126,6 @@ def make_run(tmp_path: Path) -> Callable[..., FakeContext]:
             EnvironmentLight.from_radiance(np.ones((6, 8, 8, 3), np.float32)).save(folders["bake"] / "light.safetensors")
         out = root / "report"
         out.mkdir()
-        settings = SimpleNamespace(report=SimpleNamespace(views=2, view_size=48), train=SimpleNamespace(holdout=holdout))
-        return FakeContext(out, folders, settings)
+        return Finished(folders, out, ReportOptions(Report(views=2, view_size=48), holdout))
 
     return make

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import pytest
 
-from gsbake.report.charts import Bar, Curve, bars, duration, labels, lines, log_ticks, number, size, ticks
+from gsbake.report.charts import Bar, Curve, bars, labels, lines, log_ticks, number, ticks
 from gsbake.report.html import (
     Check,
     Comparison,
@@ -49,7 +49,7 @@ FULL = replace(
     maps=(Panel("Base colour", "1024", URI),),
     audit=(Check("triangles", "pass", "29 998"), Check("size", "fail", "9 MB")),
     curves=(lines([Curve("train", [0, 1, 2], [20, 21, 22])], "PSNR"),),
-    left_out=(LeftOut("skip.converged", "train", "stopped", "gain < 0.05 dB", "about 12 s"),),
+    left_out=(LeftOut("skip.converged_steps", "train", "stopped", "gain < 0.05 dB", "about 12 s"),),
     decisions=(Decision("poses", "structure from motion", "skipped", "poses given"),),
     stages=(StageRow("Training", "12 s", (("Results", (("psnr", "27.1"),)), ("Settings", ()))),),
     time_chart=bars([Bar("train", 12, "12 s", (("steps", 9.0), ("eval", 3.0)))], "time"),
@@ -117,7 +117,7 @@ def test_text_is_escaped_and_figures_are_shown() -> None:
     html = render_page(FULL)
     text = " ".join(outline(html).text)
     assert "a & b <mug>" in text and "<script>alert(1)</script>" in text and "<script>alert" not in html
-    for words in ("27.12 dB", "0.923", "used in training", "poses given", "29 998", "27.1", "skip.converged", "gain < 0.05", "12 s"):
+    for words in ("27.12 dB", "0.923", "used in training", "poses given", "29 998", "27.1", "skip.converged_steps", "gain < 0.05", "12 s"):
         assert words in text
 
 
@@ -218,15 +218,3 @@ def test_ticks_are_round_and_inside() -> None:
 @pytest.mark.parametrize(("value", "text"), [(0, "0"), (0.25, "0.25"), (12, "12"), (3000, "3k"), (2.5e6, "2.5M"), (1e-4, "1e-4")])
 def test_numbers(value: float, text: str) -> None:
     assert number(value) == text
-
-
-@pytest.mark.parametrize(
-    ("seconds", "text"), [(0.44, "0.4 s"), (12.2, "12 s"), (59.7, "1 min 00 s"), (185, "3 min 05 s"), (4320, "1 h 12 min")]
-)
-def test_durations(seconds: float, text: str) -> None:
-    assert duration(seconds) == text
-
-
-@pytest.mark.parametrize(("count", "text"), [(812_345, "812 kB"), (3_400_000, "3.4 MB"), (512e6, "512 MB"), (1.94e9, "1.9 GB")])
-def test_sizes(count: float, text: str) -> None:
-    assert size(count) == text

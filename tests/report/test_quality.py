@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from gsbake.capture.posed_photos import View
+from gsbake.errors import BadInputError
 from gsbake.geometry.cameras import Camera
-from gsbake.pipeline.errors import BadInputError
 from gsbake.report.quality import GREY, MAX_PSNR, asset_cameras, chosen_views, compare, psnr, ssim
 from gsbake.report.render import Picture, decode_srgb
 from tests.report.shapes import front_camera

@@ -12,8 +12,8 @@ import pytest
 
 from gsbake.capture.posed_photos import PosedPhotos
 from gsbake.config.schema import Skip
+from gsbake.errors import BadInputError
 from gsbake.gltf.read import read_glb
-from gsbake.pipeline.errors import BadInputError
 from gsbake.report import compose, manifests
 from gsbake.report.asset import open_asset
 from gsbake.report.lights import LitShader
@@ -22,33 +22,33 @@ from gsbake.report.render import Renderer
 from gsbake.report.sheets import chart_of_faces, uv_sheet
 from gsbake.shading.environment import EnvironmentLight
 from gsbake.stages.report import STAGE
-from tests.report.conftest import FakeContext
+from tests.report.conftest import Finished
 from tests.report.shapes import ball, quad
 
-MakeRun = Callable[..., FakeContext]
+MakeRun = Callable[..., Finished]
 
 
 def test_the_right_asset_scores_high(make_run: MakeRun) -> None:
-    ctx = make_run()
-    found = STAGE.run(ctx)
+    done = make_run()
+    found = done.report()
     # The ball is polygonal and the photos are reduced from 64 to 48 pixels: only the rim differs.
     assert found["psnr"] > 32 and found["ssim"] > 0.97
     assert found["held_out"] is True and found["compared"] == 2  # every fourth of eight, from the second on
-    body = json.loads((ctx.out / "report.json").read_text())
+    body = json.loads((done.out / "report.json").read_text())
     assert [v["name"] for v in body["views"]] == ["IMG_2.a", "IMG_6.a"]
     assert body["psnr"] == pytest.approx(np.mean([v["psnr"] for v in body["views"]]))
-    assert ctx.reached[-1][0] == ctx.reached[-1][1]
-    assert ctx.warned == []
+    assert done.monitor.progressed[-1][0] == done.monitor.progressed[-1][1]
+    assert done.monitor.warnings == []
 
 
 def test_a_shifted_asset_scores_low(make_run: MakeRun) -> None:
-    assert STAGE.run(make_run(shift=1.2))["psnr"] < 20
+    assert make_run(shift=1.2).report()["psnr"] < 20
 
 
 def test_page_tells_the_run(make_run: MakeRun) -> None:
-    ctx = make_run(materials=True)
-    found = STAGE.run(ctx)
-    html = (ctx.out / "report.html").read_text()
+    done = make_run(materials=True)
+    found = done.report()
+    html = (done.out / "report.html").read_text()
     triangles = f"{found['triangles']:,}".replace(",", " ")
     for words in ("grey_ball", "One photo is blurred &amp; dark.", "structure from motion", "8 of 9", "Learnt light", "Sunset", triangles):
         assert words in html
@@ -60,26 +60,26 @@ def test_page_tells_the_run(make_run: MakeRun) -> None:
 
 def test_lit_ball_under_white_light(make_run: MakeRun) -> None:
     # Radiance 1 from everywhere: sRGB 188 is linear .5, so diffuse light alone gives .5; the gloss adds a few percent of white.
-    found = STAGE.run(make_run(materials=True))
+    found = make_run(materials=True).report()
     assert 20 < found["psnr"] < 40
 
 
 def test_without_masks_or_held_out_photos(make_run: MakeRun) -> None:
-    ctx = make_run(masks=False, holdout=0)
-    found = STAGE.run(ctx)
+    done = make_run(masks=False, holdout=0)
+    found = done.report()
     assert found["held_out"] is False and found["compared"] == 8
     assert found["psnr"] > 28
-    html = (ctx.out / "report.html").read_text()
+    html = (done.out / "report.html").read_text()
     assert "no masks" in html and html.count("used in training") == 2
 
 
 def test_cameras_of_another_run(make_run: MakeRun) -> None:
-    ctx = make_run()
-    path = ctx.inputs["export"] / "cameras.json"
+    done = make_run()
+    path = done.folders["export"] / "cameras.json"
     body = json.loads(path.read_text())
     path.write_text(json.dumps(body | {"frames": body["frames"][1:]}))
     with pytest.raises(BadInputError, match="7 cameras for 8 photos"):
-        STAGE.run(ctx)
+        done.report()
 
 
 def test_settings_declared() -> None:
@@ -88,9 +88,9 @@ def test_settings_declared() -> None:
 
 
 def test_light_turns_with_the_frames(make_run: MakeRun) -> None:
-    ctx = make_run()
-    cameras = asset_cameras(ctx.inputs["export"] / "cameras.json")
-    posed = PosedPhotos.open(ctx.inputs["poses"])
+    done = make_run()
+    cameras = asset_cameras(done.folders["export"] / "cameras.json")
+    posed = PosedPhotos.open(done.folders["poses"])
     to_light = compose.light_rotation(cameras[3], posed.cameras.cameras[3])
     # By the contract: unit → world by the similarity, world → asset by (x, y, z) → (x, z, −y).
     up = posed.cameras.to_world.rotation @ np.array([0.3, 0.5, -0.7])
@@ -98,7 +98,7 @@ def test_light_turns_with_the_frames(make_run: MakeRun) -> None:
 
 
 def test_open_asset_undoes_the_coding(make_run: MakeRun) -> None:
-    path = make_run().inputs["export"] / "asset.glb"
+    path = make_run().folders["export"] / "asset.glb"
     asset = open_asset(path, unlit=True)
     np.testing.assert_allclose(asset.base_color, 0.5029, atol=1e-3)  # sRGB 188
     assert asset.orm is not None and asset.normal_map is not None
@@ -169,18 +169,19 @@ def test_manifests_may_lack_everything(tmp_path: Path) -> None:
 
 
 def test_every_rule_on_work_left_out_is_listed() -> None:
-    done = {"what": "skip.converged", "choice": "stopped", "evidence": "stood still", "saved_s": 75.0}
+    done = {"what": "skip.converged_steps", "choice": "stopped", "evidence": "stood still", "saved_s": 75.0}
     said = {
-        "poses": {"decisions": [{"what": "skip.photos", "choice": "all used", "evidence": "0 of 9"}, {"what": "matching", "choice": "x"}]},
+        "poses": {"decisions": [{"what": "skip.redundant_photos", "choice": "all used", "evidence": "0 of 9"},
+                                {"what": "matching", "choice": "x"}]},
         "train": {"decisions": [done]},
         "refine": {"decisions": [done | {"choice": "all steps", "saved_s": None}]},
     }
     rows = manifests.left_out(said)
     assert list(dict.fromkeys(row.rule for row in rows)) == [f"skip.{rule}" for rule in Skip.model_fields]
     by_stage = {(row.rule, row.stage): row for row in rows}
-    assert by_stage["skip.converged", "train"].saved == "about 1 min 15 s"
-    assert by_stage["skip.converged", "refine"].saved == "" and by_stage["skip.photos", "poses"].evidence == "0 of 9"
-    assert by_stage["skip.exposure", ""].choice == "not asked"
+    assert by_stage["skip.converged_steps", "train"].saved == "about 1 min 15 s"
+    assert by_stage["skip.converged_steps", "refine"].saved == "" and by_stage["skip.redundant_photos", "poses"].evidence == "0 of 9"
+    assert by_stage["skip.exposure_equalisation", ""].choice == "not asked"
     assert [d.what for d in manifests.decisions(said)] == ["matching"]
     assert manifests.left_out({"mesh": {}}) == ()
 

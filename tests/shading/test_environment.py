@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from gsbake.pipeline.errors import BadInputError, UsageError
+from gsbake.errors import BadInputError, UsageError
 from gsbake.shading import colour, cubemap, panorama
 from gsbake.shading.environment import EnvironmentLight
 

@@ -18,8 +18,8 @@ from tests.support.node import gltf_issues
 from tests.support.truth import Figures, measure
 
 SMALL = (
-    "train.iterations=150", "train.max_size=160", "train.init_surfels=4000", "splat.max_surfels=8000", "refine.iterations=20",
-    "mesh.max_resolution=128", "mesh.faces=4000", "bake.size=256", "bake.fit_size=130", "bake.fit_steps=40", "bake.occlusion_rays=8",
+    "train.iterations=150", "train.max_size=160", "train.init_surfels=4000", "surfels.max_count=8000", "refine.iterations=20",
+    "mesh.max_resolution=128", "mesh.faces=4000", "bake.size=256", "bake.fit_size=130", "bake.fit_iterations=40", "bake.occlusion_rays=8",
     "report.views=2", "report.view_size=128",
 )  # fmt: skip
 

@@ -65,13 +65,13 @@ def trainer(kind: str, steps: int, shading: str = "colour", seed: int = 0) -> Tr
     p = Profile.model_validate(
         {
             "train": {"iterations": steps, "max_size": SIZE, "holdout": 0, "lr_position": 5e-3},
-            "splat": {"max_surfels": MOST_SURFELS, "env_size": 4},
+            "surfels": {"max_count": MOST_SURFELS}, "light": {"size": 4},
         }
     )
     points = fibonacci_sphere(200)
     surfels = create(0.7 * points, points, 0.7 * spacing(points), None, shading, 1, 0.1, 5.0)
     light = EnvironmentLight(4) if shading == "pbr" else None
-    plan = Plan(p.train, p.splat, p.loss, steps, 0.3, True, seed)
+    plan = Plan(p.train, p.surfels, p.loss, steps, 0.3, True, seed)
     return Trainer(plan, surfels, light, views(kind, SIZE), views(kind, SIZE // 2), [])
 
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 
-from gsbake.pipeline.errors import BadInputError
+from gsbake.errors import BadInputError
 from gsbake.surfels.densification.clone_split import OPACITY_FLOOR, prune
 from gsbake.surfels.losses.terms import median_sharpness
 from gsbake.surfels.model import Surfels, create

@@ -11,8 +11,8 @@ import pytest
 import trimesh
 from scipy.spatial import cKDTree
 
+from gsbake.errors import UsageError
 from gsbake.geometry.cameras import Camera, CameraSet
-from gsbake.pipeline.errors import UsageError
 from gsbake.synth import scene
 from gsbake.synth.capture import cameras, encode_srgb, true_mesh, write_capture
 

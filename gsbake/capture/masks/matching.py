@@ -12,7 +12,7 @@ import numpy as np
 
 from gsbake.capture.photos.decode import Bytes, RawPhoto, UnreadablePhotoError, orient, read_mask
 from gsbake.capture.sources import PHOTO_SUFFIXES
-from gsbake.pipeline.errors import BadInputError
+from gsbake.errors import BadInputError
 
 
 def match_masks(folder: Path, photos: dict[str, Path]) -> dict[str, Path]:

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsbake.capture.photos.decode import Bytes
+from gsbake.errors import BadInputError
 from gsbake.geometry.cameras import Array, Camera
-from gsbake.pipeline.errors import BadInputError
 
 
 def distort(points: Array, coefficients: tuple[float, ...]) -> Array:

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsbake.capture.poses.frames import Given, PhotoSize, collect, rigid
+from gsbake.errors import BadInputError
 from gsbake.geometry.cameras import Camera
-from gsbake.pipeline.errors import BadInputError
 
 #: Camera model → places of its parameters among fx, fy, cx, cy, k1, k2, p1, p2, k3, k4, k5, k6.
 _LAYOUT = {

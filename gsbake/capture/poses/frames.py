@@ -12,8 +12,8 @@ from pathlib import PurePosixPath
 
 import numpy as np
 
+from gsbake.errors import BadInputError
 from gsbake.geometry.cameras import Array, Camera
-from gsbake.pipeline.errors import BadInputError
 
 #: Largest deviation of RᵀR from the identity that passes as rounding in a text file.
 RIGID_TOLERANCE = 1e-2

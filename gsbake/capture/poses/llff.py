@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 
 from gsbake.capture.poses.frames import Given, PhotoSize, checked_intrinsics, fit_to_photo, rigid
+from gsbake.errors import BadInputError
 from gsbake.geometry.cameras import Camera
-from gsbake.pipeline.errors import BadInputError
 
 
 def read_llff(path: Path, listing: Sequence[str], sizes: Mapping[str, PhotoSize]) -> Given:

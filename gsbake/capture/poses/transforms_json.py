@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 
 from gsbake.capture.poses.frames import Given, PhotoSize, collect, match_frame, rigid
+from gsbake.errors import BadInputError
 from gsbake.geometry.cameras import Camera
-from gsbake.pipeline.errors import BadInputError
 
 _MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE")
 

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from gsbake.pipeline.errors import GsbakeError
+from gsbake.errors import GsbakeError
 
 _POLL = 0.2  # seconds between looks at stop requests
 
@@ -85,7 +85,7 @@ def run_job(job: Mapping[str, Any], out: Path, watch: Watch, limit: float | None
     deadline = None if limit is None else time.monotonic() + limit
     command = [sys.executable, "-m", "gsbake.capture.sfm.worker", str(order), str(os.getpid())]
     environment = dict(os.environ)
-    root = str(Path(__file__).resolve().parents[2])
+    root = str(Path(__file__).resolve().parents[3])
     environment["PYTHONPATH"] = os.pathsep.join(p for p in (root, environment.get("PYTHONPATH")) if p)
     with log.open("wb") as sink:
         child = subprocess.Popen(

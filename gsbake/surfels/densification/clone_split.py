@@ -2,7 +2,7 @@
 
 Clone/split after 3DGS (Kerbl et al. 2023); children inherit s (Zhu et al. 2025). Instead of a fixed threshold the surfels with the
 largest score (`policies.py`: the mean screen gradient, or that and the SDF sample) are taken, as many as a budget that grows to
-`max_surfels` allows: no scene-dependent constant to guess.
+`surfels.max_count` allows: no scene-dependent constant to guess.
 """
 
 from __future__ import annotations

@@ -15,7 +15,7 @@ import torch
 from scipy.spatial import cKDTree
 
 from gsbake.capture.posed_photos import PosedPhotos
-from gsbake.pipeline.errors import BadInputError
+from gsbake.errors import BadInputError
 from gsbake.surfels.densification.clone_split import OPACITY_FLOOR
 from gsbake.surfels.densification.policies import PRUNING, Placement
 from gsbake.surfels.initialisation import spacing

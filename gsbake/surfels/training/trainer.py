@@ -42,11 +42,12 @@ class Plan:
     """What a run of the trainer needs to know: the profile's sections and which kind of run it is.
 
     `densify`: whether surfels come and go at all; `growth`: the rule of `policies.GROWING` by which they multiply.
-    `converged` is `skip.converged`: "auto" stops early when nothing moves any more, "always" as soon as the run may, "never" does not.
+    `converged` is the rule skip.converged_steps: "auto" stops at a plateau, "always" as soon as the schedule allows, "never" does not stop
+    early.
     """
 
     train: Any
-    splat: Any
+    model: Any
     loss: Any
     iterations: int
     coarse_share: float
@@ -191,7 +192,7 @@ class Trainer:
         if self.done > DENSIFY_TO * n:
             return
         share = (self.done / n - DENSIFY_FROM) / (DENSIFY_TO - DENSIFY_FROM)
-        budget = int(self.start_count + (self.plan.splat.max_surfels - self.start_count) * min(1.0, share))
+        budget = int(self.start_count + (self.plan.model.max_count - self.start_count) * min(1.0, share))
         off = PRUNING[self.plan.train.prune](placement(self.surfels))
         self.surfels, keep, _ = prune(self.surfels, self.adam, self.stats, LARGEST, off)
         kept = Statistics(self.stats.gradient[keep], self.stats.views[keep], self.stats.weight[keep])

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from gsbake.capture.photos.undistortion import distort, pinhole_of, remap_tables, resample, undistorted
+from gsbake.errors import BadInputError
 from gsbake.geometry.cameras import Camera
-from gsbake.pipeline.errors import BadInputError
 
 LENSES = [
     (-0.2, 0.05, 0.0, 0.0),

@@ -15,8 +15,8 @@ from gsbake.capture.photos.decode import orient
 from gsbake.capture.poses.frames import PhotoSize, fit_to_photo, match_frame, upright
 from gsbake.capture.poses.given import read_poses
 from gsbake.capture.sfm.colmap import pycolmap
+from gsbake.errors import BadInputError
 from gsbake.geometry.cameras import Camera, CameraSet, Similarity
-from gsbake.pipeline.errors import BadInputError
 
 SIZES = {"a.jpg": PhotoSize(200, 100), "b.jpg": PhotoSize(200, 100)}
 

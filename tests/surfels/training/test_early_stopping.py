@@ -43,7 +43,7 @@ def trainer(mode: str) -> Trainer:
     away = torch.tensor([0.0, 0.0, 3.0])
     view = TrainView("a", black, None, torch.eye(3), away, -away, Pinhole(8, 8, 8.0, 8.0, 4.0, 4.0))
     surfels = create(points, points, torch.full((20,), 0.1).numpy(), None, "colour", 0, 0.01, 5.0)
-    return Trainer(Plan(p.train, p.splat, p.loss, STEPS, 0.1, False, 0, mode), surfels, None, [view], [view], [])
+    return Trainer(Plan(p.train, p.surfels, p.loss, STEPS, 0.1, False, 0, mode), surfels, None, [view], [view], [])
 
 
 @pytest.mark.parametrize(("mode", "gain", "stop"), [("auto", 0.0, 80), ("auto", 1.0, None), ("never", 0.0, None), ("always", 1.0, 20)])

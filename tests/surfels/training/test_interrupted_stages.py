@@ -12,7 +12,7 @@ import pytest
 
 SETTINGS = (
     "ingest.max_size=96", "stereo.enabled=never", "train.iterations=260", "train.max_size=96", "train.init_surfels=1500",
-    "splat.max_surfels=2500", "splat.shading=pbr", "splat.env_size=8", "refine.iterations=120", "skip.refined_poses=never",
+    "surfels.max_count=2500", "surfels.shading=pbr", "light.size=8", "refine.iterations=120", "skip.pose_refinement=never",
 )  # fmt: skip
 
 #: Runs up to a stage and, once that stage has done so many steps, sends itself a signal (0: never).
@@ -22,7 +22,7 @@ from pathlib import Path
 from gsbake.cli.options import Options
 from gsbake.cli.session import open_session
 from gsbake.pipeline.engine import Observer
-from gsbake.pipeline.errors import GsbakeError
+from gsbake.errors import GsbakeError
 
 out, stage, step, number = sys.argv[1], sys.argv[2], int(sys.argv[3]), int(sys.argv[4])
 

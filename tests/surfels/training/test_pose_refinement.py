@@ -235,8 +235,8 @@ def capture(size: float, exposure: float) -> tuple[list[TrainView], list[TrainVi
 
 
 def trainer(views: list[TrainView]) -> Trainer:
-    p = Profile.model_validate({"train": {"iterations": STEPS}, "splat": {"max_surfels": 1500}})
-    t = Trainer(Plan(p.train, p.splat, p.loss, STEPS, 0.0, False, 0), ball(1000), None, list(views), list(views), held_out(PHOTOS, 4))
+    p = Profile.model_validate({"train": {"iterations": STEPS}, "surfels": {"max_count": 1500}})
+    t = Trainer(Plan(p.train, p.surfels, p.loss, STEPS, 0.0, False, 0), ball(1000), None, list(views), list(views), held_out(PHOTOS, 4))
     t.background = BACK
     return t
 

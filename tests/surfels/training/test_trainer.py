@@ -12,8 +12,8 @@ import torch
 
 from gsbake.capture.posed_photos import PosedPhotos
 from gsbake.config.schema import Profile
+from gsbake.errors import BadInputError
 from gsbake.geometry.cameras import Camera, CameraSet
-from gsbake.pipeline.errors import BadInputError
 from gsbake.surfels.densification.refinement import prune_and_densify
 from gsbake.surfels.initialisation import begin, fibonacci_sphere, spacing
 from gsbake.surfels.model import Surfels, create
@@ -61,14 +61,14 @@ def posed(tmp_path_factory: pytest.TempPathFactory) -> PosedPhotos:
 
 def profile(**train: object) -> Profile:
     base = {"iterations": 60, "max_size": SIZE, "init_surfels": 400, "holdout": 6, "lr_position": 3e-3} | train
-    return Profile.model_validate({"train": base, "splat": {"max_surfels": 600}})
+    return Profile.model_validate({"train": base, "surfels": {"max_count": 600}})
 
 
 def trainer(posed: PosedPhotos, p: Profile) -> Trainer:
-    surfels, kind, _ = begin(posed, p.train, p.splat, 0)
+    surfels, kind, _ = begin(posed, p.train, p.surfels, 0)
     assert kind == p.train.init or kind == "hull"
     full, half = load_views(posed, p.train.max_size)
-    plan = Plan(p.train, p.splat, p.loss, p.train.iterations, 0.5, True, 0)
+    plan = Plan(p.train, p.surfels, p.loss, p.train.iterations, 0.5, True, 0)
     return Trainer(plan, surfels, None, full, half, held_out(len(full), p.train.holdout))
 
 
@@ -90,7 +90,7 @@ def test_learns(posed: PosedPhotos) -> None:
 def test_learns_with_the_other_transfers(posed: PosedPhotos, name: str, tmp_path: Path) -> None:
     # the bell's surfels are at most a quarter opaque: several layers share a pixel, and it learns more slowly
     p = profile(iterations=200 if name == "bell" else 100, init_surfels=1000)
-    p = p.model_copy(update={"splat": p.splat.model_copy(update={"transfer": name})})
+    p = p.model_copy(update={"surfels": p.surfels.model_copy(update={"transfer": name})})
     t = trainer(posed, p)
     before, gamma = t.evaluate(), float(t.surfels.gamma)
     while t.done < t.end:

@@ -1,21 +1,23 @@
-"""Figures as people read them."""
+"""Numbers and lists as people read them: durations, sizes, counts, the first few names of many."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
-#: Figures shown on a stage's line; the manifest holds all of them.
-SHOWN = 4
+#: Figures on a stage's line; the manifest holds all of them.
+MAX_FIGURES = 4
+#: Names that a message lists before it counts the rest.
+MAX_NAMES = 4
 
 
 def duration(seconds: float) -> str:
     """0.3 s, 42 s, 3 min 05 s, 2 h 07 min."""
     if seconds < 10:
         return f"{seconds:.1f} s"
-    if seconds < 60:
-        return f"{seconds:.0f} s"
     whole = round(seconds)
+    if whole < 60:
+        return f"{whole} s"
     if whole < 3600:
         return f"{whole // 60} min {whole % 60:02d} s"
     return f"{whole // 3600} h {whole % 3600 // 60:02d} min"
@@ -30,23 +32,28 @@ def size(count: float) -> str:
     return f"{count / 1e9:.2f} GB"
 
 
-def figure(value: float) -> str:
-    """A number with the digits that matter."""
+def number(value: float) -> str:
+    """15 000, 0.0821, 24.6: integers in groups of three, other numbers to four significant digits, without exponents where readable."""
     if isinstance(value, bool):
         return "yes" if value else "no"
-    if isinstance(value, int):
-        return f"{value:,}".replace(",", " ")
+    if isinstance(value, int) or (abs(value) >= 1e4 and abs(value) < 1e15):
+        return f"{round(value):,}".replace(",", " ")
     return f"{value:.4g}"
 
 
-def figures(results: Mapping[str, Any], limit: int = SHOWN) -> str:
+def figures(results: Mapping[str, Any], limit: int = MAX_FIGURES) -> str:
     """The first few plain numbers and words among a stage's results."""
     shown = []
     for name, value in results.items():
         if isinstance(value, bool | int | float):
-            shown.append(f"{name.replace('_', ' ')} {figure(value)}")
+            shown.append(f"{name.replace('_', ' ')} {number(value)}")
         elif isinstance(value, str) and len(value) <= 24:
             shown.append(f"{name.replace('_', ' ')} {value}")
         if len(shown) == limit:
             break
     return ", ".join(shown)
+
+
+def shortlist(names: Sequence[str]) -> str:
+    """The first few names, and how many more there are."""
+    return ", ".join(names[:MAX_NAMES]) + (f" and {len(names) - MAX_NAMES} more" if len(names) > MAX_NAMES else "")

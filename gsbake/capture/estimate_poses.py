@@ -1,0 +1,221 @@
+"""Cameras of a capture (solved, or checked when given), undistorted photos, and the unit frame around the object."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import tempfile
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from gsbake.capture.hull.visual_hull import visual_hull
+from gsbake.capture.masks.completion import mend
+from gsbake.capture.photos.redundancy import spare_photos
+from gsbake.capture.photos.undistortion import lens_key, pinhole_of, remap_tables, resample
+from gsbake.capture.posed_photos import PosedPhotos
+from gsbake.capture.poses.normalisation import Extent, extent_from_masks, extent_from_view
+from gsbake.capture.sfm.solve import Solver
+from gsbake.config.schema import Poses
+from gsbake.errors import BadInputError
+from gsbake.geometry.cameras import Camera, CameraSet
+from gsbake.geometry.ply import read_cloud, write_cloud
+from gsbake.imaging.png import write_png
+from gsbake.monitor import SILENT, Monitor, Rule, decide_skip
+from gsbake.text import shortlist
+
+#: Fewer points than this say nothing about the shape.
+MIN_POINTS = 30
+#: Surface points at which photos are compared for redundancy.
+SURFACE_POINTS = 1000
+#: Longer side in pixels of the masks that the hull is made from.
+HULL_SIZE = 512
+
+
+@dataclass(frozen=True)
+class PoseOptions:
+    """Settings of pose estimation; `redundant_photos` is the rule of [skip]."""
+
+    poses: Poses = Poses()
+    redundant_photos: Rule = "auto"
+
+
+def estimate_poses(
+    ingest: Path,
+    out: Path,
+    options: PoseOptions | None = None,
+    *,
+    seed: int = 0,
+    threads: int = 2,
+    scratch: Path | None = None,
+    monitor: Monitor = SILENT,
+) -> dict[str, Any]:
+    """Find the cameras of the folder that `ingest` wrote, write the posed capture into the folder `out`; return the figures.
+
+    Written: `cameras.json` (`CameraSet`, unit frame), `photos/`, `masks/` (pinhole), `points.ply` (tie points, unit frame; may be absent),
+    `sparse/` (COLMAP binary model, input frame). `scratch` keeps COLMAP's database for a run that is interrupted. Raises BadInputError when
+    too few photos register, or required poses are missing.
+    """
+    if scratch is None:
+        with tempfile.TemporaryDirectory(prefix="gsbake-poses-") as folder:
+            return estimate_poses(ingest, out, options, seed=seed, threads=threads, scratch=Path(folder), monitor=monitor)
+    run = _Estimation(ingest, out, options or PoseOptions(), seed, threads, scratch, monitor)
+    return run.run()
+
+
+@dataclass
+class _Estimation:
+    """One run."""
+
+    ingest: Path
+    out: Path
+    options: PoseOptions
+    seed: int
+    threads: int
+    scratch: Path
+    monitor: Monitor
+
+    def run(self) -> dict[str, Any]:
+        """The recipe."""
+        monitor = self.monitor
+        entries: list[dict[str, Any]] = json.loads((self.ingest / "photos.json").read_text())["photos"]
+        solver = Solver(self.ingest, entries, self.scratch, self.options.poses, self.seed, self.threads, monitor)
+        given = self._use_given(len(entries))
+        solved = solver.triangulate() if given else solver.solve()
+        points, colours = read_cloud(solved.cloud) if solved.cloud.exists() else (None, None)
+        with monitor.part("undistortion"):
+            pinholes = self._undistort(solved.cameras)
+        with monitor.part("normalisation"):
+            masks = self._small_masks(pinholes)
+            extent = self._extent(pinholes, masks, points)
+        to_world = extent.similarity()
+        to_unit = to_world.inverse()
+        origin = "given" if given else "solved"
+        unit = [c.moved(to_unit) for c in pinholes]
+        cloud = None if points is None or len(points) < MIN_POINTS else to_unit.apply(points)
+        if cloud is not None:
+            write_cloud(self.out / "points.ply", cloud, colours if colours is not None else cloud * 0)
+        with monitor.part("masks"):
+            self._complete_masks([(camera.moved(to_unit), mask) for camera, mask in masks], cloud)
+        with monitor.part("redundant photos"):
+            unit, dropped = self._drop_redundant(entries, unit, cloud)
+        CameraSet(tuple(unit), to_world, origin).save(self.out / "cameras.json")
+        if (solver.folder / "sparse").exists():
+            shutil.copytree(solver.folder / "sparse", self.out / "sparse")
+        monitor.decide("unit frame", f"radius {extent.radius:.4g} in world units", extent.evidence)
+        centre = extent.centre.tolist()
+        return {"poses": origin, **solved.figures, "dropped_photos": dropped, "centre": centre, "radius": extent.radius}
+
+    def _use_given(self, photos: int) -> bool:
+        """Whether given poses are used. Raises BadInputError when they are required but missing."""
+        source, known = self.options.poses.source, self.ingest / "poses" / "cameras.json"
+        if not known.exists() and source == "given":
+            raise BadInputError("No poses were given, but poses.source is given; give poses with the photos or set it to auto.")
+        use = known.exists() and source != "solve"
+        count = f"given for {len(CameraSet.load(known).cameras)} of {photos} photos" if known.exists() else "none were given"
+        evidence = f"{count}; set by the profile" if source != "auto" else count
+        self.monitor.decide("pose source", "given" if use else "structure from motion", evidence)
+        return use
+
+    def _undistort(self, cameras: Sequence[Camera]) -> list[Camera]:
+        """Write photos and masks as a pinhole camera images them; photos without distortion are copied as they are."""
+        groups: dict[tuple[float, ...], list[Camera]] = {}
+        for camera in cameras:
+            groups.setdefault(lens_key(camera), []).append(camera)
+        (self.out / "photos").mkdir()
+        if any((self.ingest / "masks" / f"{c.name}.png").exists() for c in cameras):
+            (self.out / "masks").mkdir()
+        cv2.setNumThreads(1)
+        done = 0
+        flat: dict[str, Camera] = {}
+        with ThreadPoolExecutor(max(1, min(self.threads, 8))) as pool:
+            for members in groups.values():
+                target = pinhole_of(members[0])
+                tables = remap_tables(members[0], target) if members[0].distortion else None
+
+                def one(camera: Camera, tables: Any = tables, target: Camera = target) -> Camera:
+                    for sub in ("photos", "masks"):
+                        self._resample(sub, camera.name, tables)
+                    return replace(target, name=camera.name, R=camera.R, t=camera.t)
+
+                for result in pool.map(one, members):
+                    flat[result.name] = result
+                    done += 1
+                    self.monitor.progress(done, len(cameras), "undistortion")
+        return [flat[c.name] for c in cameras]
+
+    def _resample(self, sub: str, name: str, tables: Any) -> None:
+        """Write one photo or mask (the folder `sub`) through the tables of `remap_tables`, or copy it where there are none."""
+        source, goal = self.ingest / sub / f"{name}.png", self.out / sub / f"{name}.png"
+        mask = sub == "masks"
+        if mask and not source.exists():
+            return
+        if tables is None:
+            shutil.copyfile(source, goal)
+            return
+        image: Any = cv2.imread(str(source), cv2.IMREAD_GRAYSCALE if mask else cv2.IMREAD_COLOR)
+        if image is None:
+            raise FileNotFoundError(source)
+        result = resample(np.asarray(image, np.uint8), tables, mask)
+        write_png(goal, result if mask else np.ascontiguousarray(result[..., ::-1]))
+
+    def _small_masks(self, cameras: Sequence[Camera]) -> list[tuple[Camera, Any]]:
+        """Each photo's camera and mask at the size that hulls are made from; None where it has none."""
+        posed = PosedPhotos(self.out, CameraSet(tuple(cameras)))
+        cv2.setNumThreads(self.threads)
+        return [posed.mask(i, HULL_SIZE) for i in range(len(cameras))]
+
+    def _extent(self, cameras: Sequence[Camera], masks: Sequence[tuple[Camera, Any]], points: Any) -> Extent:
+        """The ball around the object: from the visual hull when half of the photos have masks, else from what the cameras look at."""
+        masked = [(camera, mask) for camera, mask in masks if mask is not None]
+        if len(masked) >= max(3, 0.5 * len(cameras)):
+            extent = extent_from_masks([c for c, _ in masked], [m for _, m in masked])
+            if extent is not None:
+                return extent
+            self.monitor.warn("The masks share no common object; check that white is the object (else set ingest.invert_masks).")
+        return extent_from_view(cameras, points)
+
+    def _complete_masks(self, masks: Sequence[tuple[Camera, Any]], cloud: Any) -> None:
+        """Add to mask files the parts that tie points prove missing; `masks` are small, cameras and cloud in the unit frame."""
+        if cloud is None or any(mask is None for _, mask in masks):
+            return
+        mended = mend([camera for camera, _ in masks], [mask for _, mask in masks], cloud)
+        names = [masks[one.index][0].name for one in mended]
+        for one, name in zip(mended, names, strict=True):
+            path = self.out / "masks" / f"{name}.png"
+            mask = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+            if mask is None:
+                raise FileNotFoundError(path)
+            missing = cv2.resize(255 * one.missing.astype(np.uint8), mask.shape[::-1], interpolation=cv2.INTER_LINEAR)
+            write_png(path, np.where(missing > 127, 255, mask).astype(np.uint8))
+        if mended:
+            points = sum(one.points for one in mended)
+            evidence = f"they excluded {points} tie points that nearly all others include: {shortlist(names)}"
+            self.monitor.decide("mask completion", f"{len(mended)} of {len(masks)} masks", evidence)
+
+    def _drop_redundant(self, entries: Sequence[dict[str, Any]], cameras: list[Camera], cloud: Any) -> tuple[list[Camera], list[str]]:
+        """The cameras (unit frame) without redundant photos, whose files are deleted, and the names of those."""
+        posed = PosedPhotos(self.out, CameraSet(tuple(cameras)))
+
+        def surface() -> tuple[Any, Any]:
+            if posed.has_masks:
+                return visual_hull(posed).surface_points(SURFACE_POINTS, self.seed)
+            points = np.zeros((0, 3)) if cloud is None else cloud[np.linalg.norm(cloud, axis=1) < 1]
+            return points[:: max(1, len(points) // SURFACE_POINTS)], None
+
+        rule = self.options.redundant_photos
+        alike = {e["name"]: e["duplicate_of"] for e in entries if e["duplicate_of"]}
+        spare, evidence = ([], "not searched") if rule == "never" else spare_photos(cameras, alike, surface, rule == "always")
+        names = [cameras[i].name for i in spare]
+        skipped = f"{len(names)} of {len(cameras)} photos skipped ({shortlist(names)})" if names else "no photo is redundant"
+        if not decide_skip(self.monitor, "redundant_photos", rule, bool(names), evidence, skipped, f"all {len(cameras)} photos used"):
+            return cameras, []
+        for name in names:
+            for sub in ("photos", "masks"):
+                (self.out / sub / f"{name}.png").unlink(missing_ok=True)
+        return [c for c in cameras if c.name not in set(names)], names

@@ -1,0 +1,264 @@
+"""From mesh and photos to textures: UV atlas, normal map, ambient occlusion, materials, as linear half-float images."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from safetensors.numpy import save_file
+
+from gsbake.capture.posed_photos import PosedPhotos
+from gsbake.config.schema import Bake
+from gsbake.errors import BadInputError
+from gsbake.geometry.ply import read_mesh
+from gsbake.geometry.raycast import RayCaster
+from gsbake.imaging.exr import write_exr
+from gsbake.materials.delighting import find_irradiance, without_shading
+from gsbake.materials.fitting import RAY_OFFSET, SMOOTHING_RADIUS, FitOptions, fit_materials
+from gsbake.monitor import SILENT, Monitor, Rule, decide_skip
+from gsbake.surfels.raster.threads import configure
+from gsbake.texturing.atlas import make_atlas
+from gsbake.texturing.inpainting import continue_over_surface, flood
+from gsbake.texturing.needed import normals_agree
+from gsbake.texturing.normal_map import Detail, find_detail, normal_map, vertex_normals
+from gsbake.texturing.occlusion_map import open_share
+from gsbake.texturing.photo_projection import project_photos, project_surfel_materials
+from gsbake.texturing.projection import Blended
+from gsbake.texturing.resampling import Coarse
+from gsbake.texturing.unwrapped_mesh import Surface
+
+Floats = NDArray[np.float32]
+
+#: Edge of the texture on which the light for delighting is estimated: some ten thousand texels determine its nine coefficients.
+DELIGHT_SIZE = 128
+#: A larger share of the surface that no photo observed is worth a warning.
+MAX_UNSEEN = 0.25
+
+
+@dataclass(frozen=True)
+class BakeOptions:
+    """Settings of the bake; `train_size` and `holdout` are those of training, `light_size` the edge of the environment map's faces in
+    texels, the rest are rules of [skip]."""
+
+    bake: Bake = Bake()
+    train_size: int = 512
+    holdout: int = 8
+    light_size: int = 32
+    exposure_equalisation: Rule = "auto"
+    specular: Rule = "auto"
+    normal_map: Rule = "auto"
+    metallic_map: Rule = "auto"
+    roughness_map: Rule = "auto"
+
+
+def bake_textures(
+    poses: Path,
+    surfels: Path,
+    mesh: Path,
+    out: Path,
+    options: BakeOptions | None = None,
+    *,
+    seed: int = 0,
+    threads: int = 2,
+    monitor: Monitor = SILENT,
+) -> dict[str, Any]:
+    """Unwrap the mesh of the folder `mesh` and bake its textures from the photos into the folder `out`; return the figures.
+
+    Written: `mesh.safetensors` (the unwrapped mesh with its tangent frames), `base_color.exr`, `orm.exr`, `coverage.exr`, where needed
+    `normal.exr` and `emissive.exr`, with materials `light.safetensors`. Raises BadInputError when the mesh is damaged, does not fit the
+    atlas, or is seen by no photo.
+    """
+    return _Baking(PosedPhotos.open(poses, surfels), surfels, mesh, out, options or BakeOptions(), seed, threads, monitor).run()
+
+
+@dataclass(frozen=True)
+class Textures:
+    """Per texel: `values` (n, 3, 5 or 8) linear base colour, then roughness and metallic, then emission; which are `observed` (n,), and the
+    `confidence` (n,); `normal` of the shading."""
+
+    projected: Blended
+    normal: Detail
+    figures: dict[str, Any]
+
+
+@dataclass
+class _Baking:
+    """One run."""
+
+    posed: PosedPhotos
+    surfels: Path
+    mesh: Path
+    out: Path
+    options: BakeOptions
+    seed: int
+    threads: int
+    monitor: Monitor
+
+    def run(self) -> dict[str, Any]:
+        """The recipe."""
+        monitor, settings = self.monitor, self.options.bake
+        configure(self.threads)
+        if settings.materials == "surfels" and not (self.surfels / "light.safetensors").exists():
+            raise BadInputError(
+                'bake: bake.materials is "surfels", but the surfels learnt none; set surfels.shading to "pbr" or bake.materials to "fit".'
+            )
+        vertices, faces = self._read("mesh.ply")
+        surface = self._unwrap(vertices, faces)
+        monitor.check_stop()
+        with monitor.part("normals"):
+            dense, detail = self._dense(surface)
+        monitor.check_stop()
+        with monitor.part("occlusion"):
+            occlusion = self._occlusion(surface, dense, detail)
+        textures = self._materials(surface, detail, occlusion)
+        if not textures.projected.seen.any():
+            raise BadInputError("bake: no photo sees the mesh; poses and mesh do not belong together, run from the poses stage again.")
+        coded = self._normal_map(surface, textures)
+        with monitor.part("inpainting"):
+            image, emissive = self._image(surface, textures.projected, occlusion, coded, faces, len(vertices))
+        with monitor.part("write"):
+            self._write(surface, textures.projected, image, coded is not None, emissive)
+        return self._figures(surface, detail, textures)
+
+    def _read(self, name: str) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+        """Vertices and faces of a PLY of the mesh stage."""
+        try:
+            return read_mesh(self.mesh / name)
+        except ValueError as error:
+            raise BadInputError(f"{error}; run the mesh stage again or replace the file.") from error
+
+    def _unwrap(self, vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> Surface:
+        """The low-poly mesh cut into charts, with its texels."""
+        size = self.options.bake.size
+        with self.monitor.part("atlas"):
+            try:
+                atlas = make_atlas(vertices, faces, size)
+            except ValueError as error:
+                raise BadInputError(f"bake: {error}; raise bake.size or lower mesh.faces.") from error
+        with self.monitor.part("texels"):
+            surface = Surface.of(vertices, faces, atlas, size, self.threads)
+        self.monitor.progress(1, 4, "atlas", charts=atlas.charts, fill=atlas.fill)
+        return surface
+
+    def _dense(self, surface: Surface) -> tuple[tuple[RayCaster, NDArray[np.float64]], Detail]:
+        """The dense mesh with its vertex normals, and its nearest point to each texel."""
+        vertices, faces = self._read("dense.ply")
+        caster, normals = RayCaster(vertices, faces, self.threads), vertex_normals(vertices, faces)
+        return (caster, normals), find_detail(surface.at, surface.facing, caster, normals, surface.diagonal)
+
+    def _occlusion(self, surface: Surface, dense: tuple[RayCaster, NDArray[np.float64]], detail: Detail) -> Floats:
+        """Ambient occlusion (n,) per texel, 1 = open, traced on the dense mesh where there is one."""
+        rays = self.options.bake.occlusion_rays
+        if rays == 0:
+            return np.ones(len(surface.texels), np.float32)
+
+        def each(done: int, total: int) -> None:
+            self.monitor.check_stop()
+            self.monitor.progress(done, total, "ambient occlusion")
+
+        return open_share(surface, dense, detail, rays, RAY_OFFSET * surface.diagonal, SMOOTHING_RADIUS, each)
+
+    def _materials(self, surface: Surface, detail: Detail, occlusion: Floats) -> Textures:
+        """What `bake.materials` asks for; the light is written beside the textures."""
+        options, monitor = self.options, self.monitor
+        light = self.out / "light.safetensors"
+        if options.bake.materials == "surfels":
+            with monitor.part("projection"):
+                projected = project_surfel_materials(surface, self.posed, self.surfels, options.train_size, monitor)
+            shutil.copyfile(self.surfels / "light.safetensors", light)
+            return Textures(projected, detail, {})
+        with monitor.part("projection"):
+            projected = project_photos(surface, self.posed, options.holdout, options.exposure_equalisation, monitor)
+        if options.bake.materials == "delight":
+            with monitor.part("delighting"):
+                return Textures(self._delight(surface, projected, detail, occlusion), detail, {})
+        if options.bake.materials == "fit":
+            fit = FitOptions(
+                options.bake, options.light_size, options.holdout, options.specular, options.metallic_map, options.roughness_map
+            )
+            with monitor.part("fit"):
+                fitted = fit_materials(surface, self.posed, projected, detail, occlusion, fit, self.seed, monitor)
+            fitted.light.save(light)
+            return Textures(fitted.textures, fitted.normal, fitted.figures)
+        return Textures(projected, detail, {})
+
+    def _delight(self, surface: Surface, projected: Blended, detail: Detail, occlusion: Floats) -> Blended:
+        """Base colour (n, 3): the projected colours without their shading."""
+        visible = np.ones_like(occlusion) if self.options.bake.visibility == "none" else occlusion
+        coarse = Coarse.sized(surface.atlas.uv, surface.atlas.faces, surface.texels, surface.texel, DELIGHT_SIZE)
+        seen = projected.seen.astype(np.float32)[:, None]
+        share = coarse.down(seen)
+        known = share[:, 0] > 0.5
+        colour, normal, position, open_there = (
+            coarse.down(seen * x)[known] / share[known] for x in (projected.values, detail.normal, detail.position, visible[:, None])
+        )
+        irradiance = find_irradiance(colour, normal / np.linalg.norm(normal, axis=1, keepdims=True), position, open_there[:, 0])
+        values, mine = projected.values.copy(), projected.seen
+        values[mine], level = without_shading(projected.values[mine], detail.normal[mine], visible[mine], irradiance)
+        irradiance.light(self.options.light_size, level).save(self.out / "light.safetensors")
+        return replace(projected, values=values)
+
+    def _normal_map(self, surface: Surface, textures: Textures) -> Floats | None:
+        """The tangent-space normal map (n, 3), coded to 0..1, or None where the low-poly mesh needs none."""
+        fitted = self.options.bake.materials == "fit"
+        agree, evidence = (False, "the material fit refines normals") if fitted else normals_agree(textures.normal, surface.facing)
+        rule = self.options.normal_map
+        if decide_skip(self.monitor, "normal_map", rule, agree, evidence, "no normal map", "normal map baked"):
+            return None
+        interpolate, faces = surface.texels.interpolate, surface.atlas.faces
+        return normal_map(textures.normal, interpolate(surface.normal, faces), interpolate(surface.tangent, faces))
+
+    def _image(
+        self, surface: Surface, projected: Blended, occlusion: Floats, coded: Floats | None, faces: NDArray[np.int64], vertices: int
+    ) -> tuple[Floats, bool]:
+        """All maps as one image (size, size, channels), unobserved texels and gutters filled: base colour, occlusion, roughness, metallic,
+        the normal map if there is one, emission if there is any; and whether there is."""
+        texels, settings = surface.texels, self.options.bake
+        values = continue_over_surface(projected.values, projected.seen, texels, faces, vertices)
+        if values.shape[1] == 3:
+            constant = np.tile(np.array([settings.default_roughness, 0.0], np.float32), (len(texels), 1))
+            values = np.concatenate([values, constant], 1)
+        values = np.clip(values, 0, 1)
+        parts = [values[:, :3], occlusion[:, None], values[:, 3:5], *([] if coded is None else [coded]), values[:, 5:]]
+        image = flood(texels.image(np.concatenate(parts, 1)), texels.covered(), rim=max(2, settings.size // 256))
+        return image, values.shape[1] == 8
+
+    def _write(self, surface: Surface, projected: Blended, image: Floats, normals: bool, emissive: bool) -> None:
+        """Write the images, the coverage and the unwrapped mesh."""
+        write_exr(self.out / "base_color.exr", image[..., 0:3])
+        write_exr(self.out / "orm.exr", image[..., 3:6])
+        if normals:
+            write_exr(self.out / "normal.exr", image[..., 6:9])
+        if emissive:
+            write_exr(self.out / "emissive.exr", image[..., -3:])
+        count = len(surface.texels)
+        coverage = np.stack([np.ones(count, np.float32), projected.seen.astype(np.float32), projected.confidence], 1)
+        write_exr(self.out / "coverage.exr", surface.texels.image(coverage))
+        arrays = {"position": surface.position, "normal": surface.normal, "tangent": surface.tangent, "uv": surface.atlas.uv}
+        body = {name: np.ascontiguousarray(array, np.float32) for name, array in arrays.items()}
+        save_file(body | {"faces": np.ascontiguousarray(surface.atlas.faces, np.int32)}, self.out / "mesh.safetensors")
+
+    def _figures(self, surface: Surface, detail: Detail, textures: Textures) -> dict[str, Any]:
+        """What the manifest keeps."""
+        projected = textures.projected
+        unseen = float(1 - projected.seen.mean())
+        if unseen > MAX_UNSEEN:
+            self.monitor.warn(f"bake: {unseen:.0%} of the surface was observed by no photo; its colours are inpainted.")
+        return {
+            "charts": surface.atlas.charts,
+            "fill": surface.atlas.fill,
+            "texels": len(surface.texels),
+            "vertices": len(surface.position),
+            "faces": len(surface.atlas.faces),
+            "texel_edge": surface.texel,
+            "unseen_share": unseen,
+            "median_views": float(np.median(projected.views)),
+            "detail_share": float(detail.found.mean()),
+            "detail_bound": detail.bound,
+            "largest_gain": float(np.exp(np.abs(np.log(projected.gains)).max())),
+            **textures.figures,
+        }

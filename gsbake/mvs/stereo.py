@@ -1,0 +1,151 @@
+"""Multi-view stereo of a posed capture: depth maps, a fused oriented point cloud, and the carved visual hull."""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gsbake.capture.hull.thin_parts import find_thin
+from gsbake.capture.hull.visual_hull import Hull, visual_hull
+from gsbake.capture.posed_photos import PosedPhotos
+from gsbake.config.schema import Stereo
+from gsbake.monitor import SILENT, Monitor
+from gsbake.mvs.depth_maps import DepthMap
+from gsbake.mvs.matching import StereoRun
+from gsbake.mvs.outliers import find_ghosts, without_ghosts
+from gsbake.mvs.point_cloud import StereoCloud
+from gsbake.mvs.pyramids import one_thread
+
+#: Fewer or smaller photos than this (pixels) give too few matches to be worth the time.
+MIN_PHOTOS, MIN_SIZE = 5, 200
+#: Density of points on parts too thin for the hull: so many over the whole object.
+THIN_POINTS = 40_000
+
+
+def run_stereo(
+    poses: Path,
+    out: Path,
+    options: Stereo | None = None,
+    *,
+    seed: int = 0,
+    threads: int = 2,
+    scratch: Path | None = None,
+    monitor: Monitor = SILENT,
+) -> dict[str, Any]:
+    """Match the photos of the folder `poses` and write depth maps and points into the folder `out`; return the figures.
+
+    Written: `points.ply` (unit frame), `depth/<name>.npz`, and with masks `hull.npz` and `thin.npz`. Nothing is written where matching is
+    skipped: by the options, or because photos are too few or too small. `scratch` keeps finished planes for a run that is interrupted.
+    """
+    options = options or Stereo()
+    posed = PosedPhotos.open(poses)
+    reason = _skip_reason(posed, options)
+    if reason is not None:
+        monitor.decide("stereo", "skipped", reason)
+        return {"points": 0}
+    if scratch is None:
+        with tempfile.TemporaryDirectory(prefix="gsbake-stereo-") as folder:
+            return run_stereo(poses, out, options, seed=seed, threads=threads, scratch=Path(folder), monitor=monitor)
+
+    def step(done: int, text: str) -> None:
+        monitor.check_stop()
+        monitor.progress(min(done, len(posed)), len(posed), text)
+
+    with one_thread():
+        hull = _hull(posed, monitor)
+        run = StereoRun(posed, options, hull, seed, threads, scratch / "planes", step)
+        with monitor.part("photos"):
+            run.prepare()
+        with monitor.part("matching"):
+            run.match()
+        with monitor.part("confirming"):
+            maps = run.confirm()
+        with monitor.part("fusing"):
+            cloud, maps = _fuse(run, maps, hull, monitor)
+        _carve(run, out, monitor)
+    if hull is not None:
+        _thin_parts(posed, hull, out, seed, monitor)
+    (out / "depth").mkdir()
+    for one in maps:
+        one.save(out / "depth" / f"{one.camera.name}.npz")
+    cloud.save(out / "points.ply")
+    return _figures(run, maps, cloud, options, monitor)
+
+
+def _skip_reason(posed: PosedPhotos, options: Stereo) -> str | None:
+    """Why matching is skipped, or None."""
+    if options.enabled == "never":
+        return "set by the profile"
+    size = float(np.median([max(c.width, c.height) for c in posed.cameras.cameras]))
+    if options.enabled == "auto" and (len(posed) < MIN_PHOTOS or size < MIN_SIZE):
+        return f"{len(posed)} photos of {size:.0f} pixels; {MIN_PHOTOS} photos of {MIN_SIZE} pixels are needed"
+    return None
+
+
+def _hull(posed: PosedPhotos, monitor: Monitor) -> Hull | None:
+    """The visual hull, which bounds the depths; None where not all photos have masks or the masks share nothing."""
+    hull = None
+    if posed.has_masks:
+        with monitor.part("hull"):
+            hull = visual_hull(posed)
+        hull = None if hull.empty else hull
+    bounds = "visual hull" if hull is not None else "unit sphere"
+    monitor.decide("depth bounds", bounds, "all photos have masks" if hull is not None else "not all photos have masks")
+    return hull
+
+
+def _fuse(run: StereoRun, maps: list[DepthMap], hull: Hull | None, monitor: Monitor) -> tuple[StereoCloud, list[DepthMap]]:
+    """The fused cloud and the depth maps without outlier components."""
+    cloud = run.points(maps)
+    ghosts = find_ghosts(cloud, hull)
+    if not ghosts.points:
+        return cloud, maps
+    monitor.decide("outlier components", f"{ghosts.points} points removed", "too few, or isolated and deep inside the hull: mirror images")
+    return cloud.select(~ghosts.hold(cloud.points)), [without_ghosts(one, ghosts) for one in maps]
+
+
+def _carve(run: StereoRun, out: Path, monitor: Monitor) -> None:
+    """Carve the hull where photos see through it, and write it."""
+    with monitor.part("carving"):
+        opened = run.opened()
+    if opened is None:
+        return
+    opened.hull.save(out / "hull.npz")
+    monitor.decide(
+        "visual hull carving",
+        f"{opened.made} regions carved",
+        f"photos see through {100 * opened.share:.1f} % of the cells onto a surface behind; rejected: "
+        f"{opened.refused} regions without a surface behind, {opened.holed} that would open silhouettes",
+    )
+
+
+def _thin_parts(posed: PosedPhotos, hull: Hull, out: Path, seed: int, monitor: Monitor) -> None:
+    """Find parts thinner than a cell of the hull and write points on them."""
+    with monitor.part("thin parts"):
+        slight = find_thin(posed, hull, THIN_POINTS, seed)
+    found = f"{len(slight.points)} points" if len(slight.points) else "none"
+    monitor.decide("thin parts", found, f"{100 * slight.share:.1f} % of the masks is narrower than a cell of the hull")
+    slight.save(out / "thin.npz")
+
+
+def _figures(run: StereoRun, maps: list[DepthMap], cloud: StereoCloud, options: Stereo, monitor: Monitor) -> dict[str, Any]:
+    """What the manifest keeps."""
+    inside = sum(int(sizes[-1].inside.sum()) for sizes in run.photos)
+    confirmed = sum(int((one.confidence > 0).sum()) for one in maps) / max(inside, 1)
+    unmatched = sum(not n for n in run.matched)
+    views = options.min_consistent_views
+    evidence = f"{100 * confirmed:.0f} % of the object's pixels are confirmed by {views} or more other photos"
+    monitor.decide("geometric consistency", f"{len(cloud)} points", evidence)
+    if unmatched:
+        monitor.decide("unmatched photos", str(unmatched), "no other photo shows the same surface 5 to 45 degrees away")
+    return {
+        "points": len(cloud),
+        "confirmed_share": confirmed,
+        "pixels": inside,
+        "unmatched_photos": unmatched,
+        "neighbours": float(np.mean([len(n) for n in run.matched])),
+        "median_views": float(np.median(cloud.views)) if len(cloud) else 0.0,
+    }

@@ -1,0 +1,37 @@
+"""PNGs read back by another decoder, free of ancillary chunks, and written loudly when they cannot be."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from gsbake.imaging.png import encode_png, write_png
+
+
+@pytest.mark.parametrize("shape", [(1, 1, 3), (5, 7, 3), (64, 33, 3), (9, 16), (9, 16, 1), (6, 5, 4)])
+def test_opencv_reads_the_same_pixels(shape: tuple[int, ...]) -> None:
+    draw = np.random.default_rng(1)
+    for pixels in (draw.integers(0, 256, shape, np.uint8), np.cumsum(np.ones(shape, np.uint8), 0, np.uint8), np.full(shape, 7, np.uint8)):
+        data = encode_png(pixels)
+        found = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+        order = [2, 1, 0, 3][: shape[2]] if len(shape) == 3 and shape[2] > 1 else None
+        assert found is not None and np.array_equal(found.reshape(shape) if order is None else found[..., order], pixels)
+        kinds = [data[i + 4 : i + 8] for i in chunks(data)]
+        assert set(kinds) == {b"IHDR", b"IDAT", b"IEND"}
+
+
+def chunks(data: bytes) -> list[int]:
+    """Where the chunks of a PNG begin."""
+    out, at = [], 8
+    while at < len(data):
+        out.append(at)
+        at += 12 + int.from_bytes(data[at : at + 4], "big")
+    return out
+
+
+def test_a_file_that_cannot_be_written_is_an_error(tmp_path: Path) -> None:
+    with pytest.raises(OSError):
+        write_png(tmp_path / "none" / "a.png", np.zeros((2, 2, 3), np.uint8))

@@ -1,0 +1,41 @@
+"""Numbers and lists as people read them."""
+
+from __future__ import annotations
+
+import pytest
+
+from gsbake.text import duration, figures, number, shortlist, size
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"),
+    [(0.32, "0.3 s"), (9.94, "9.9 s"), (42.4, "42 s"), (59.7, "1 min 00 s"), (185, "3 min 05 s"), (3599.6, "1 h 00 min")],
+)
+def test_duration(seconds: float, text: str) -> None:
+    assert duration(seconds) == text
+
+
+@pytest.mark.parametrize(("count", "text"), [(480_000, "480 kB"), (3_200_000, "3.2 MB"), (1_250_000_000, "1.25 GB")])
+def test_size(count: float, text: str) -> None:
+    assert size(count) == text
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        (15_000, "15 000"), (15_000.0, "15 000"), (1.5e6, "1 500 000"), (-12_345, "-12 345"), (27.1234, "27.12"), (0.08213, "0.08213"),
+        (0, "0"), (True, "yes"),
+    ],
+)
+def test_number(value: float, text: str) -> None:
+    assert number(value) == text
+
+
+def test_figures_are_the_first_plain_results() -> None:
+    assert figures({"psnr": 27.1234, "faces": 30000, "log": [1], "ok": True}) == "psnr 27.12, faces 30 000, ok yes"
+    assert figures({"a": 1, "b": 2, "c": 3}, limit=2) == "a 1, b 2"
+
+
+def test_shortlist() -> None:
+    assert shortlist(["a", "b"]) == "a, b"
+    assert shortlist(list("abcdef")) == "a, b, c, d and 2 more"
