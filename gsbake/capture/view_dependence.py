@@ -15,9 +15,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gsbake.capture.photos.decode import srgb_decode
 from gsbake.geometry.cameras import Array, Camera
 from gsbake.imaging.sampling import read_at
+from gsbake.imaging.srgb import decode_bytes
 
 #: A place that its brightest photos (this quantile) show brighter than the median one by this share shines.
 CHANGE, BRIGHT_PHOTOS = 0.15, 0.95
@@ -59,7 +59,7 @@ class Sightings:
         pixel, _ = camera.project(self.points)
         index = np.flatnonzero(seen & (pixel > 1).all(1) & (pixel[:, 0] < camera.width - 1) & (pixel[:, 1] < camera.height - 1))
         if len(index):
-            value = luminance_at(srgb_decode(rgb), pixel[index], BLUR)
+            value = luminance_at(decode_bytes(rgb), pixel[index], BLUR)
             strongest = cv2.GaussianBlur(rgb.max(2), (0, 0), BLUR)
             code = read_at(strongest, *(pixel[index].T - 0.5))
             good = (code > DARKEST) & (value > 0)

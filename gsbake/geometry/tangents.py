@@ -18,6 +18,8 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
+from gsbake.geometry.vectors import unit
+
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
@@ -33,12 +35,6 @@ class Tangents:
     tangent: NDArray[np.float32]
     source: NDArray[np.int32]
     faces: NDArray[np.int32]
-
-
-def _unit(x: Floats) -> Floats:
-    """Rows of (n, 3) at unit length; rows too short to have a direction become 0."""
-    length = np.linalg.norm(x, axis=1, keepdims=True)
-    return np.where(length > 1e-20, x / np.maximum(length, 1e-20), 0.0)
 
 
 def tangents(position: NDArray[Any], normal: NDArray[Any], uv: NDArray[Any], faces: NDArray[Any]) -> Tangents:
@@ -62,7 +58,7 @@ def tangents(position: NDArray[Any], normal: NDArray[Any], uv: NDArray[Any], fac
     out = np.zeros((len(source), 4))
     out[:, 3] = 1
     used = group_of >= 0
-    out[used, :3] = _unit(total)[group_of[used]]
+    out[used, :3] = unit(total)[group_of[used]]
     out[used & mirrored[group_of], 3] = -1
     lost = np.flatnonzero(np.einsum("nd,nd->n", out[:, :3], out[:, :3]) < 0.5)
     out[lost, :3] = _any_perpendicular(n[source[lost]])
@@ -71,7 +67,7 @@ def tangents(position: NDArray[Any], normal: NDArray[Any], uv: NDArray[Any], fac
 
 def _flat(vector: Floats, normal: Floats) -> Floats:
     """Unit directions (n, 3) of `vector` (n, 3) projected on the planes of `normal` (n, 3)."""
-    return _unit(vector - normal * np.einsum("nd,nd->n", normal, vector)[:, None])
+    return unit(vector - normal * np.einsum("nd,nd->n", normal, vector)[:, None])
 
 
 def _groups(keys: Floats, faces: Ints, positive: NDArray[np.bool_], valid: NDArray[np.bool_]) -> Ints:
@@ -132,7 +128,7 @@ def _face_tangents(p: Floats, up: Floats, faces: Ints) -> tuple[Floats, NDArray[
     area = s1[:, 0] * s2[:, 1] - s1[:, 1] * s2[:, 0]
     positive = area > 0
     along = (s2[:, 1:] * d1 - s1[:, 1:] * d2) * np.where(positive, 1.0, -1.0)[:, None]
-    tangent = _unit(along)
+    tangent = unit(along)
     valid = (np.abs(area) > 1e-20) & (np.einsum("nd,nd->n", tangent, tangent) > 0.5)
     return tangent, positive, valid
 
@@ -140,7 +136,7 @@ def _face_tangents(p: Floats, up: Floats, faces: Ints) -> tuple[Floats, NDArray[
 def _any_perpendicular(normal: Floats) -> Floats:
     """Some unit vector (n, 3) perpendicular to each normal, for vertices whose UVs give no direction."""
     axis = np.eye(3)[np.argmin(np.abs(normal), axis=1)]
-    return _unit(np.cross(normal, axis))
+    return unit(np.cross(normal, axis))
 
 
 def frame_to_world(vector: NDArray[Any], normal: NDArray[Any], tangent: NDArray[Any]) -> Floats:
@@ -151,7 +147,7 @@ def frame_to_world(vector: NDArray[Any], normal: NDArray[Any], tangent: NDArray[
     n, t = np.asarray(normal, np.float64), np.asarray(tangent, np.float64)
     v = np.asarray(vector, np.float64)
     bitangent = np.cross(n, t[:, :3]) * t[:, 3:4]
-    return _unit(v[:, :1] * t[:, :3] + v[:, 1:2] * bitangent + v[:, 2:] * n)
+    return unit(v[:, :1] * t[:, :3] + v[:, 1:2] * bitangent + v[:, 2:] * n)
 
 
 def world_to_frame(vector: NDArray[Any], normal: NDArray[Any], tangent: NDArray[Any]) -> Floats:
@@ -161,4 +157,4 @@ def world_to_frame(vector: NDArray[Any], normal: NDArray[Any], tangent: NDArray[
     b = np.cross(n, t3) * t[:, 3:4]
     # Cramer's rule for v = x t + y b + z n; the common determinant only scales, and its sign is that of w.
     columns = [np.einsum("nd,nd->n", v, across) for across in (np.cross(b, n), np.cross(n, t3), np.cross(t3, b))]
-    return _unit(np.stack(columns, 1) * t[:, 3:4])
+    return unit(np.stack(columns, 1) * t[:, 3:4])

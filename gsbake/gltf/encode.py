@@ -54,12 +54,12 @@ class Sheets:
 
 def quantise(base_color: NDArray[Any], orm: NDArray[Any], normal: NDArray[Any] | None, emissive: NDArray[Any] | None = None) -> Sheets:
     """Masters (s, s, 3) as 8-bit maps."""
-    glow = None if emissive is None else encode_bytes(emissive)
+    glow = None if emissive is None else encode_bytes(np.asarray(emissive, np.float64))
     packed, constants = _linear(orm), None
     if (packed[..., 1:] == packed[0, 0, 1:]).all():
         constants = (round(float(orm[0, 0, 1]), 3), round(float(orm[0, 0, 2]), 3))
         packed = np.ascontiguousarray(packed[..., 0])
-    return Sheets(encode_bytes(base_color), packed, None if normal is None else _linear(normal), glow, constants)
+    return Sheets(encode_bytes(np.asarray(base_color, np.float64)), packed, None if normal is None else _linear(normal), glow, constants)
 
 
 def encode_within(sheets: Sheets, budget: int) -> tuple[GltfImages, Saving]:

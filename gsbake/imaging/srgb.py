@@ -1,7 +1,4 @@
-"""sRGB and linear light, on 8-bit images.
-
-IEC 61966-2-1.
-"""
+"""The sRGB tone curve (IEC 61966-2-1), for arrays; `imaging.srgb_torch` has it with gradients."""
 
 from __future__ import annotations
 
@@ -10,13 +7,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+#: The curve is SLOPE · linear up to KINK (linear) or CODED_KINK (sRGB), and SCALE · linear^(1 / GAMMA) − OFFSET beyond.
+KINK, CODED_KINK, SLOPE = 0.0031308, 0.04045, 12.92
+SCALE, OFFSET, GAMMA = 1.055, 0.055, 2.4
+
 
 def _decoded(value: NDArray[Any]) -> NDArray[Any]:
-    return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
+    return np.where(value <= CODED_KINK, value / SLOPE, ((value + OFFSET) / SCALE) ** GAMMA)
 
 
 def _encoded(value: NDArray[Any]) -> NDArray[Any]:
-    return np.where(value <= 0.0031308, 12.92 * value, 1.055 * value ** (1 / 2.4) - 0.055)
+    return np.where(value <= KINK, SLOPE * value, SCALE * value ** (1 / GAMMA) - OFFSET)
 
 
 #: Linear value of each 8-bit sRGB code.
@@ -39,5 +40,5 @@ def encode(linear: NDArray[Any]) -> NDArray[np.float32]:
 
 
 def encode_bytes(linear: NDArray[Any]) -> NDArray[np.uint8]:
-    """8-bit sRGB codes of linear values (clipped to 0..1), rounded to nearest."""
-    return np.asarray(np.rint(255 * _encoded(np.clip(np.asarray(linear, np.float64), 0, 1))), np.uint8)
+    """8-bit sRGB codes of linear values (clipped to 0..1), rounded to nearest; computed in the precision of `linear`."""
+    return np.asarray(np.rint(255 * _encoded(np.clip(np.asarray(linear), 0, 1))), np.uint8)

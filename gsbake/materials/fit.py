@@ -43,6 +43,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from gsbake.imaging.metrics import decibels
+from gsbake.imaging.srgb_torch import linear_to_srgb
 from gsbake.materials.bilateral import Alike
 from gsbake.materials.emission import find_glow
 from gsbake.materials.light_intensity import Level, find_level, graded
@@ -51,9 +53,9 @@ from gsbake.materials.pixel_shading import AROUND, BOUNCED, GLOW, SENT, Batch
 from gsbake.materials.pixels import Pixels
 from gsbake.materials.sparsity_prior import NEAR, common
 from gsbake.materials.visibility import Visibility
-from gsbake.shading.colour import colourfulness, linear_to_srgb
 from gsbake.shading.cubemap import solid_angles
 from gsbake.shading.environment import EnvironmentLight
+from gsbake.shading.neutral_light import colourfulness
 from gsbake.texturing.texels import Texels
 
 Floats = NDArray[np.float32]
@@ -375,4 +377,4 @@ class MaterialFit:
         shown, tables = torch.sigmoid(self._logits) if values is None else torch.as_tensor(values), self._light.prefilter()
         shaded = (b.shade(shown, self._bend, tables, self._around).clamp_min(0) for b in batches)
         squares = torch.cat([((linear_to_srgb(s) - b.colour) ** 2).mean(1) for s, b in zip(shaded, batches, strict=True)])
-        return -10 * math.log10(max(float(squares.mean()), 1e-10))
+        return decibels(float(squares.mean()))

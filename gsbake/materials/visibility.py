@@ -27,6 +27,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from gsbake.geometry.raycast import RayCaster
+from gsbake.geometry.vectors import unit
 from gsbake.shading import cubemap
 from gsbake.texturing.ambient_occlusion import smoothed
 from gsbake.texturing.texels import Texels
@@ -61,11 +62,6 @@ def _cells(count: int, size: int) -> scipy.sparse.csr_matrix:
     rows = np.concatenate([turn * count + cKDTree(copy).query(centre)[1] for turn, copy in enumerate(directions(count))])
     share = np.tile(angle * (count / (4 * np.pi)), TURNS)
     return scipy.sparse.csr_matrix((share.astype(np.float32), (rows, np.tile(column, TURNS))), shape=(TURNS * count, len(centre)))
-
-
-def _unit(vectors: NDArray[Any]) -> Floats:
-    """Vectors (n, 3) at unit length; none stays none."""
-    return np.asarray(vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-20), np.float32)
 
 
 @dataclass(frozen=True)
@@ -104,8 +100,8 @@ class Visibility:
         called after every round of one ray per texel.
         """
         corner = caster.vertices[caster.faces[texels.face]]
-        facing = _unit(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]))
-        normal = _unit(normal)
+        facing = unit(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])).astype(np.float32)
+        normal = unit(normal).astype(np.float32)
         position = texels.interpolate(caster.vertices, caster.faces)
         origin = position + offset * facing
         column, row = texels.index % texels.size, texels.index // texels.size

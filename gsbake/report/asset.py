@@ -8,7 +8,8 @@ import numpy as np
 
 from gsbake.errors import BadInputError
 from gsbake.gltf.read import GltfAsset, read_glb
-from gsbake.report.render import Asset, Floats, decode_srgb
+from gsbake.imaging.srgb import decode
+from gsbake.report.render import Asset, Floats
 
 #: glTF's sampler value for clamping to the edge.
 CLAMP = 33071
@@ -27,7 +28,7 @@ def from_gltf(file: GltfAsset, unlit: bool, name: str) -> Asset:
     material = (file.document.get("materials") or [{}])[0]
     surface = material.get("pbrMetallicRoughness", {})
     colour = file.image("base_color")
-    base: Floats = np.ones((1, 1, 3), np.float32) if colour is None else decode_srgb(colour.astype(np.float32) / 255)
+    base: Floats = np.ones((1, 1, 3), np.float32) if colour is None else decode(colour.astype(np.float32) / 255)
     base = base * np.array(surface.get("baseColorFactor", (1, 1, 1, 1))[:3], np.float32)
     packed = file.image("orm")
     orm: Floats = np.ones((1, 1, 3), np.float32) if packed is None else packed.astype(np.float32) / np.float32(255)
@@ -51,7 +52,7 @@ def from_gltf(file: GltfAsset, unlit: bool, name: str) -> Asset:
         base_color=base,
         orm=orm,
         normal_map=None if coded is None else coded.astype(np.float32) / np.float32(127.5) - 1,
-        emissive=None if glow is None else decode_srgb(glow.astype(np.float32) / 255) * strength,
+        emissive=None if glow is None else decode(glow.astype(np.float32) / 255) * strength,
         unlit=unlit,
         wrap=samplers[0].get("wrapS") != CLAMP,
     )

@@ -9,24 +9,20 @@ IEEE TIP 2004, with Gaussian weights, averaged over the same pixels.
 from __future__ import annotations
 
 import json
-import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
-from skimage.metrics import structural_similarity
 
 from gsbake.capture.posed_photos import View
 from gsbake.errors import BadInputError
 from gsbake.geometry.cameras import Camera
+from gsbake.imaging.metrics import psnr, ssim
 from gsbake.report.render import Floats, Picture
 
 #: Grey (sRGB value) behind photo and render.
 GREY = 0.5
-#: A perfect match would be infinite decibels, which no JSON can hold.
-MAX_PSNR = 100.0
 
 
 @dataclass(frozen=True)
@@ -37,24 +33,6 @@ class Likeness:
     ssim: float
     photo: Floats
     render: Floats
-
-
-def psnr(a: Floats, b: Floats, where: NDArray[np.bool_]) -> float:
-    """Peak signal-to-noise ratio (dB, peak 1) of two pictures (h, w, 3) over the pixels `where` (h, w); at most MAX_PSNR."""
-    if not where.any():
-        return 0.0
-    error = float(np.mean(np.square(a[where].astype(np.float64) - b[where])))
-    return MAX_PSNR if error <= 0 else min(MAX_PSNR, -10 * math.log10(error))
-
-
-def ssim(a: Floats, b: Floats, where: NDArray[np.bool_]) -> float:
-    """Mean structural similarity of two pictures (h, w, 3), values 0..1, over the pixels `where` (h, w)."""
-    if not where.any() or min(a.shape[:2]) < 11:
-        return 0.0
-    _, every = structural_similarity(
-        a, b, channel_axis=2, data_range=1.0, gaussian_weights=True, sigma=1.5, use_sample_covariance=False, full=True
-    )  # fmt: skip
-    return float(np.asarray(every).mean(axis=2)[where].mean())
 
 
 def compare(view: View, picture: Picture) -> Likeness:

@@ -19,20 +19,11 @@ from numpy.typing import NDArray
 
 from gsbake.geometry.cameras import Camera
 from gsbake.geometry.raycast import RayCaster
+from gsbake.geometry.vectors import unit
+from gsbake.imaging.sampling import bilinear
+from gsbake.imaging.srgb import encode
 
 Floats = NDArray[np.float32]
-
-
-def decode_srgb(coded: NDArray[np.floating]) -> Floats:
-    """sRGB values in 0..1 to linear ones (IEC 61966-2-1)."""
-    value = np.asarray(coded, np.float32)
-    return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4).astype(np.float32)
-
-
-def encode_srgb(linear: NDArray[np.floating]) -> Floats:
-    """Linear values to sRGB values in 0..1, clipped."""
-    value = np.clip(np.asarray(linear, np.float32), 0, 1)
-    return np.where(value <= 0.0031308, 12.92 * value, 1.055 * value ** (1 / 2.4) - 0.055).astype(np.float32)
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,7 +95,7 @@ class Picture:
     @property
     def rgb(self) -> Floats:
         """Straight sRGB (h, w, 3) in 0..1."""
-        return encode_srgb(self.linear)
+        return encode(self.linear)
 
     def over(self, grey: float) -> Floats:
         """The picture (h, w, 3) over a plain background, mixed in sRGB values as photos with masks are."""
@@ -210,24 +201,3 @@ class Renderer:
         footprint = float(np.median(distance)) ** 2 / (camera.fx * camera.fy)
         texels = self._density * height * width * footprint
         return max(0, min(round(0.5 * math.log2(max(texels, 1e-12))), int(math.log2(min(height, width)))))
-
-
-def unit(vectors: Floats) -> Floats:
-    """Vectors (n, 3) at unit length; a zero vector stays zero."""
-    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), np.float32(1e-12))
-
-
-def bilinear(image: Floats, uv: Floats, wrap: bool = True) -> Floats:
-    """Values (n, c) of an image (h, w, c) at uv (n, 2), texel centres at (i + .5) / size; beyond 0..1 repeated or clamped."""
-    height, width = image.shape[:2]
-    x, y = uv[:, 0] * width - np.float32(0.5), uv[:, 1] * height - np.float32(0.5)
-    col, row = np.floor(x).astype(np.int64), np.floor(y).astype(np.int64)
-    fx, fy = (x - col)[:, None].astype(np.float32), (y - row)[:, None].astype(np.float32)
-    if wrap:
-        left, right, top, bottom = col % width, (col + 1) % width, row % height, (row + 1) % height
-    else:
-        left, right = np.clip(col, 0, width - 1), np.clip(col + 1, 0, width - 1)
-        top, bottom = np.clip(row, 0, height - 1), np.clip(row + 1, 0, height - 1)
-    above = image[top, left] * (1 - fx) + image[top, right] * fx
-    below = image[bottom, left] * (1 - fx) + image[bottom, right] * fx
-    return np.asarray(above * (1 - fy) + below * fy, np.float32)

@@ -9,8 +9,9 @@ import numpy as np
 import scipy.sparse
 from numpy.typing import NDArray
 
+from gsbake.imaging.srgb import encode
 from gsbake.report.html import Panel, picture_uri
-from gsbake.report.render import Asset, Floats, encode_srgb
+from gsbake.report.render import Asset, Floats
 
 #: Longer side of a map in the page.
 SHOWN = 768
@@ -64,7 +65,7 @@ def map_panels(asset: Asset) -> tuple[Panel, ...]:
 
     height, width = asset.base_color.shape[:2]
     kind = "as photographed" if asset.unlit else "no light in it"
-    out = [panel("Base colour", f"{width} × {height}, {kind}", encode_srgb(asset.base_color))]
+    out = [panel("Base colour", f"{width} × {height}, {kind}", encode(asset.base_color))]
     if asset.normal_map is not None:
         out.append(panel("Normal", "tangent space, +Y up", 0.5 + 0.5 * asset.normal_map))
     if asset.orm is not None:
@@ -74,7 +75,7 @@ def map_panels(asset: Asset) -> tuple[Panel, ...]:
             span = f"{low:.2f} everywhere" if high - low < 0.004 else f"{caption}, {low:.2f}–{high:.2f}"
             out.append(panel(title, span, grey(asset.orm[..., k])))
     if asset.emissive is not None:
-        out.append(panel("Emission", "light of its own", encode_srgb(asset.emissive)))
+        out.append(panel("Emission", "light of its own", encode(asset.emissive)))
     charts = int(chart_of_faces(asset.faces, len(asset.uv)).max()) + 1 if len(asset.faces) else 0
     out.append(panel("UV sheet", f"{charts} charts, {len(asset.faces)} triangles", uv_sheet(asset)))
     return tuple(out)

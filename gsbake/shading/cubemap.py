@@ -20,6 +20,8 @@ import numpy as np
 import scipy.sparse
 from numpy.typing import NDArray
 
+from gsbake.geometry.vectors import unit
+
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
@@ -29,16 +31,11 @@ FACE_T = np.array([[0, -1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1], [0, -1, 0], [0
 FACE_AXIS = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]], dtype=np.float64)
 
 
-def normalise(vectors: Array) -> Array:
-    """Vectors (…, 3) at unit length."""
-    return np.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True))
-
-
 def directions(size: int) -> Array:
     """Unit directions of the texel centres, (6, size, size, 3)."""
     x = (2.0 * np.arange(size) + 1.0) / size - 1.0
     t, s = np.meshgrid(x, x, indexing="ij")
-    return normalise(FACE_AXIS[:, None, None] + s[None, :, :, None] * FACE_S[:, None, None] + t[None, :, :, None] * FACE_T[:, None, None])
+    return unit(FACE_AXIS[:, None, None] + s[None, :, :, None] * FACE_S[:, None, None] + t[None, :, :, None] * FACE_T[:, None, None])
 
 
 def solid_angles(size: int) -> Array:

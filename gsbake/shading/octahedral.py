@@ -16,7 +16,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from gsbake.shading.cubemap import Array, Index, normalise
+from gsbake.geometry.vectors import unit
+from gsbake.shading.cubemap import Array, Index
 
 #: Directions whose absolute coordinates sum to less than this are not normalised any further.
 SHORTEST = 0.05
@@ -28,7 +29,7 @@ def decode(uv: Array) -> Array:
     z = 1.0 - np.abs(u) - np.abs(v)
     x = np.where(z >= 0, u, (1.0 - np.abs(v)) * np.where(u >= 0, 1.0, -1.0))
     y = np.where(z >= 0, v, (1.0 - np.abs(u)) * np.where(v >= 0, 1.0, -1.0))
-    return normalise(np.stack([x, y, z], axis=-1))
+    return unit(np.stack([x, y, z], axis=-1))
 
 
 def encode(dirs: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from gsbake.capture.posed_photos import PosedPhotos
+from gsbake.geometry.vectors import unit
 from gsbake.surfels.model import Surfels, create
 
 Floats = NDArray[np.float64]
@@ -53,7 +54,7 @@ def _cloud_normals(points: Floats, centres: Floats) -> Floats:
 def _sample_colours(posed: PosedPhotos, points: Floats, normals: Floats) -> Floats:
     """sRGB (n, 3) of each point in the photo that faces it best (occlusion ignored: a start value only)."""
     cameras = posed.cameras.cameras
-    facing = np.stack([np.einsum("ni,ni->n", normals, _unit(c.centre - points)) for c in cameras])
+    facing = np.stack([np.einsum("ni,ni->n", normals, unit(c.centre - points)) for c in cameras])
     colours = np.full((len(points), 3), 0.5)
     best = facing.argmax(0)
     for i in np.unique(best):
@@ -64,10 +65,6 @@ def _sample_colours(posed: PosedPhotos, points: Floats, normals: Floats) -> Floa
         ok = (z > 0) & (x >= 0) & (y >= 0) & (x < view.camera.width) & (y < view.camera.height)
         colours[mine[ok]] = view.rgb[y[ok], x[ok]] / 255.0
     return colours
-
-
-def _unit(v: Floats) -> Floats:
-    return np.asarray(v / np.maximum(np.linalg.norm(v, axis=-1, keepdims=True), 1e-12))
 
 
 def begin(posed: PosedPhotos, train: Any, model: Any, seed: int, stereo: Path | None = None) -> tuple[Surfels, str, str]:

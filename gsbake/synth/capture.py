@@ -17,17 +17,11 @@ from numpy.typing import NDArray
 
 from gsbake.errors import UsageError
 from gsbake.geometry.cameras import Camera, CameraSet
+from gsbake.imaging.srgb import encode_bytes
 from gsbake.synth import scene
 from gsbake.synth.shade import Rig, render, studio
 
 Array = NDArray[np.float64]
-
-
-def encode_srgb(linear: Array) -> NDArray[np.uint8]:
-    """Linear values to 8-bit sRGB (IEC 61966-2-1), clipped to 0..1."""
-    value = np.clip(linear, 0, 1)
-    coded = np.where(value <= 0.0031308, 12.92 * value, 1.055 * value ** (1 / 2.4) - 0.055)
-    return np.round(255 * coded).astype(np.uint8)
 
 
 def look_at(name: str, centre: Array, target: Array, roll: float, focal: float, principal: tuple[float, float], size: int) -> Camera:
@@ -112,18 +106,18 @@ def _write_view(folder: Path, camera: Camera, rig: Rig, background: bool) -> Non
     straight = 1 / np.maximum(coverage, 1e-9)[..., None]
     name = f"{camera.name}.png"
     if background:
-        _write_png(folder / "images" / name, encode_srgb(picture[..., :3]))
+        _write_png(folder / "images" / name, encode_bytes(picture[..., :3]))
     else:
-        _write_png(folder / "images" / name, encode_srgb(picture[..., :3] * straight), alpha)
+        _write_png(folder / "images" / name, encode_bytes(picture[..., :3] * straight), alpha)
     truth = folder / "truth"
     maps = buffers * straight
     length = np.maximum(np.linalg.norm(maps[..., 3:6], axis=-1, keepdims=True), 1e-9)
     code = np.where(coverage[..., None] > 0, 0.5 + 0.5 * maps[..., 3:6] / length, 0.5)
     orm = np.stack([np.ones_like(coverage), maps[..., 6], maps[..., 7]], -1)
     _write_png(truth / "masks" / name, alpha)
-    _write_png(truth / "albedo" / name, encode_srgb(maps[..., :3]), alpha)
+    _write_png(truth / "albedo" / name, encode_bytes(maps[..., :3]), alpha)
     _write_png(truth / "normal" / name, np.round(255 * code).astype(np.uint8), alpha)
-    _write_png(truth / "emission" / name, encode_srgb(maps[..., 8:11]), alpha)
+    _write_png(truth / "emission" / name, encode_bytes(maps[..., 8:11]), alpha)
     _write_png(truth / "orm" / name, np.round(255 * np.clip(orm, 0, 1)).astype(np.uint8), alpha)
 
 

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from gsbake.geometry.raycast import Hits, RayCaster
 from gsbake.geometry.tangents import world_to_frame
+from gsbake.geometry.vectors import unit
 
 Floats = NDArray[np.float64]
 
@@ -48,9 +49,9 @@ def vertex_normals(vertices: NDArray[Any], faces: NDArray[Any]) -> Floats:
     p, triangles = np.asarray(vertices, np.float64), np.asarray(faces, np.int64)
     corner = p[triangles]
     out = np.zeros_like(p)
-    face = _unit(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]))
+    face = unit(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]))
     for k in range(3):
-        e1, e2 = _unit(corner[:, (k + 1) % 3] - corner[:, k]), _unit(corner[:, (k + 2) % 3] - corner[:, k])
+        e1, e2 = unit(corner[:, (k + 1) % 3] - corner[:, k]), unit(corner[:, (k + 2) % 3] - corner[:, k])
         angle = np.arccos(np.clip(np.einsum("nd,nd->n", e1, e2), -1, 1))
         for axis in range(3):
             out[:, axis] += np.bincount(triangles[:, k], angle * face[:, axis], len(p))
@@ -63,7 +64,7 @@ def find_detail(position: NDArray[Any], normal: NDArray[Any], dense: RayCaster, 
 
     `dense_normals` (v, 3) belong to the dense mesh's vertices; `diagonal` is the light mesh's bounding-box diagonal.
     """
-    p, n = np.asarray(position, np.float64), _unit(np.asarray(normal, np.float64))
+    p, n = np.asarray(position, np.float64), unit(np.asarray(normal, np.float64))
     widest = WIDEST * diagonal
     slip = 1e-3 * widest  # so that a surface exactly at the texel is met by at least one of the two rays
     distance = np.full(len(p), np.inf)
@@ -97,9 +98,4 @@ def normal_map(detail: Detail, normal: NDArray[Any], tangent: NDArray[Any]) -> N
 def _smooth_normal(hits: Hits, dense: RayCaster, normals: NDArray[Any]) -> Floats:
     """Interpolated unit normals (n, 3) at hits; 0 on a miss."""
     corners = np.asarray(normals, np.float64)[dense.faces[np.maximum(hits.face, 0)]]
-    return _unit(np.einsum("nk,nkd->nd", hits.bary.astype(np.float64), corners))
-
-
-def _unit(x: Floats) -> Floats:
-    """Rows of (n, 3) at unit length; 0 stays 0."""
-    return x / np.maximum(np.linalg.norm(x, axis=1, keepdims=True), 1e-20)
+    return unit(np.einsum("nk,nkd->nd", hits.bary.astype(np.float64), corners))

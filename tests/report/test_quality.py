@@ -12,8 +12,10 @@ import pytest
 from gsbake.capture.posed_photos import View
 from gsbake.errors import BadInputError
 from gsbake.geometry.cameras import Camera
-from gsbake.report.quality import GREY, MAX_PSNR, asset_cameras, chosen_views, compare, psnr, ssim
-from gsbake.report.render import Picture, decode_srgb
+from gsbake.imaging.metrics import MAX_PSNR, psnr, ssim
+from gsbake.imaging.srgb import decode
+from gsbake.report.quality import GREY, asset_cameras, chosen_views, compare
+from gsbake.report.render import Picture
 from tests.report.shapes import front_camera
 
 SIZE = 32
@@ -22,7 +24,7 @@ CAMERA = front_camera(4, SIZE, 40)
 
 def picture(grey: float, alpha: np.ndarray) -> Picture:
     rgb = np.full((SIZE, SIZE, 3), grey, np.float32)
-    return Picture(decode_srgb(rgb), alpha.astype(np.float32), rgb, rgb, rgb)
+    return Picture(decode(rgb), alpha.astype(np.float32), rgb, rgb, rgb)
 
 
 def box(x0: int, x1: int) -> np.ndarray:

@@ -8,16 +8,18 @@ import numpy as np
 import pytest
 
 from gsbake.geometry.cameras import Camera
+from gsbake.imaging.sampling import bilinear
+from gsbake.imaging.srgb import decode, encode
 from gsbake.report.lights import PROCEDURAL, LitShader, procedural
-from gsbake.report.render import Asset, Renderer, bilinear, decode_srgb, encode_srgb, unlit
+from gsbake.report.render import Asset, Renderer, unlit
 from gsbake.shading.environment import EnvironmentLight
 from tests.report.shapes import ball, front_camera, quad
 
 
 def test_srgb_known_values() -> None:
-    np.testing.assert_allclose(encode_srgb(np.array([0.0, 0.001, 0.18, 0.5, 1.0])), [0, 0.01292, 0.461356, 0.735357, 1], atol=1e-5)
+    np.testing.assert_allclose(encode(np.array([0.0, 0.001, 0.18, 0.5, 1.0])), [0, 0.01292, 0.461356, 0.735357, 1], atol=1e-5)
     codes = np.linspace(0, 1, 256)
-    np.testing.assert_allclose(encode_srgb(decode_srgb(codes)), codes, atol=1e-5)
+    np.testing.assert_allclose(encode(decode(codes)), codes, atol=1e-5)
 
 
 def test_bilinear_centres_midpoints_and_wrap() -> None:
@@ -47,7 +49,7 @@ def test_sphere_covers_the_area_of_its_cone() -> None:
     ys, xs = np.mgrid[:128, :128] + 0.5
     inside = np.hypot(xs - 64, ys - 64) < radius - 2
     assert picture.alpha[inside].min() == 1
-    np.testing.assert_allclose(picture.rgb[inside], encode_srgb(np.array(0.5)), atol=1e-4)
+    np.testing.assert_allclose(picture.rgb[inside], encode(np.array(0.5)), atol=1e-4)
     # The normal at a pixel is where its ray first meets the sphere.
     ray = np.array([(80.5 - 64) / 180, -(50.5 - 64) / 180, -1.0])
     a, b, c = ray @ ray, 2 * ray[2] * 4, 15.0
@@ -61,7 +63,7 @@ def test_edges_mix_in_linear_light() -> None:
     sharp = np.repeat(np.repeat(base, 64, 0), 64, 1)  # left half white, right half black
     camera = front_camera(4, 41, 60)  # odd: the border runs through the middle of column 20
     picture = Renderer(quad(sharp)).draw(camera, unlit, samples=4)
-    np.testing.assert_allclose(picture.rgb[20, 20], encode_srgb(np.array(0.5)), atol=0.03)
+    np.testing.assert_allclose(picture.rgb[20, 20], encode(np.array(0.5)), atol=0.03)
 
 
 def linear_light(a: float, b: tuple[float, float, float]) -> EnvironmentLight:
@@ -73,7 +75,7 @@ def diffuse(asset_of: object, shader: LitShader) -> np.ndarray:
     out = []
     for grey in (0.6, 0.0):
         picture = Renderer(asset_of(grey)).draw(front_camera(4, 32, 40), shader)  # type: ignore[operator]
-        out.append(decode_srgb(picture.rgb[12:20, 12:20]).mean((0, 1)))
+        out.append(decode(picture.rgb[12:20, 12:20]).mean((0, 1)))
     return out[0] - out[1]
 
 
@@ -120,7 +122,7 @@ def test_light_of_its_own_is_added_to_what_it_reflects() -> None:
     glow = np.full((4, 4, 3), (0.0, 0.1, 0.3), np.float32)
     for strength, light in ((0.0, 0.0), (1.0, 0.25)):
         shown = Renderer(quad(np.full((4, 4, 3), light), emissive=strength * glow)).draw(front_camera(4, 40, 60), unlit, samples=1)
-        np.testing.assert_allclose(decode_srgb(shown.rgb[20, 20]), light + strength * glow[0, 0], atol=1e-4)
+        np.testing.assert_allclose(decode(shown.rgb[20, 20]), light + strength * glow[0, 0], atol=1e-4)
 
 
 def test_viewer_light_shows_the_asset_frame() -> None:
@@ -134,7 +136,7 @@ def test_viewer_light_shows_the_asset_frame() -> None:
 def test_fine_textures_do_not_alias() -> None:
     checker = (np.indices((512, 512)).sum(0) % 2).astype(np.float32)[..., None].repeat(3, 2)
     picture = Renderer(quad(checker)).draw(front_camera(4, 40, 60), unlit, samples=1)
-    np.testing.assert_allclose(decode_srgb(picture.rgb[6:34, 6:34]), 0.5, atol=0.01)
+    np.testing.assert_allclose(decode(picture.rgb[6:34, 6:34]), 0.5, atol=0.01)
 
 
 def test_windows_at_the_border_and_inside() -> None:

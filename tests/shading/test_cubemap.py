@@ -7,11 +7,12 @@ import math
 import numpy as np
 import pytest
 
+from gsbake.geometry.vectors import unit
 from gsbake.shading import cubemap, octahedral
 
 
 def random_directions(count: int, seed: int = 0) -> np.ndarray:
-    return cubemap.normalise(np.random.default_rng(seed).normal(size=(count, 3)))
+    return unit(np.random.default_rng(seed).normal(size=(count, 3)))
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,9 @@ import pytest
 import torch
 
 from gsbake.errors import BadInputError, UsageError
-from gsbake.shading import colour, cubemap, panorama
+from gsbake.geometry.vectors import unit
+from gsbake.imaging import srgb_torch
+from gsbake.shading import cubemap, neutral_light, panorama
 from gsbake.shading.environment import EnvironmentLight
 
 
@@ -54,22 +56,22 @@ def test_pixels_match_the_viewers_formulas() -> None:
 
 @pytest.mark.parametrize("convention", ["blender", "gltf"])
 def test_sun_comes_back_in_the_image(convention: panorama.Convention) -> None:
-    sun = cubemap.normalise(np.array([0.48, -0.7, 0.53]))
+    sun = unit(np.array([0.48, -0.7, 0.53]))
     angle = 0.7
     rotation = np.array([[math.cos(angle), -math.sin(angle), 0], [math.sin(angle), math.cos(angle), 0], [0, 0, 1.0]])
     image = sun_light(sun).equirectangular(180, rotation, convention)
     assert image.shape == (180, 360, 3) and image.dtype == np.float32
     bright = image[..., 0] > 0.8 * image[..., 0].max()
-    found = cubemap.normalise(panorama.directions(180, convention)[bright].mean(axis=0))
+    found = unit(panorama.directions(180, convention)[bright].mean(axis=0))
     assert math.degrees(math.acos(min(1.0, float(found @ (rotation @ sun))))) < 1.0
     back = EnvironmentLight.from_equirectangular(image, 64, rotation, convention).radiance().detach().numpy()
     weight = (back[..., 0] > 0.8 * back[..., 0].max())[..., None]
-    again = cubemap.normalise((cubemap.directions(64) * weight).sum(axis=(0, 1, 2)))
+    again = unit((cubemap.directions(64) * weight).sum(axis=(0, 1, 2)))
     assert math.degrees(math.acos(min(1.0, float(again @ sun)))) < 1.0
 
 
 def test_flux_survives_the_image() -> None:
-    sun = cubemap.normalise(np.array([-0.3, 0.2, 0.93]))
+    sun = unit(np.array([-0.3, 0.2, 0.93]))
     light = sun_light(sun, 32)
     flux = (light.radiance().detach().numpy() * cubemap.solid_angles(32)[..., None]).sum(axis=(0, 1, 2))
     for height in (16, 64):
@@ -115,21 +117,21 @@ def test_hdr_file(tmp_path: Path) -> None:
 
 def test_srgb() -> None:
     linear = torch.tensor([0.0, 0.001, 0.0031308, 0.18, 0.214041, 0.5, 1.0], dtype=torch.float64)
-    coded = colour.linear_to_srgb(linear)
+    coded = srgb_torch.linear_to_srgb(linear)
     expected = [12.92 * x if x <= 0.0031308 else 1.055 * x ** (1 / 2.4) - 0.055 for x in linear.tolist()]
     np.testing.assert_allclose(coded.numpy(), expected, atol=1e-12)
     assert coded[4].item() == pytest.approx(0.5, abs=1e-5)
-    torch.testing.assert_close(colour.srgb_to_linear(coded), linear, rtol=0, atol=1e-7)
+    torch.testing.assert_close(srgb_torch.srgb_to_linear(coded), linear, rtol=0, atol=1e-7)
     inside = torch.tensor([0.0005, 0.002, 0.004, 0.3, 0.99], dtype=torch.float64, requires_grad=True)
-    assert torch.autograd.gradcheck(colour.linear_to_srgb, (inside,))
-    assert torch.autograd.gradcheck(colour.srgb_to_linear, (torch.tensor([0.01, 0.2, 0.9], dtype=torch.float64, requires_grad=True),))
+    assert torch.autograd.gradcheck(srgb_torch.linear_to_srgb, (inside,))
+    assert torch.autograd.gradcheck(srgb_torch.srgb_to_linear, (torch.tensor([0.01, 0.2, 0.9], dtype=torch.float64, requires_grad=True),))
     wide = torch.tensor([-0.5, 0.0, 1.0, 7.0], dtype=torch.float64, requires_grad=True)
-    out = colour.linear_to_srgb(wide)
+    out = srgb_torch.linear_to_srgb(wide)
     assert out.tolist() == pytest.approx([0.0, 0.0, 1.0, 1.0])
     out.sum().backward()
     assert wide.grad is not None and wide.grad.tolist() == pytest.approx([12.92, 12.92, 1.055 / 2.4, 1.055 / 2.4])
 
 
 def test_colourfulness() -> None:
-    assert colour.colourfulness(torch.full((6, 4, 4, 3), 0.7)).item() == pytest.approx(0.0, abs=1e-7)
-    assert colour.colourfulness(torch.tensor([[1.0, 2.0, 3.0]])).item() == pytest.approx(2 / 3)
+    assert neutral_light.colourfulness(torch.full((6, 4, 4, 3), 0.7)).item() == pytest.approx(0.0, abs=1e-7)
+    assert neutral_light.colourfulness(torch.tensor([[1.0, 2.0, 3.0]])).item() == pytest.approx(2 / 3)

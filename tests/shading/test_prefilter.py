@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 import torch
 
+from gsbake.geometry.vectors import unit
 from gsbake.shading import cubemap, prefilter
 from gsbake.shading.environment import EnvironmentLight
 from gsbake.shading.light_tables import LightTables, filter_cube
 
 
 def random_directions(count: int, seed: int = 0) -> np.ndarray:
-    return cubemap.normalise(np.random.default_rng(seed).normal(size=(count, 3)))
+    return unit(np.random.default_rng(seed).normal(size=(count, 3)))
 
 
 def lookup(tables: LightTables, dirs: np.ndarray, roughness: float) -> np.ndarray:
@@ -25,7 +26,7 @@ def lookup(tables: LightTables, dirs: np.ndarray, roughness: float) -> np.ndarra
 
 def room(dirs: np.ndarray) -> np.ndarray:
     """Sky, a warm window and a dark floor: smooth, but bright over some degrees."""
-    window = np.exp(25.0 * (dirs @ cubemap.normalise(np.array([0.5, -0.6, 0.6])) - 1.0))
+    window = np.exp(25.0 * (dirs @ unit(np.array([0.5, -0.6, 0.6])) - 1.0))
     sky = 0.4 + 0.25 * dirs[:, 2] + 0.1 * np.sin(5 * dirs[:, 0])
     return sky[:, None] * np.array([0.8, 0.9, 1.0]) + 12.0 * window[:, None] * np.array([1.0, 0.8, 0.5])
 
@@ -67,13 +68,13 @@ def test_specular_against_monte_carlo(roughness: float) -> None:
     size, count = 32, 4000
     tables = EnvironmentLight.from_function(room, size).prefilter()
     probe = np.concatenate([random_directions(60, 5), [[0.5, -0.6, 0.6]]])
-    probe = cubemap.normalise(probe)
+    probe = unit(probe)
     rng = np.random.default_rng(6)
     alpha = roughness**2
     u = (np.arange(count) + 0.5) / count
     phi = 2 * math.pi * ((np.arange(count) * 0.6180339887 + rng.random((len(probe), 1))) % 1)
     theta = 2 * np.arctan(alpha * np.sqrt(u / (1 - u)))
-    side = cubemap.normalise(np.cross(probe, [0.31, 0.82, -0.47]))
+    side = unit(np.cross(probe, [0.31, 0.82, -0.47]))
     other = np.cross(probe, side)
     ring = np.cos(phi)[..., None] * side[:, None] + np.sin(phi)[..., None] * other[:, None]
     lights = np.sin(theta)[None, :, None] * ring + np.cos(theta)[None, :, None] * probe[:, None]
@@ -93,12 +94,12 @@ def test_sharp_level_keeps_the_map() -> None:
 
 @pytest.mark.parametrize("roughness", [0.08, 0.2, 0.4, 1.0])
 def test_a_sun_is_brightest_where_it_stands(roughness: float) -> None:
-    sun = cubemap.normalise(np.array([0.37, 0.62, -0.69]))
+    sun = unit(np.array([0.37, 0.62, -0.69]))
     light = EnvironmentLight.from_function(lambda d: 0.1 + 200.0 * (d @ sun > math.cos(math.radians(3)))[:, None] * np.ones(3), 32)
     probe = np.concatenate([random_directions(4000, 7), sun[None]])
     seen = lookup(light.prefilter(), probe, roughness)[:, 1]
     bright = probe[seen > 0.9 * seen.max()].mean(axis=0)
-    assert math.degrees(math.acos(min(1.0, float(cubemap.normalise(bright) @ sun)))) < 3.0
+    assert math.degrees(math.acos(min(1.0, float(unit(bright) @ sun)))) < 3.0
 
 
 def test_no_seams() -> None:

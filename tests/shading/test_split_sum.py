@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from gsbake.shading import cubemap
+from gsbake.geometry.vectors import unit
 from gsbake.shading.environment import EnvironmentLight
 from gsbake.shading.light_tables import LightTables
 from gsbake.shading.split_sum import _reference, reflected, shade, traced_openness
@@ -31,7 +31,7 @@ def noise_light(size: int, seed: int = 0) -> LightTables:
 
 
 def window(dirs: np.ndarray) -> np.ndarray:
-    bright = np.exp(8.0 * (dirs @ cubemap.normalise(np.array([0.4, 0.5, 0.77])) - 1.0))
+    bright = np.exp(8.0 * (dirs @ unit(np.array([0.4, 0.5, 0.77])) - 1.0))
     return (0.2 + 0.1 * dirs[:, 1:2]) * np.ones(3) + 3.0 * bright[:, None] * np.array([1.0, 0.9, 0.7])
 
 
@@ -64,9 +64,9 @@ def test_sphere_against_the_rendering_equation() -> None:
         albedo, alpha = np.array([0.6, 0.35, 0.2]), roughness**2
         truth = np.empty_like(normal)
         for i, n in enumerate(normal):
-            side = cubemap.normalise(np.cross(n, [0.9, -0.1, 0.3]))
+            side = unit(np.cross(n, [0.9, -0.1, 0.3]))
             light = local @ np.stack([side, np.cross(n, side), n])
-            h = cubemap.normalise(light + view[i])
+            h = unit(light + view[i])
             nl, nv, nh, vh = local[:, 2], n @ view[i], h @ n, h @ view[i]
             density = alpha**2 / (math.pi * (nh**2 * (alpha**2 - 1) + 1) ** 2)
             visibility = 0.5 / (nl * math.sqrt(nv**2 * (1 - alpha**2) + alpha**2) + nv * np.sqrt(nl**2 * (1 - alpha**2) + alpha**2))

@@ -18,6 +18,7 @@ from scipy.spatial import cKDTree
 
 from gsbake.config.schema import Skip
 from gsbake.gltf.read import read_glb
+from gsbake.imaging.srgb import encode
 
 #: glTF (+Y up) to the capture's Z-up world.
 TO_WORLD = np.array([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])
@@ -79,7 +80,7 @@ def test_albedo(baked: tuple[Path, Path]) -> None:
     points, face = trimesh.sample.sample_surface(mesh, 20_000, seed=1)
     weight = trimesh.triangles.points_to_barycentric(mesh.triangles[face], points)
     uv = (asset.attributes["TEXCOORD_0"][asset.faces[face]] * weight[:, :, None]).sum(1)
-    true = _srgb(truth["albedo"][cKDTree(truth["position"]).query(points)[1]])
+    true = encode(truth["albedo"][cKDTree(truth["position"]).query(points)[1]])
     size = np.array(image.shape[1::-1])
     x, y = np.clip((uv * size).astype(int), 0, size - 1).T
     found = np.asarray(image)[y, x, :3] / 255.0
@@ -95,7 +96,3 @@ def test_second_run_is_cached(baked: tuple[Path, Path]) -> None:
     said = json.loads(gsbake("run", capture, "--profile", "smoke", "--out", out, "--json").stdout)
     assert len(said["stages"]) == 9 and {s["status"] for s in said["stages"]} == {"cached"}
     assert (out / "asset.glb").read_bytes() == before
-
-
-def _srgb(x: np.ndarray) -> np.ndarray:
-    return np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.maximum(x, 1e-9) ** (1 / 2.4) - 0.055)

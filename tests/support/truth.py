@@ -7,7 +7,6 @@ with. Shadows are those of the true object; normals, materials and the outline a
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -15,8 +14,11 @@ import numpy as np
 
 from benchmarks.truth import measure_file
 from gsbake.geometry.cameras import Camera
+from gsbake.imaging.metrics import decibels
+from gsbake.imaging.sampling import bilinear
+from gsbake.imaging.srgb import encode
 from gsbake.report.asset import open_asset
-from gsbake.report.render import Asset, Renderer, Samples, bilinear, encode_srgb
+from gsbake.report.render import Asset, Renderer, Samples
 from gsbake.synth import scene
 from gsbake.synth.capture import cameras
 from gsbake.synth.shade import SUBSETS, Rig, make_rig, outgoing, render
@@ -48,7 +50,7 @@ def measure(asset: Path, capture: Path) -> Figures:
     drawn = in_world(open_asset(asset))
     found, true = _materials(drawn)
     gain = (true[:, :3] * found[:, :3]).sum(0) / (found[:, :3] ** 2).sum(0)
-    colour = encode_srgb(found[:, :3] * gain) - encode_srgb(true[:, :3])
+    colour = encode(found[:, :3] * gain) - encode(true[:, :3])
     error = np.sqrt(((found - true) ** 2).mean(0))
     return Figures(
         chamfer=shape.chamfer_pct,
@@ -58,11 +60,6 @@ def measure(asset: Path, capture: Path) -> Figures:
         metallic=float(error[4]),
         relit=relit_psnr(drawn),
     )
-
-
-def decibels(squared: float) -> float:
-    """PSNR in dB of a mean squared error of values in 0..1."""
-    return -10 * math.log10(max(squared, 1e-10))
 
 
 def in_world(asset: Asset) -> Asset:
@@ -113,7 +110,7 @@ def relit_psnr(asset: Asset) -> float:
         where = (cover > 0.5) | (picture.alpha > 0.5)
         mine, theirs = shown * picture.alpha[..., None], truth
         gain = (mine[where] * theirs[where]).sum(0) / np.maximum((mine[where] ** 2).sum(0), 1e-12)
-        error = encode_srgb(mine * gain) - encode_srgb(theirs)
+        error = encode(mine * gain) - encode(theirs)
         scores.append(decibels(float((error[where] ** 2).mean())))
     return float(np.mean(scores))
 

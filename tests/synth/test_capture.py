@@ -13,8 +13,9 @@ from scipy.spatial import cKDTree
 
 from gsbake.errors import UsageError
 from gsbake.geometry.cameras import Camera, CameraSet
+from gsbake.imaging.srgb import encode_bytes
 from gsbake.synth import scene
-from gsbake.synth.capture import cameras, encode_srgb, true_mesh, write_capture
+from gsbake.synth.capture import cameras, true_mesh, write_capture
 
 VIEWS, SIZE = 6, 64
 
@@ -122,7 +123,7 @@ def test_albedo_maps_match_the_points(folder: Path) -> None:
     use = np.arange(0, len(points), 15)[front & (towards[::15] > 0.5)]
     at = pixels[use].astype(int)
     shown = rgba(folder / "truth" / "albedo" / f"{camera.name}.png")[at[:, 1], at[:, 0], :3].astype(float)
-    expected = encode_srgb(albedo[use]).astype(float)
+    expected = encode_bytes(albedo[use]).astype(float)
     assert np.median(np.abs(shown - expected)) < 12
     assert np.corrcoef(shown.ravel(), expected.ravel())[0, 1] > 0.75
 
@@ -159,7 +160,7 @@ def test_background_fills_the_picture(tmp_path: Path) -> None:
 
 def test_srgb_code_values() -> None:
     # 0.18 (grey card) codes to 118, 0.5 to 188, the linear toe is 12.92 x.
-    np.testing.assert_array_equal(encode_srgb(np.array([0.0, 0.002, 0.18, 0.5, 1.0, 2.0])), [0, 7, 118, 188, 255, 255])
+    np.testing.assert_array_equal(encode_bytes(np.array([0.0, 0.002, 0.18, 0.5, 1.0, 2.0])), [0, 7, 118, 188, 255, 255])
 
 
 @pytest.mark.parametrize(("views", "size"), [(2, 128), (24, 8)])

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import io
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +16,8 @@ import cv2
 import numpy as np
 import OpenImageIO as oiio
 from numpy.typing import NDArray
+
+from gsbake.imaging.srgb import decode_bytes, encode_bytes
 
 Bytes = NDArray[np.uint8]
 Floats = NDArray[np.float32]
@@ -49,24 +50,6 @@ class RawPhoto:
     def height(self) -> int:
         """Height in pixels after the EXIF orientation was applied."""
         return int(self.pixels.shape[0])
-
-
-def srgb_encode(linear: NDArray[Any]) -> Bytes:
-    """Linear light (0..1, clipped) to 8-bit sRGB."""
-    index = np.clip(linear, 0.0, 1.0)
-    coded = np.where(index <= 0.0031308, index * np.float32(12.92), 1.055 * np.power(index, np.float32(1 / 2.4)) - np.float32(0.055))
-    return np.asarray(np.rint(coded * 255.0), np.uint8)
-
-
-@cache
-def _decode_table() -> Floats:
-    coded = np.arange(256, dtype=np.float64) / 255.0
-    return np.where(coded <= 0.04045, coded / 12.92, ((coded + 0.055) / 1.055) ** 2.4).astype(np.float32)
-
-
-def srgb_decode(coded: NDArray[Any]) -> Floats:
-    """8-bit sRGB to linear light 0..1, float32."""
-    return np.asarray(_decode_table()[coded], np.float32)
 
 
 def orient(image: NDArray[Any], orientation: int) -> NDArray[Any]:
@@ -178,7 +161,7 @@ def to_working(photo: RawPhoto, mask: Bytes | None, max_size: int) -> tuple[Byte
     pixels = photo.pixels
     weight = photo.alpha
     if reduced:
-        linear: Any = srgb_decode(pixels) if pixels.dtype == np.uint8 else pixels
+        linear: Any = decode_bytes(np.asarray(pixels, np.uint8)) if pixels.dtype == np.uint8 else pixels
         if weight is not None:
             share = weight.astype(np.float32)[..., None] / 255
             total = cv2.resize(share, size, interpolation=cv2.INTER_AREA)[..., None]
@@ -186,9 +169,9 @@ def to_working(photo: RawPhoto, mask: Bytes | None, max_size: int) -> tuple[Byte
             weight = np.rint(total[..., 0] * 255).astype(np.uint8)
         else:
             linear = cv2.resize(linear, size, interpolation=cv2.INTER_AREA)
-        rgb = srgb_encode(linear)
+        rgb = encode_bytes(linear)
     else:
-        rgb = np.asarray(pixels) if pixels.dtype == np.uint8 else srgb_encode(pixels)
+        rgb = np.asarray(pixels) if pixels.dtype == np.uint8 else encode_bytes(pixels)
     if weight is not None:
         rgb = fill_clear(rgb, weight)
     if mask is not None and reduced:

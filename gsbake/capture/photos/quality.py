@@ -12,8 +12,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gsbake.capture.photos.decode import Bytes, srgb_decode
+from gsbake.capture.photos.decode import Bytes
 from gsbake.capture.photos.sharpness import loss_at_half
+from gsbake.imaging.srgb import decode_bytes
 
 #: Thumbnails (32x32 grey) whose root mean square difference is below this (of 255) show the same picture.
 SAME_PICTURE = 1.0
@@ -55,7 +56,7 @@ def measure(rgb: Bytes, mask: Bytes | None) -> Quality:
     inside = mask if mask is not None and (mask > 127).any() else None
     grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
     small = cv2.resize(rgb, (256, 256), interpolation=cv2.INTER_AREA)
-    luminance = srgb_decode(np.asarray(small, np.uint8)) @ _LUMINANCE
+    luminance = decode_bytes(np.asarray(small, np.uint8)) @ _LUMINANCE
     stops = np.log2(np.maximum(luminance, 1e-4))
     if inside is not None:
         share = cv2.resize(inside, (256, 256), interpolation=cv2.INTER_AREA) > 127

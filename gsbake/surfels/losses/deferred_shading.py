@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numba import njit
 
+from gsbake.imaging import srgb
 from gsbake.shading import brdf
 from gsbake.shading import split_sum_kernel as kernels
 from gsbake.shading.light_tables import LightTables
@@ -27,7 +28,7 @@ _ZERO, _ONE, _HALF = np.float32(0.0), np.float32(1.0), np.float32(0.5)
 _CHUNK = 16384
 _SHORTEST = np.float32(1e-12)
 # the sRGB curve (IEC 61966-2-1)
-_KINK, _SLOPE, _SCALE, _OFFSET = np.float32(0.0031308), np.float32(12.92), np.float32(1.055), np.float32(0.055)
+_KINK, _SLOPE, _SCALE, _OFFSET = (np.float32(x) for x in (srgb.KINK, srgb.SLOPE, srgb.SCALE, srgb.OFFSET))
 _EXPONENT = np.float32(1 / 2.4)
 _TO_BASE_2 = np.float32(1 / np.log(2))
 _POWER = np.array(POWER, np.float32)

@@ -43,7 +43,7 @@ def picture(planes: Tensor, view: TrainView, tables: LightTables | None) -> Tens
     `gsbake.surfels.losses.deferred_shading` is its twin in training."""
     if tables is None:
         return planes[:3]
-    from gsbake.shading.colour import linear_to_srgb
+    from gsbake.imaging.srgb_torch import linear_to_srgb
     from gsbake.shading.split_sum import shade
 
     h, w = planes.shape[1:]

@@ -7,7 +7,6 @@ are weighted by Cauchy's function; the twist is held to few pixels by a prior, w
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -15,6 +14,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from gsbake.imaging.metrics import decibels
 from gsbake.surfels.raster.gbuffer import picture, rasterise
 from gsbake.surfels.raster.rasterise import Rendered
 from gsbake.surfels.training.corrections import OFFSET, POWER, Correction, then
@@ -172,7 +172,7 @@ def psnr(scene: Scene, view: TrainView, correction: Correction, used: Tensor) ->
     inside = scene.inside(view, scene.draw(view)[1].alpha) & used
     corrected = correction.of(view)
     error = (scene.draw(corrected)[0] - scene.photo(corrected)).square().mean(0)[inside]
-    return -10 * math.log10(max(float(error.mean()), 1e-10)) if len(error) else 0.0
+    return decibels(float(error.mean())) if len(error) else 0.0
 
 
 def scene_of(surfels: object, light: object, masked: bool, background: Tensor) -> Scene:

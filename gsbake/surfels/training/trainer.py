@@ -14,6 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from gsbake.imaging.metrics import decibels
 from gsbake.surfels.densification.clone_split import Statistics, densify, placement, prune
 from gsbake.surfels.densification.policies import GROWING, PRUNING
 from gsbake.surfels.losses import image as image_loss
@@ -105,7 +106,7 @@ class Trainer:
         weights = ImageWeights(w.ssim, w.normal, w.mask, w.distortion if late else 0.0, w.smoothness)
         total, colour = image_loss.image(out.planes, tables, view, self.masked, self._background(view), weights)
         if tables is not None and w.white_light:
-            from gsbake.shading.colour import colourfulness
+            from gsbake.shading.neutral_light import colourfulness
 
             total = total + w.white_light * colourfulness(self.light.radiance())
         if late and w.median:
@@ -218,7 +219,7 @@ class Trainer:
             background = self.background[:, None, None]
             error = (picture(out.planes, view, tables) + background * (1 - out.alpha) - photo * cover - background * (1 - cover)) ** 2
             inside = (cover > 0.5) | (out.alpha > 0.5)
-            total.append(-10 * math.log10(max(float(error.mean(0)[inside].mean()), 1e-10)))
+            total.append(decibels(float(error.mean(0)[inside].mean())))
         return sum(total) / len(total)
 
     def record(self) -> dict[str, float]:

@@ -14,12 +14,11 @@ from gsbake.capture.photos.decode import (
     fill_clear,
     orient,
     read_photo,
-    srgb_decode,
-    srgb_encode,
     to_working,
     working_size,
 )
 from gsbake.capture.photos.exif import camera_key, focal_pixels
+from gsbake.imaging.srgb import decode_bytes, encode_bytes
 
 
 def save_float(path: Path, pixels: np.ndarray[Any, Any]) -> None:
@@ -33,10 +32,10 @@ def save_float(path: Path, pixels: np.ndarray[Any, Any]) -> None:
 
 def test_srgb_curve_against_the_standard() -> None:
     # IEC 61966-2-1: 188 is the coded value nearest to half of full light, and 10 lies on the linear foot.
-    assert srgb_decode(np.array([0, 10, 188, 255], np.uint8)) == pytest.approx([0, 10 / 255 / 12.92, 0.5029, 1.0], abs=1e-4)
-    assert srgb_encode(np.array([0.0, 0.5, 0.2140, 2.0], np.float32)).tolist() == [0, 188, 127, 255]
+    assert decode_bytes(np.array([0, 10, 188, 255], np.uint8)) == pytest.approx([0, 10 / 255 / 12.92, 0.5029, 1.0], abs=1e-4)
+    assert encode_bytes(np.array([0.0, 0.5, 0.2140, 2.0], np.float32)).tolist() == [0, 188, 127, 255]
     every = np.arange(256, dtype=np.uint8)
-    assert (srgb_encode(srgb_decode(every)) == every).all()
+    assert (encode_bytes(decode_bytes(every)) == every).all()
 
 
 def test_grey_sixteen_bit_and_palette(tmp_path: Path) -> None:
@@ -73,7 +72,7 @@ def test_linear_float_is_coded(tmp_path: Path) -> None:
     light[:] = (0.25, 0.1, 0.05, 0.5)  # EXR colour is multiplied by alpha: straight light .5, .2, .1
     save_float(tmp_path / "a.exr", light)
     rgb, _ = to_working(read_photo(tmp_path / "a.exr"), None, 100)
-    assert rgb[1, 1].tolist() == srgb_encode(np.array([0.5, 0.2, 0.1], np.float32)).tolist() == [188, 124, 89]
+    assert rgb[1, 1].tolist() == encode_bytes(np.array([0.5, 0.2, 0.1], np.float32)).tolist() == [188, 124, 89]
     light[2, 2] = np.nan
     save_float(tmp_path / "nan.exr", light)
     with pytest.raises(UnreadablePhotoError, match="NaN"):

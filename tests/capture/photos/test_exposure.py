@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gsbake.capture.photos.decode import srgb_decode, srgb_encode
 from gsbake.capture.photos.exposure import LEAST_IN_ALL, TiePoints
 from gsbake.capture.poses.colmap_model import read_tracks
 from gsbake.geometry.cameras import Camera
+from gsbake.imaging.srgb import decode_bytes, encode_bytes
 
 PHOTOS, POINTS, SIDE = 9, 400, 400
 
@@ -35,7 +35,7 @@ def tie_points(gain: np.ndarray, shining: float = 0.0, count: int = POINTS) -> T
         image = np.kron(grid, np.ones((edge, edge)))
         full = np.full((SIDE, SIDE), 0.1)
         full[: image.shape[0], : image.shape[1]] = image
-        tied.add(camera, srgb_decode(srgb_encode(np.repeat(np.clip(full, 0, 1)[..., None], 3, 2))))
+        tied.add(camera, decode_bytes(encode_bytes(np.repeat(np.clip(full, 0, 1)[..., None], 3, 2))))
     return tied
 
 

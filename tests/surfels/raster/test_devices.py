@@ -9,9 +9,10 @@ import pytest
 import torch
 from torch import Tensor
 
+from gsbake.imaging.srgb_torch import linear_to_srgb
 from gsbake.pipeline.machine import cuda_lacks
-from gsbake.shading.colour import colourfulness, linear_to_srgb
 from gsbake.shading.light_tables import LightTables
+from gsbake.shading.neutral_light import colourfulness
 from gsbake.shading.prefilter import operator
 from gsbake.shading.split_sum import shade
 from gsbake.surfels import spherical_harmonics as harmonics
