@@ -19,13 +19,13 @@ import torch
 
 from benchmarks.raster import sphere
 from gsbake.config.schema import Profile
-from gsbake.pipeline.machine import cuda_lacks
-from gsbake.surfels.model import Surfels, quaternion_to
+from gsbake.pipeline.machine import missing_cuda_requirement
+from gsbake.surfels.model import Surfels, quaternion_from_normal
 from gsbake.surfels.raster.projection import Pinhole
 from gsbake.surfels.raster.rasterise import render
 from gsbake.surfels.training.trainer import Plan, Trainer
 from gsbake.surfels.training.views import TrainView
-from gsbake.surfels.transfer import named
+from gsbake.surfels.transfer import transfer_by_name
 
 CHANNELS = 10
 CASES = [(surfels, size) for surfels in (100_000, 1_000_000) for size in (800, 1600)]
@@ -70,8 +70,8 @@ def training(steps: int = 200, size: int = 128) -> dict[str, float]:
     found = {}
     for device in ("cpu", "cuda"):
         start = Surfels(
-            inputs[0].clone(), quaternion_to(inputs[0]), inputs[2].clone(), torch.full((3000,), 0.01), torch.tensor([1.0]),
-            {"sh": torch.zeros(3000, 1, 3)}, named("sech2"),
+            inputs[0].clone(), quaternion_from_normal(inputs[0]), inputs[2].clone(), torch.full((3000,), 0.01), torch.tensor([1.0]),
+            {"sh": torch.zeros(3000, 1, 3)}, transfer_by_name("sech2"),
         )  # fmt: skip
         moved = [v.to(device) for v in views]
         trainer = Trainer(plan, start.to(device), None, moved, moved, [])
@@ -145,7 +145,7 @@ def main() -> int:
     parser.add_argument("--check", action="store_true", help="parity and training only, no timings")
     parser.add_argument("--csv", help="write the timings to this file too")
     args = parser.parse_args()
-    lacks = cuda_lacks()
+    lacks = missing_cuda_requirement()
     if lacks:
         sys.stderr.write(f"benchmarks.device needs an NVIDIA GPU: {lacks}.\n")
         return 2

@@ -23,8 +23,7 @@ from pathlib import Path
 
 from benchmarks.charts import COLOURS, Panel, Series, write
 from benchmarks.step import profile
-from gsbake.cli.options import Options
-from gsbake.cli.session import open_session
+from gsbake.api import RunOptions, open_session
 from gsbake.pipeline.machine import default_threads
 from gsbake.surfels.raster.threads import configure
 from gsbake.synth.capture import write_capture
@@ -88,7 +87,7 @@ def bake(photos: int, edge: int, target: str, out: Path, threads: int, rounds: i
     best: dict[str, tuple[float, float]] = {}
     for number in range(rounds):
         folder = out / f"round-{number}" / f"{photos}-{edge}"
-        options = Options(photos=capture, out=folder, profile="preview", overrides=overrides, device="cpu", threads=threads)
+        options = RunOptions(photos=capture, out=folder, profile="preview", overrides=overrides, device="cpu", threads=threads)
         for state in open_session(options).engine.run(target):
             assert state.artifact is not None  # the engine returned, so every stage is there
             found = float(state.artifact.manifest["seconds"]), state.artifact.manifest["peak_bytes"] / 1e6

@@ -31,8 +31,7 @@ from typing import Any
 from benchmarks.maps import measure_maps
 from benchmarks.skip import CpuClock, reuse, write
 from benchmarks.timeline import CAPTURES, ROOT, manifests, names
-from gsbake.cli.options import Options
-from gsbake.cli.session import open_session
+from gsbake.api import RunOptions, open_session
 from gsbake.errors import GsbakeError, UsageError
 
 RESULTS = ROOT / "benchmarks" / "results" / "materials.csv"
@@ -113,7 +112,7 @@ def score(asset: Path, solved: bool, truth: Path, scorer: Path, python: Path) ->
 def measure(folder: Path, profile: str, row: str, overrides: Sequence[str], out: Path, threads: int) -> tuple[Row, Path, bool]:
     """Make the asset of one row, or take what is cached: its row without the scorer's figures, its GLB, and whether poses were solved."""
     clock = CpuClock(out / "cpu.json")
-    options = Options(photos=folder, out=out, profile=profile, overrides=[*STEPS[row], *overrides], device="cpu", threads=threads)
+    options = RunOptions(photos=folder, out=out, profile=profile, overrides=[*STEPS[row], *overrides], device="cpu", threads=threads)
     states = open_session(options, clock).engine.run("report")
     done = manifests(states)
     folders = {s.name: s.artifact.folder for s in states if s.artifact is not None}

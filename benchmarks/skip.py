@@ -28,8 +28,7 @@ from typing import Any
 
 from benchmarks.timeline import BUILT_IN, ROOT, find_capture, manifests, names
 from benchmarks.truth import measure_stage, read_truth
-from gsbake.cli.options import Options
-from gsbake.cli.session import open_session
+from gsbake.api import RunOptions, open_session
 from gsbake.config.schema import Skip
 from gsbake.errors import BadInputError, UsageError
 from gsbake.monitor import SKIP_PREFIX
@@ -71,11 +70,11 @@ class CpuClock(Observer):
         self.spent: dict[str, float] = json.loads(file.read_text()) if file.is_file() else {}
         self._begun = 0.0
 
-    def starts(self, state: StageState) -> None:
+    def stage_started(self, state: StageState) -> None:
         """Note what ended processes have taken so far."""
         self._begun = _children()
 
-    def finished(self, state: StageState) -> None:
+    def stage_finished(self, state: StageState) -> None:
         """The difference is this stage's."""
         self.spent[_stage_key(state)] = _children() - self._begun
         self.file.parent.mkdir(parents=True, exist_ok=True)
@@ -113,7 +112,7 @@ def reuse(run: Path, out: Path, stages: Sequence[str] = EARLY) -> None:
 def measure_run(folder: Path, profile: str, rule: str, mode: str, out: Path, threads: int) -> Row:
     """Run everything with one rule set, or take what is cached, and measure it."""
     overrides = [f"{SKIP_PREFIX}{rule}={mode}"] if rule else []
-    options = Options(photos=folder, out=out, profile=profile, overrides=overrides, device="cpu", threads=threads)
+    options = RunOptions(photos=folder, out=out, profile=profile, overrides=overrides, device="cpu", threads=threads)
     clock = CpuClock(out / "cpu.json")
     try:
         states = open_session(options, clock).engine.run("report")

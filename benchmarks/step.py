@@ -28,11 +28,10 @@ from gsbake.shading.environment import EnvironmentLight
 from gsbake.surfels import spherical_harmonics as harmonics
 from gsbake.surfels.densification import clone_split as adapt
 from gsbake.surfels.losses import deferred_shading as deferred
-from gsbake.surfels.losses import geometry as surface
-from gsbake.surfels.losses import image as image_loss
+from gsbake.surfels.losses import geometry, smoothness
+from gsbake.surfels.losses import image as image_losses
 from gsbake.surfels.losses import photometric as similarity
-from gsbake.surfels.losses import projection as projection_loss
-from gsbake.surfels.losses import smoothness
+from gsbake.surfels.losses import projection as projection_losses
 from gsbake.surfels.losses import terms as losses
 from gsbake.surfels.model import Surfels, create
 from gsbake.surfels.raster import projection
@@ -53,14 +52,14 @@ REST = (
     ("harmonics backward", harmonics._Colours, "backward"),
     ("light filter forward", tables._Filter, "forward"),
     ("light filter backward", tables._Filter, "backward"),
-    ("image losses", image_loss._Image, "forward"),
-    (". colour and SSIM", similarity, "colour"),
-    (". normals, mask, distortion", surface, "surface"),
-    (". smoothness", smoothness, "smoothness"),
-    (". G-buffer forward, with shading", deferred.Shaded, "__init__"),
-    (". G-buffer backward, with shading", deferred.Shaded, "backward"),
-    ("projection loss forward", projection_loss._Projection, "forward"),
-    ("projection loss backward", projection_loss._Projection, "backward"),
+    ("image losses", image_losses._ImageLosses, "forward"),
+    (". colour and SSIM", similarity, "colour_loss"),
+    (". normals, mask, distortion", geometry, "geometry_losses"),
+    (". smoothness", smoothness, "smoothness_loss"),
+    (". G-buffer forward, with shading", deferred.DeferredShading, "__init__"),
+    (". G-buffer backward, with shading", deferred.DeferredShading, "backward"),
+    ("projection loss forward", projection_losses._ProjectionLoss, "forward"),
+    ("projection loss backward", projection_losses._ProjectionLoss, "backward"),
     ("median", losses, "median_sharpness"),
     ("Adam", adam.Adam, "step"),
     ("statistics", adapt.Statistics, "add"),

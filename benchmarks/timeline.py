@@ -27,8 +27,7 @@ from typing import Any
 from benchmarks import peers
 from benchmarks.rows import STARTS, Row, draw, markdown, merged, read_csv, text, write_csv
 from benchmarks.truth import measure_stage, read_truth
-from gsbake.cli.options import Options
-from gsbake.cli.session import Session, open_session
+from gsbake.api import RunOptions, Session, open_session
 from gsbake.config.load import load_profile
 from gsbake.errors import BadInputError, UsageError
 from gsbake.pipeline.plan import StageState
@@ -59,7 +58,7 @@ class Checkpoint:
             f"train.init={self.start}",
             f"stereo.enabled={'auto' if self.start == 'stereo' else 'never'}",
         ]
-        options = Options(
+        options = RunOptions(
             photos=self.folder, out=out / self.capture, profile=self.profile, overrides=overrides, device="cpu", threads=threads
         )
         return open_session(options)

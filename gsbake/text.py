@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -52,6 +53,34 @@ def figures(results: Mapping[str, Any], limit: int = MAX_FIGURES) -> str:
         if len(shown) == limit:
             break
     return ", ".join(shown)
+
+
+def summarise(template: str, results: Mapping[str, Any]) -> str:
+    """The template with results in its braces, as in "{photos} photos, {psnr:dB}"; clauses between commas that lack a result are dropped.
+
+    A format after the colon is a unit: "dB" one decimal, "%" a share as a percentage, "MB", "px" two decimals.
+    """
+    clauses = []
+    for clause in filter(None, (part.strip() for part in template.split(","))):
+        names = [name.partition(":") for name in re.findall(r"\{([^}]+)\}", clause)]
+        if any(results.get(name) is None for name, _, _ in names):
+            continue
+        for name, colon, unit in names:
+            clause = clause.replace("{" + name + colon + unit + "}", _with_unit(results[name], unit))
+        clauses.append(clause)
+    return ", ".join(clauses)
+
+
+def _with_unit(value: Any, unit: str) -> str:
+    match unit:
+        case "%":
+            return f"{100 * value:.0f} %"
+        case "dB":
+            return f"{value:.1f} dB"
+        case "MB" | "px":
+            return f"{value:.2f} {unit}"
+        case _:
+            return value if isinstance(value, str) else number(value)
 
 
 def shortlist(names: Sequence[str]) -> str:

@@ -23,6 +23,7 @@ STAGE = Stage(
     version=15,
     title="Textures",
     run=run,
+    summary="{charts} charts, {texels} texels, {fit_psnr:dB} on held-out photos",
     needs=("poses", "refine", "mesh"),
     settings=(
         "bake.*", "light.size", "train.max_size", "train.holdout", "skip.exposure_equalisation", "skip.normal_map", "skip.specular",

@@ -21,6 +21,7 @@ STAGE = Stage(
     version=2,
     title="Asset",
     run=run,
+    summary="{megabytes:MB}, {triangles} triangles, {texture_size}² texels",
     needs=("ingest", "poses", "refine", "bake"),
     settings=("export.*", "bake.materials", "bake.size"),
 )

@@ -21,6 +21,7 @@ STAGE = Stage(
     version=2,
     title="Photos",
     run=run,
+    summary="{photos} photos, {masks} masks, {skipped} skipped",
     sources=("photos", "masks", "poses"),
     settings=("ingest.*", "skip.resolution"),
 )

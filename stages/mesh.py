@@ -24,6 +24,7 @@ STAGE = Stage(
     version=5,
     title="Mesh",
     run=run,
+    summary="{faces} triangles, {dense_faces} before decimation",
     needs=("poses", "stereo", "refine"),
     settings=("mesh.*", "train.max_size", "stereo.max_size", "skip.empty_cells"),
     uses_device=True,

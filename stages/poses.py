@@ -22,6 +22,7 @@ STAGE = Stage(
     version=3,
     title="Camera poses",
     run=run,
+    summary="{registered} photos registered, {points} tie points, {reprojection_px:px} reprojection error",
     needs=("ingest",),
     settings=("poses.*", "skip.redundant_photos"),
     seeded=True,

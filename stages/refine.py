@@ -25,6 +25,7 @@ STAGE = Stage(
     version=2,
     title="Surfel refinement",
     run=run,
+    summary="{surfels} surfels, {steps} steps, {psnr:dB} on held-out photos",
     needs=("poses", "train"),
     settings=("refine.*", "train.max_size", "train.holdout", "train.lr_*", "surfels.*", "loss.*", "skip.converged_steps"),
     uses_device=True,

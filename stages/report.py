@@ -20,6 +20,7 @@ STAGE = Stage(
     version=2,
     title="Report",
     run=run,
+    summary="{psnr:dB} and SSIM {ssim} over {compared} photos",
     needs=("ingest", "poses", "stereo", "train", "refine", "mesh", "bake", "export"),
     settings=("report.*", "train.holdout"),
 )

@@ -21,6 +21,7 @@ STAGE = Stage(
     version=4,
     title="Multi-view stereo",
     run=run,
+    summary="{points} points, {confirmed_share:%} of the object confirmed",
     needs=("poses",),
     settings=("stereo.*",),
     seeded=True,

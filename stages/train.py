@@ -26,6 +26,7 @@ STAGE = Stage(
     version=3,
     title="Surfel training",
     run=run,
+    summary="{surfels} surfels, {steps} steps, {psnr:dB} on held-out photos",
     needs=("poses", "stereo"),
     settings=("train.*", "surfels.*", "light.*", "loss.*", "skip.converged_steps", "skip.confirmed_steps", "skip.*_refinement"),
     uses_device=True,

@@ -8,7 +8,7 @@ from types import FrameType
 
 
 def main() -> None:
-    """Entry point of `gsbake`: every end has a documented exit code (0, 2, 42, 75; 1 for the unforeseen) and one sentence on stderr."""
+    """Entry point of `gsbake`: every end has a documented exit code (0, 2, 42, 75; 1 for an internal error) and one sentence on stderr."""
     from gsbake.errors import GsbakeError, InterruptedRun
 
     def interrupted(number: int, frame: FrameType | None) -> None:
@@ -48,4 +48,4 @@ def _save_traceback(error: Exception) -> str:
     with tempfile.NamedTemporaryFile("w", prefix="gsbake-error-", suffix=".txt", delete=False) as file:
         file.write("".join(traceback.format_exception(error)))
     text = " ".join(f"{type(error).__name__}: {error}".split())
-    return f"Something nobody foresaw happened ({text[:300]}); the traceback is in '{file.name}'."
+    return f"Internal error ({text[:300]}); the traceback is in '{file.name}'."

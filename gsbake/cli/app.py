@@ -25,6 +25,7 @@ from gsbake.cli.options import (
     SeedOption,
     SetOption,
     ThreadsOption,
+    VerboseOption,
     complete_profile,
     complete_stage,
 )
@@ -32,13 +33,15 @@ from gsbake.cli.options import (
 app = typer.Typer(
     name="gsbake",
     help="Photos in, relightable game-ready asset out.",
-    epilog="Exit codes: 0 done, 2 wrong usage, 42 bad input (do not retry), 75 interrupted (the same command goes on), 1 anything else.",
+    epilog="Exit codes: 0 done, 2 wrong usage, 42 bad input (do not retry), 75 interrupted (the same command continues), 1 internal error.",
     no_args_is_help=True,
     rich_markup_mode=None,  # plain help is there in a third of the time
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 
+#: What `--invert-masks` stands for.
+INVERTED = ("ingest.invert_masks=true",)
 #: Commands that bring the pipeline up to one stage, and their help.
 STAGE_HELP = {
     "ingest": "Read photos, masks and known poses.",
@@ -82,13 +85,15 @@ def _pipeline_command(target: str | None) -> Callable[..., None]:
         seed: SeedOption = None,
         dry_run: DryRunOption = False,
         quiet: QuietOption = False,
+        verbose: VerboseOption = False,
         as_json: JsonOption = False,
     ) -> None:
         from gsbake.cli.run import run_pipeline
 
         options = Options(
-            photos=photos, out=out, profile=profile, overrides=overrides or [], masks=masks, poses=poses, invert_masks=invert_masks,
-            device=device.value, threads=threads, seed=seed, dry_run=dry_run, quiet=quiet, as_json=as_json,
+            photos=photos, out=out, profile=profile, overrides=[*(overrides or []), *(INVERTED if invert_masks else ())], masks=masks,
+            poses=poses, device=device.value, threads=threads, seed=seed,
+            dry_run=dry_run, quiet=quiet, verbose=verbose, as_json=as_json,
         )  # fmt: skip
         run_pipeline(options, target)
 

@@ -11,8 +11,8 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from gsbake.api import Session
 from gsbake.cli.options import Options
-from gsbake.cli.session import Session, open_session
 from gsbake.config.load import LoadedProfile, bounds, fields, load_profile, shipped
 from gsbake.pipeline.plan import StageState
 from gsbake.text import duration, figures, size
@@ -54,10 +54,10 @@ def plan_document(session: Session, states: list[StageState]) -> dict[str, Any]:
                 "status": state.status,
                 "will_run": state.artifact is None,
                 "reasons": list(state.reasons),
-                "key": state.ingredients.key if state.ingredients is not None else None,
+                "key": state.cache_key.digest if state.cache_key is not None else None,
                 "folder": str(state.artifact.folder) if state.artifact is not None else None,
                 "settings": dict(state.settings),
-                "inputs": dict(state.ingredients.inputs) if state.ingredients is not None else {},
+                "inputs": dict(state.cache_key.inputs) if state.cache_key is not None else {},
                 "results": state.artifact.manifest.get("results", {}) if state.artifact is not None else {},
                 "decisions": state.artifact.manifest.get("decisions", []) if state.artifact is not None else [],
             }
@@ -68,7 +68,7 @@ def plan_document(session: Session, states: list[StageState]) -> dict[str, Any]:
 
 def status(options: Options) -> None:
     """Print the state of every stage."""
-    session = open_session(options)
+    session = options.session()
     states = session.engine.plan()
     if options.as_json:
         typer.echo(json.dumps(plan_document(session, states), indent=1, ensure_ascii=False))
@@ -81,7 +81,7 @@ def status(options: Options) -> None:
 
 def explain(options: Options, stage: str | None) -> None:
     """Print for one stage, or all, what its key is made of and why it would run."""
-    session = open_session(options)
+    session = options.session()
     session.engine.registry.up_to(stage)  # says so when there is no such stage
     states = [s for s in session.engine.plan(stage) if stage is None or s.name == stage]
     if options.as_json:
@@ -97,9 +97,9 @@ def explain(options: Options, stage: str | None) -> None:
             console.print(Text(f"  in {state.artifact.folder}"))
             for d in state.artifact.manifest.get("decisions", ()):
                 console.print(Text(f"  decided {d['what']}: {d['choice']} ({d['evidence']})"))
-        if state.ingredients is not None:
-            what = state.ingredients
-            console.print(Text(f"  key {what.key[:16]} from stage version {what.version}"))
+        if state.cache_key is not None:
+            what = state.cache_key
+            console.print(Text(f"  key {what.digest[:16]} from stage version {what.version}"))
             for name, digest in what.inputs.items():
                 console.print(Text(f"    input {name}: content {digest[:16]}"))
             if what.backend is not None:

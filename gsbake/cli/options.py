@@ -5,9 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
+
+if TYPE_CHECKING:
+    from gsbake.api import Session
+    from gsbake.pipeline.engine import Observer
 
 
 class Device(StrEnum):
@@ -76,8 +80,9 @@ InvertOption = Annotated[bool, typer.Option("--invert-masks", help="Masks are wh
 DeviceOption = Annotated[Device, typer.Option("--device", help="Where heavy kernels run.")]
 ThreadsOption = Annotated[int, typer.Option("--threads", min=0, help="Threads; 0 takes the physical cores.", show_default=False)]
 SeedOption = Annotated[int | None, typer.Option("--seed", help="Seed of everything random.  [default: 0]", show_default=False)]
-DryRunOption = Annotated[bool, typer.Option("--dry-run", "-n", help="Say what would be done, and why; do nothing.")]
-QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="Say nothing but warnings and errors.")]
+DryRunOption = Annotated[bool, typer.Option("--dry-run", "-n", help="Print what would be done, and why; do nothing.")]
+QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="Print warnings and errors only.")]
+VerboseOption = Annotated[bool, typer.Option("--verbose", "-v", help="Print every decision with its evidence.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON document instead of text.")]
 
 
@@ -91,10 +96,19 @@ class Options:
     overrides: list[str] = field(default_factory=list)
     masks: Path | None = None
     poses: Path | None = None
-    invert_masks: bool = False
     device: str = "auto"
     threads: int = 0
     seed: int | None = None
     dry_run: bool = False
     quiet: bool = False
+    verbose: bool = False
     as_json: bool = False
+
+    def session(self, observer: Observer | None = None) -> Session:
+        """The run that the options describe, ready to go; nothing is written."""
+        from gsbake.api import RunOptions, open_session
+
+        run = RunOptions(
+            self.photos, self.out, self.profile, self.overrides, self.masks, self.poses, self.device, self.threads, self.seed
+        )  # fmt: skip
+        return open_session(run, observer)

@@ -8,7 +8,6 @@ from pathlib import Path
 import typer
 
 from gsbake.cli.options import Options
-from gsbake.cli.session import open_session
 from gsbake.errors import BadInputError, UsageError
 from gsbake.pipeline.replace import folder_files, replace_output, undo_replacement
 from gsbake.pipeline.store import Artifact
@@ -19,7 +18,7 @@ STANDS_FOR = {("mesh", ".ply"): ("mesh.ply", "dense.ply")}
 
 def replace(options: Options, stage: str, paths: list[Path], undo: bool) -> None:
     """Register the files, or take the registration back."""
-    session = open_session(options)
+    session = options.session()
     store = session.engine.store
     session.engine.registry.load(stage)
     if undo == bool(paths):
@@ -44,7 +43,7 @@ def replace(options: Options, stage: str, paths: list[Path], undo: bool) -> None
 
 def _current(options: Options, stage: str) -> Artifact | None:
     """The stage's output as things stand: by hand, else cached, else the newest there is."""
-    session = open_session(options)
+    session = options.session()
     replacement = session.engine.store.replacement(stage)
     if replacement is not None:
         return replacement.artifact

@@ -3,29 +3,24 @@
 from __future__ import annotations
 
 import json
+import time
 from typing import Any
 
 import typer
 
+from gsbake.api import Result
 from gsbake.cli.display import choose_display, close_display
 from gsbake.cli.inspect import plan_document, print_plan
 from gsbake.cli.options import Options
-from gsbake.cli.publish import publish_results
-from gsbake.cli.session import open_session
-from gsbake.errors import BadInputError
-from gsbake.pipeline.engine import artifacts_of
-from gsbake.pipeline.files import disk_error, open_output
 from gsbake.pipeline.plan import StageState
-from gsbake.text import duration
+from gsbake.text import duration, number, size
 
 
 def run_pipeline(options: Options, target: str | None) -> None:
-    """Run up to `target` (everything without one) and say where the results are."""
-    import time
-
+    """Run up to `target` (everything without one) and print where the results are."""
     start = time.perf_counter()
-    display = choose_display(quiet=options.quiet, as_json=options.as_json)
-    session = open_session(options, display)
+    display = choose_display(quiet=options.quiet, verbose=options.verbose, as_json=options.as_json)
+    session = options.session(display)
     if options.dry_run:
         states = session.engine.plan(target)
         if options.as_json:
@@ -34,40 +29,55 @@ def run_pipeline(options: Options, target: str | None) -> None:
             print_plan(states)
         return
     try:
-        open_output(session.out)
-        session.project.save(session.out)
-        states = session.engine.run(target)
-        placed, project = publish_results(session.out, artifacts_of(states), session.project, session.engine.store.digests)
-        project.save(session.out)
-        session.engine.store.digests.save()
-    except OSError as error:
-        raise disk_error(error, session.out) or BadInputError(
-            f"The output folder '{session.out}' cannot be written ({error.strerror}); choose another with --out."
-        ) from error
+        result = session.run(target)
     finally:
         close_display(display)
     seconds = time.perf_counter() - start
     if options.as_json:
-        document = {
-            "out": str(session.out),
-            "seconds": round(seconds, 3),
-            "stages": [_document(state) for state in states],
-            "files": {name: str(path) for name, path in placed.items()},
-            "exit_code": 0,
-        }
-        typer.echo(json.dumps(document, indent=1, ensure_ascii=False))
+        typer.echo(json.dumps(_document(result, seconds), indent=1, ensure_ascii=False))
     elif not options.quiet:
-        last = states[-1].artifact
-        found = [str(path) for path in placed.values()] or ([str(last.folder)] if last is not None else [])
-        typer.echo(f"Done in {duration(seconds)}: {', '.join(found)}")
+        for name, text in closing(result, seconds):
+            typer.echo(f"{name:<9} {text}")
 
 
-def _document(state: StageState) -> dict[str, Any]:
+def closing(result: Result, seconds: float) -> list[tuple[str, str]]:
+    """The last lines of a run: asset, test figure, warnings, report and time, as far as the run went."""
+    lines = []
+    figures = {state.name: state.artifact.manifest.get("results", {}) for state in result.stages if state.artifact is not None}
+    asset, export, report = result.files.get("asset.glb"), figures.get("export", {}), figures.get("report", {})
+    if asset is not None:
+        texture = f", {export['texture_size']}² texels" if "texture_size" in export else ""
+        triangles = f", {number(export['triangles'])} triangles" if "triangles" in export else ""
+        lines.append(("Asset", f"{asset}  ({size(asset.stat().st_size)}{triangles}{texture})"))
+    elif result.stages and result.stages[-1].artifact is not None:
+        lines.append(("Output", str(result.stages[-1].artifact.folder)))
+    if report.get("psnr") is not None:
+        photos = "held-out photos" if report.get("held_out") else "training photos"
+        lines.append(("Quality", f"{report['psnr']:.1f} dB PSNR, SSIM {report['ssim']:.3f} on {report['compared']} {photos}"))
+    if result.warnings:
+        lines.append(("Warnings", f"{len(result.warnings)}, listed above and in the report"))
+    if "report.html" in result.files:
+        lines.append(("Report", str(result.files["report.html"])))
+    lines.append(("Time", duration(seconds)))
+    return lines
+
+
+def _document(result: Result, seconds: float) -> dict[str, Any]:
+    """The run as JSON."""
+    return {
+        "out": str(result.out),
+        "seconds": round(seconds, 3),
+        "stages": [_stage(state) for state in result.stages],
+        "files": {name: str(path) for name, path in result.files.items()},
+        "exit_code": 0,
+    }
+
+
+def _stage(state: StageState) -> dict[str, Any]:
     manifest = state.artifact.manifest if state.artifact is not None else {}
-    ran = state.status == "run"
     return {
         "name": state.name,
-        "status": "ran" if ran else state.status,
+        "status": "ran" if state.status == "run" else state.status,
         "reasons": list(state.reasons),
         "folder": str(state.artifact.folder) if state.artifact is not None else None,
         "seconds": manifest.get("seconds"),

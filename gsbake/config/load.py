@@ -191,4 +191,4 @@ def _validate(values: Mapping[str, Any], origins: Mapping[str, str]) -> Profile:
         if isinstance(value, str) and field is not None:
             near = difflib.get_close_matches(value, [str(c) for c in get_args(field.annotation)], 1)
             text += f" (did you mean '{near[0]}'?)" if near else ""
-        raise BadInputError(f"{origins.get(key, 'profile')}: {key} = {value!r} will not do: it {text}.") from error
+        raise BadInputError(f"{origins.get(key, 'profile')}: {key} = {value!r} is invalid: it {text}.") from error

@@ -55,7 +55,7 @@ from gsbake.materials.sparsity_prior import NEAR, common
 from gsbake.materials.visibility import Visibility
 from gsbake.shading.cubemap import solid_angles
 from gsbake.shading.environment import EnvironmentLight
-from gsbake.shading.neutral_light import colourfulness
+from gsbake.shading.neutral_light import neutral_light_loss
 from gsbake.texturing.texels import Texels
 
 Floats = NDArray[np.float32]
@@ -243,7 +243,7 @@ class MaterialFit:
         loss = (error * batch.weight).mean()
         loss = loss + priors.dark * values[:, :3].mean() + priors.metal * values[:, 4].mean()
         if priors.white:
-            loss = loss + priors.white * colourfulness(self._light.radiance())
+            loss = loss + priors.white * neutral_light_loss(self._light.radiance())
         if priors.smooth and len(self._pairs):
             count = max(1, int(COMPARED * len(self._pairs)))
             start = int(torch.randint(len(self._pairs) - count + 1, (1,), generator=generator))

@@ -18,7 +18,7 @@ from gsbake.imaging.srgb import decode
 from gsbake.materials.metallic import Evidence
 from gsbake.materials.pixels import Pixels
 from gsbake.shading.light_tables import LightTables
-from gsbake.shading.split_sum import reflected, shade, traced_openness
+from gsbake.shading.split_sum import mirror_reflection, shade, traced_specular_visibility
 
 Floats = NDArray[np.float32]
 
@@ -107,11 +107,11 @@ class Batch:
     def _lit(self, normal: Tensor, albedo: Tensor, roughness: Tensor, metallic: Tensor, tables: LightTables, near: Near) -> Tensor:
         """`shade` of the pixels with their surroundings, linear colours (n, 3)."""
         texels, view = near.texels, self.towards
-        openness = None if near.blocked is None else traced_openness(normal, view, roughness, texels[:, 1], near.blocked)
+        openness = None if near.blocked is None else traced_specular_visibility(normal, view, roughness, texels[:, 1], near.blocked)
         lit = shade(normal, view, albedo, roughness, metallic, tables, texels[:, 1], texels[:, 0], openness)
         if near.rows is not None and near.sent is not None:
             at = near.rows
-            lit = lit.index_add(0, at, reflected(normal[at], view[at], albedo[at], roughness[at], metallic[at], near.sent))
+            lit = lit.index_add(0, at, mirror_reflection(normal[at], view[at], albedo[at], roughness[at], metallic[at], near.sent))
         return lit + (1 - metallic)[:, None] * albedo * texels[:, BOUNCED] + texels[:, GLOW]
 
 

@@ -1,1 +1,1 @@
-"""The engine: stages, keys, cache, leases, manifests. It knows nothing of 3D."""
+"""Build engine: stages, cache keys, artifacts, leases and manifests. It contains nothing specific to 3D."""

@@ -1,4 +1,4 @@
-"""The engine: takes stages in order, serves what is cached, runs what is not, and publishes it with a manifest."""
+"""Build engine: takes stages in order, reuses cached artifacts, runs the other stages and publishes their output with a manifest."""
 
 from __future__ import annotations
 
@@ -11,47 +11,48 @@ from typing import Any
 
 from gsbake.errors import GsbakeError, InterruptedRun
 from gsbake.pipeline.events import EventLog, now
-from gsbake.pipeline.files import disk_error, open_output, remove_tree
-from gsbake.pipeline.key import HASH_FORMAT, SHORT, Ingredients
-from gsbake.pipeline.lease import Holder, Lease
-from gsbake.pipeline.machine import host_facts, versions
+from gsbake.pipeline.files import disk_error, ensure_output_folder, remove_tree
+from gsbake.pipeline.key import KEY_FORMAT, KEY_PREFIX_LENGTH, CacheKey
+from gsbake.pipeline.lease import Lease, LeaseHolder
+from gsbake.pipeline.machine import host_info, versions
 from gsbake.pipeline.plan import Planner, Request, StageState
 from gsbake.pipeline.registry import Registry
 from gsbake.pipeline.stage import Stage
 from gsbake.pipeline.store import Artifact, Store
 from gsbake.pipeline.supervise import Outcome, StageFailed, StopSignals, supervise
 from gsbake.pipeline.worker import Job
+from gsbake.text import summarise
 
 
 class Observer:
-    """Watches a run; the command line's displays derive from it. Every method may be left out."""
+    """Receives the events of a run. Base class of the command line's displays; every method is optional."""
 
-    def begins(self, stages: list[Stage]) -> None:
-        """A run over these stages starts."""
+    def run_started(self, stages: list[Stage]) -> None:
+        """A run of these stages starts."""
 
-    def served(self, state: StageState) -> None:
-        """A stage is cached or was replaced by hand."""
+    def stage_reused(self, state: StageState) -> None:
+        """A stage is cached, or its output was replaced by the user."""
 
-    def starts(self, state: StageState) -> None:
-        """A stage starts to run, for the state's reasons."""
+    def stage_started(self, state: StageState) -> None:
+        """A stage starts, for the state's reasons."""
 
-    def waits(self, name: str, holder: Holder | None) -> None:
-        """Somebody else computes this artifact; called again and again while waiting."""
+    def stage_waiting(self, name: str, holder: LeaseHolder | None) -> None:
+        """Another process computes the artifact; called at every poll while waiting."""
 
     def progress(self, name: str, done: int, total: int, text: str, live: Mapping[str, float]) -> None:
         """A stage reports progress."""
 
-    def decided(self, name: str, what: str, choice: str, evidence: str) -> None:
-        """A stage took a decision."""
+    def decision(self, name: str, what: str, choice: str, evidence: str) -> None:
+        """A stage reports a decision."""
 
-    def warned(self, name: str, text: str) -> None:
-        """A stage warns."""
+    def warning(self, name: str, text: str) -> None:
+        """A stage reports a warning."""
 
-    def stopping(self, name: str) -> None:
-        """A stop was asked for and passed on to the stage."""
+    def stage_stopping(self, name: str) -> None:
+        """A stop request was sent to the stage."""
 
-    def finished(self, state: StageState) -> None:
-        """A stage was published; the state holds its artifact."""
+    def stage_finished(self, state: StageState) -> None:
+        """The artifact of a stage was published; `state` holds it."""
 
 
 class Engine:
@@ -66,36 +67,36 @@ class Engine:
         self.events = EventLog(request.out / "events.jsonl")
 
     def plan(self, target: str | None = None) -> list[StageState]:
-        """What `run` would do, without doing it."""
+        """The states of the stages that `run` would take; nothing is run."""
         states = self.planner.plan(self.registry.up_to(target))
         self.store.digests.save()
         return states
 
     def run(self, target: str | None = None) -> list[StageState]:
-        """Bring every stage up to `target` (all without one) up to date and return their states, artifacts included.
+        """Bring all stages up to `target` (all without one) up to date; returns their states with artifacts.
 
-        Raises BadInputError, UsageError, InterruptedRun, or StageFailed with the path of the saved traceback.
+        Raises BadInputError, UsageError, InterruptedRun, or StageFailed, which names the file with the traceback.
         """
         stages = self.registry.up_to(target)
         try:
-            open_output(self.request.out)
+            ensure_output_folder(self.request.out)
             with StopSignals() as stop:
                 return self._run(stages, stop)
         except GsbakeError as error:
             self.events.write("run ended", error=type(error).__name__, message=str(error), exit_code=error.exit_code)
             raise
         except OSError as error:
-            known = disk_error(error, self.request.out)
-            if known is None:
+            user_error = disk_error(error, self.request.out)
+            if user_error is None:
                 raise
-            raise known from error
+            raise user_error from error
         finally:
             self.store.digests.save()
 
     def _run(self, stages: list[Stage], stop: StopSignals) -> list[StageState]:
         start = time.perf_counter()
         self.events.write("run started", stages=[s.name for s in stages], seed=self.request.seed, device=self.request.device)
-        self.observer.begins(stages)
+        self.observer.run_started(stages)
         states: list[StageState] = []
         artifacts: dict[str, Artifact] = {}
         for stage in stages:
@@ -105,7 +106,7 @@ class Engine:
                 state = self._compute(stage, state, artifacts, stop)
             else:
                 self.events.write("stage cached", stage=stage.name, folder=state.artifact.folder, by_hand=state.artifact.by_hand)
-                self.observer.served(state)
+                self.observer.stage_reused(state)
             assert state.artifact is not None
             artifacts[stage.name] = state.artifact
             states.append(state)
@@ -113,50 +114,77 @@ class Engine:
         return states
 
     def _compute(self, stage: Stage, state: StageState, artifacts: Mapping[str, Artifact], stop: StopSignals) -> StageState:
-        """Run a stage under its lease, unless somebody else has published its output in the meantime."""
-        what = state.ingredients
-        assert what is not None
-        lease = Lease(self.store.stage_folder(stage.name) / f"{what.key[:SHORT]}.lease")
+        """Run a stage under its lease, unless another process has published its artifact meanwhile."""
+        cache_key = state.cache_key
+        assert cache_key is not None
+        lease = Lease(self.store.stage_folder(stage.name) / f"{cache_key.digest[:KEY_PREFIX_LENGTH]}.lease")
 
-        def on_wait(holder: Holder | None) -> None:
+        def on_wait(holder: LeaseHolder | None) -> None:
             stop.check()
-            self.observer.waits(stage.name, holder)
+            self.observer.stage_waiting(stage.name, holder)
 
-        lapsed = lease.acquire(on_wait)
+        stale_holder = lease.acquire(on_wait)
         with lease:
-            if lapsed is not None:
-                self.events.write("lease taken over", stage=stage.name, holder=str(lapsed))
-            self.store.sweep(stage.name, what.key)
-            again = self.planner.assess(stage, artifacts)
-            if again.artifact is not None:
-                self.observer.served(again)
-                return again
-            self.events.write("stage started", stage=stage.name, key=what.key, reasons=list(state.reasons))
-            self.observer.starts(state)
-            artifact = self._execute(stage, state, what, artifacts, stop)
-        done = StageState(stage.name, stage.title, "run", state.reasons, what, artifact, state.settings)
+            if stale_holder is not None:
+                self.events.write("lease taken over", stage=stage.name, holder=str(stale_holder))
+            self.store.remove_leftovers(stage.name, cache_key.digest)
+            current = self.planner.assess(stage, artifacts)
+            if current.artifact is not None:
+                self.observer.stage_reused(current)
+                return current
+            self.events.write("stage started", stage=stage.name, key=cache_key.digest, reasons=list(state.reasons))
+            self.observer.stage_started(state)
+            artifact = self._execute(stage, state, cache_key, artifacts, stop)
+        done = StageState(stage.name, stage.title, "run", state.reasons, cache_key, artifact, state.settings)
         self.events.write(
             "stage finished", stage=stage.name, seconds=artifact.manifest["seconds"], peak_bytes=artifact.manifest["peak_bytes"],
             results=artifact.manifest["results"],
         )  # fmt: skip
-        self.observer.finished(done)
+        self.observer.stage_finished(done)
         return done
 
     def _execute(
-        self, stage: Stage, state: StageState, what: Ingredients, artifacts: Mapping[str, Artifact], stop: StopSignals
+        self, stage: Stage, state: StageState, cache_key: CacheKey, artifacts: Mapping[str, Artifact], stop: StopSignals
     ) -> Artifact:
+        """Run a stage in a worker process and publish its output."""
         request, store = self.request, self.store
         files = self.planner.input_files(stage, artifacts)
         inputs = {need: artifacts[need].folder for need in stage.needs}
         inputs |= {name: request.sources[name] for name in stage.sources if name in request.sources}
-        checkpoint = store.checkpoint(stage.name, what.key)
+        checkpoint = store.checkpoint(stage.name, cache_key.digest)
         checkpoint.mkdir(parents=True, exist_ok=True)
         resumed = any(checkpoint.iterdir())
-        temporary = store.temporary(stage.name, what.key)
+        temporary = store.temporary(stage.name, cache_key.digest)
+        job = self._job(stage, temporary, inputs, checkpoint)
+        started = now()
+        try:
+            log = request.out / "logs" / f"{stage.name}-{cache_key.digest[:KEY_PREFIX_LENGTH]}.log"
+            log.parent.mkdir(exist_ok=True)
+            outcome = supervise(job, log, stop, lambda message: self._relay(stage.name, message))
+            manifest = self._manifest(stage, state, cache_key, outcome, started, resumed)
+            manifest["inputs"] = {
+                name: {"path": str(inputs[name]), "digest": cache_key.inputs[name], "files": dict(files[name])} for name in sorted(files)
+            }
+            artifact = store.publish(temporary, store.folder(stage.name, cache_key.digest), manifest)
+        except StageFailed as error:
+            raise StageFailed(f"{stage.title} failed: {error}; the traceback is in '{self._save_traceback(stage.name, error)}'.") from error
+        except InterruptedRun as error:
+            raise InterruptedRun(f"{stage.title}: {error}") from error
+        finally:
+            if temporary.exists():
+                remove_tree(temporary)
+            with suppress(OSError):
+                checkpoint.rmdir()  # succeeds only when empty
+        remove_tree(checkpoint)
+        return artifact
+
+    def _job(self, stage: Stage, out: Path, inputs: Mapping[str, Path], checkpoint: Path) -> Job:
+        """The worker's job: run `stage` on `inputs` and write into the folder `out`."""
+        request = self.request
         schema = type(request.profile)
-        job = Job(
+        return Job(
             stage=self.registry.references[stage.name],
-            out=str(temporary.resolve()),
+            out=str(out.resolve()),
             inputs={name: str(path.resolve()) for name, path in inputs.items()},
             schema=f"{schema.__module__}:{schema.__qualname__}",
             profile=request.profile.model_dump(mode="json"),
@@ -164,56 +192,35 @@ class Engine:
             threads=request.threads,
             device=request.device if stage.uses_device else "cpu",
             checkpoint=str(checkpoint.resolve()),
-            place=str(request.out),
+            output_folder=str(request.out),
             parent=os.getpid(),
         )
-        started = now()
-        try:
-            log = request.out / "logs" / f"{stage.name}-{what.key[:SHORT]}.log"
-            log.parent.mkdir(exist_ok=True)
-            outcome = supervise(job, log, stop, lambda message: self._relay(stage.name, message))
-            manifest = self._manifest(stage, state, what, outcome, started, resumed)
-            manifest["inputs"] = {
-                name: {"path": str(inputs[name]), "digest": what.inputs[name], "files": dict(files[name])} for name in sorted(files)
-            }
-            artifact = store.publish(temporary, store.folder(stage.name, what.key), manifest)
-        except StageFailed as error:
-            raise StageFailed(f"{stage.title} failed: {error}; the traceback is in '{self._save_error(stage.name, error)}'.") from error
-        except InterruptedRun as error:
-            raise InterruptedRun(f"{stage.title}: {error}") from error
-        finally:
-            if temporary.exists():
-                remove_tree(temporary)
-            with suppress(OSError):
-                checkpoint.rmdir()  # goes only when the stage left nothing in it
-        remove_tree(checkpoint)
-        return artifact
 
     def _relay(self, name: str, message: Mapping[str, Any]) -> None:
-        """Pass a worker's message to the observer and the log."""
+        """Pass a worker's message to the observer and the event log."""
         match message["kind"]:
             case "progress":
                 live = {k: v for k, v in message["live"].items() if v is not None}
                 self.observer.progress(name, message["done"], message["total"], message["text"], live)
             case "decision":
                 self.events.write("decision", stage=name, **{k: v for k, v in message.items() if k != "kind"})
-                self.observer.decided(name, message["what"], message["choice"], message["evidence"])
+                self.observer.decision(name, message["what"], message["choice"], message["evidence"])
             case "warning":
                 self.events.write("warning", stage=name, text=message["text"])
-                self.observer.warned(name, message["text"])
+                self.observer.warning(name, message["text"])
             case "stop sent":
                 self.events.write("stop sent", stage=name)
-                self.observer.stopping(name)
+                self.observer.stage_stopping(name)
 
     def _manifest(
-        self, stage: Stage, state: StageState, what: Ingredients, outcome: Outcome, started: str, resumed: bool
+        self, stage: Stage, state: StageState, cache_key: CacheKey, outcome: Outcome, started: str, resumed: bool
     ) -> dict[str, Any]:
         return {
             "stage": stage.name,
             "title": stage.title,
             "version": stage.version,
-            "key": what.key,
-            "key_format": HASH_FORMAT,
+            "key": cache_key.digest,
+            "key_format": KEY_FORMAT,
             "started": started,
             "finished": now(),
             "resumed": resumed,
@@ -221,18 +228,19 @@ class Engine:
             "parts": {name: round(seconds, 3) for name, seconds in outcome.parts.items()},
             "peak_bytes": outcome.peak_bytes,
             "results": outcome.results,
+            "summary": summarise(stage.summary, outcome.results),
             "decisions": outcome.decisions,
             "warnings": outcome.warnings,
             "reasons": list(state.reasons),
             "settings": dict(state.settings),
-            "seed": what.seed,
-            "backend": what.backend,
+            "seed": cache_key.seed,
+            "backend": cache_key.backend,
             "threads": self.request.threads,
-            "host": host_facts(),
+            "host": host_info(),
             "versions": versions(),
         }
 
-    def _save_error(self, name: str, error: StageFailed) -> Path:
+    def _save_traceback(self, name: str, error: StageFailed) -> Path:
         folder = self.request.out / "errors"
         folder.mkdir(exist_ok=True)
         path = folder / f"{now().replace(':', '-')[:19]}-{name}.txt"
@@ -240,6 +248,6 @@ class Engine:
         return path
 
 
-def artifacts_of(states: Iterable[StageState]) -> dict[str, Artifact]:
-    """{stage: artifact} of the states that have one."""
+def artifacts_by_stage(states: Iterable[StageState]) -> dict[str, Artifact]:
+    """{stage: artifact} of the states with an artifact."""
     return {state.name: state.artifact for state in states if state.artifact is not None}

@@ -1,4 +1,4 @@
-"""Writing so that a crash at any instant leaves the old content or the new, never half of one."""
+"""Atomic file writes, and error messages for full or read-only disks."""
 
 from __future__ import annotations
 
@@ -6,19 +6,20 @@ import errno
 import os
 import shutil
 import uuid
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from gsbake.errors import BadInputError, UsageError
 
-#: errno values that mean the disk (or the quota) is full.
-FULL = frozenset({errno.ENOSPC, errno.EDQUOT})
-#: errno values that mean the place cannot be written at all.
-LOCKED = frozenset({errno.EROFS, errno.EACCES, errno.EPERM})
+#: errno values of a full disk or quota.
+DISK_FULL = frozenset({errno.ENOSPC, errno.EDQUOT})
+#: errno values of a location without write access.
+NOT_WRITABLE = frozenset({errno.EROFS, errno.EACCES, errno.EPERM})
 
 
 def sync(path: Path) -> None:
-    """Flush a file or folder to the disk; file systems that cannot flush a folder are let off."""
+    """Flush a file or folder to disk; ignored on file systems that cannot flush folders."""
     handle = os.open(path, os.O_RDONLY)
     try:
         with suppress(OSError):
@@ -35,13 +36,12 @@ def sync_tree(folder: Path) -> None:
         sync(Path(root))
 
 
-def write_atomic(path: Path, text: str, *, durable: bool = False) -> None:
-    """Replace `path` by `text` in one step; `durable` also waits for the disk."""
+@contextmanager
+def _atomic_replacement(path: Path) -> Iterator[Path]:
+    """A temporary path beside `path` that replaces it when the block succeeds and is deleted when it fails."""
     temporary = path.with_name(f".{path.name}.{os.getpid()}.{uuid.uuid4().hex[:8]}.tmp")
     try:
-        temporary.write_text(text, encoding="utf-8")
-        if durable:
-            sync(temporary)
+        yield temporary
         temporary.replace(path)
     except BaseException:
         with suppress(OSError):
@@ -49,64 +49,66 @@ def write_atomic(path: Path, text: str, *, durable: bool = False) -> None:
         raise
 
 
+def write_atomic(path: Path, text: str, *, durable: bool = False) -> None:
+    """Replace the content of `path` atomically; `durable` also flushes it to disk."""
+    with _atomic_replacement(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+        if durable:
+            sync(temporary)
+
+
 def copy_atomic(source: Path, target: Path) -> None:
-    """Replace `target` by a copy of `source` in one step."""
-    temporary = target.with_name(f".{target.name}.{os.getpid()}.{uuid.uuid4().hex[:8]}.tmp")
-    try:
+    """Replace `target` atomically by a copy of `source`."""
+    with _atomic_replacement(target) as temporary:
         shutil.copyfile(source, temporary)
         sync(temporary)
-        temporary.replace(target)
-    except BaseException:
-        with suppress(OSError):
-            temporary.unlink()
-        raise
 
 
 def remove_tree(folder: Path) -> None:
-    """Delete a folder as far as that is possible; a left-over is swept by the next run."""
+    """Delete a folder; errors are ignored, and the next run removes what is left."""
     shutil.rmtree(folder, ignore_errors=True)
 
 
-def open_output(out: Path) -> None:
-    """Make the output folder if need be, and try whether it can be written; BadInputError or UsageError when it cannot."""
+def ensure_output_folder(out: Path) -> None:
+    """Create the output folder and check that it is writable. Raises BadInputError or UsageError otherwise."""
     try:
         out.mkdir(parents=True, exist_ok=True)
         probe = out / f".probe-{uuid.uuid4().hex[:8]}"
         probe.touch()
         probe.unlink()
     except (FileExistsError, NotADirectoryError) as error:
-        raise UsageError(f"'{out}' cannot be the output folder: a file of that name is in the way.") from error
+        raise UsageError(f"'{out}' cannot be the output folder: a file of that name exists; choose another with --out.") from error
     except OSError as error:
         raise disk_error(error, out) or BadInputError(
-            f"The output folder '{out}' cannot be made ({error.strerror}); choose another with --out."
+            f"The output folder '{out}' cannot be created ({error.strerror}); choose another with --out."
         ) from error
 
 
-def disk_error(error: BaseException, place: Path) -> BadInputError | None:
-    """The sentence for a full or unwritable disk, or None when `error` is neither.
+def disk_error(error: BaseException, folder: Path) -> BadInputError | None:
+    """The user error for a full disk or an unwritable output `folder`; None for any other `error`.
 
-    A native library may report a full disk in words of its own, so free space is looked at as well.
+    Native libraries report a full disk in their own words, so free space is checked too.
     """
     number = error.errno if isinstance(error, OSError) else None
-    where = place if place.exists() else place.parent
-    if number in FULL:
-        return _disk_full(place)
-    if number in LOCKED and isinstance(error, OSError):
-        named = Path(os.fsdecode(error.filename)) if isinstance(error.filename, str | bytes) else place
-        if _within(named, place) or number == errno.EROFS:
-            return BadInputError(f"The output folder '{place}' cannot be written ({error.strerror}); choose another with --out.")
+    existing = folder if folder.exists() else folder.parent
+    if number in DISK_FULL:
+        return _disk_full(folder)
+    if number in NOT_WRITABLE and isinstance(error, OSError):
+        failed = Path(os.fsdecode(error.filename)) if isinstance(error.filename, str | bytes) else folder
+        if _related(failed, folder) or number == errno.EROFS:
+            return BadInputError(f"The output folder '{folder}' cannot be written ({error.strerror}); choose another with --out.")
     with suppress(OSError):
-        usage = shutil.disk_usage(where)
+        usage = shutil.disk_usage(existing)
         if usage.total and usage.free < 1 << 20:
-            return _disk_full(place)
+            return _disk_full(folder)
     return None
 
 
-def _disk_full(place: Path) -> BadInputError:
-    return BadInputError(f"The disk that holds '{place}' is full; free some space and run the same command, which goes on from here.")
+def _disk_full(folder: Path) -> BadInputError:
+    return BadInputError(f"The disk of '{folder}' is full; free some space and run the same command, which resumes the run.")
 
 
-def _within(path: Path, place: Path) -> bool:
-    """Whether `path` is `place`, lies in it, or is one of the folders it would be made in."""
-    path, place = Path(os.path.abspath(path)), Path(os.path.abspath(place))
-    return path == place or place in path.parents or path in place.parents
+def _related(path: Path, folder: Path) -> bool:
+    """Whether `path` is `folder`, is inside it, or is one of its parents."""
+    path, folder = Path(os.path.abspath(path)), Path(os.path.abspath(folder))
+    return path == folder or folder in path.parents or path in folder.parents

@@ -1,9 +1,9 @@
-"""The key of a stage's output: a digest of everything that may change it, and of nothing else.
+"""Cache key of a stage's artifact: a digest of everything that can change it, and of nothing else.
 
 Key = BLAKE3 of canonical JSON {format, stage, version, declared settings, content digests of the inputs, backend class, seed}.
-Inputs enter by content, not by key: a stage that re-runs and writes the same bytes spares everything after it. Threads, verbosity
-and the device's index are not in it. A field at its schema default is left out, so that adding a field changes no old key; the
-manifest keeps all values, and a lookup compares them, so that a *changed* default is noticed too.
+Inputs enter by content, not by key: when a stage runs again and writes the same bytes, later stages stay cached (early cut-off). Threads,
+verbosity and the device index are not part of the key. Fields at their schema default are omitted, so that a new field changes no existing
+key; the manifest stores all values and a look-up compares them, so that a *changed* default is detected too.
 """
 
 from __future__ import annotations
@@ -17,21 +17,21 @@ from blake3 import blake3
 
 from gsbake.pipeline.stage import Stage
 
-#: Raised when the way keys are computed changes; every old artifact then counts as unknown.
-HASH_FORMAT = 1
+#: Version of the key's definition. A new version invalidates all artifacts.
+KEY_FORMAT = 1
 
-#: Characters of the key that name an artifact folder.
-SHORT = 16
+#: Hexadecimal digits of the key in an artifact folder's name.
+KEY_PREFIX_LENGTH = 16
 
 
-def canonical(value: Any) -> str:
-    """JSON with sorted keys and no spaces; NaN is refused."""
+def canonical_json(value: Any) -> str:
+    """JSON with sorted keys and without spaces. Raises ValueError for NaN and infinity."""
     return json.dumps(value, sort_keys=True, separators=(",", ":"), ensure_ascii=True, allow_nan=False)
 
 
 @dataclass(frozen=True)
-class Ingredients:
-    """What a key is made of; `settings` holds every declared field, `defaults` what the schema says of each."""
+class CacheKey:
+    """Components of a key; `settings` holds the value of every declared field, `defaults` its schema default."""
 
     stage: str
     version: int
@@ -42,11 +42,11 @@ class Ingredients:
     defaults: Mapping[str, Any] = field(default_factory=dict)
 
     @staticmethod
-    def of(
+    def for_stage(
         stage: Stage, settings: Mapping[str, Any], defaults: Mapping[str, Any], inputs: Mapping[str, str], *, device: str, seed: int
-    ) -> Ingredients:
-        """The ingredients of `stage` with the declared `settings` and the content digests of its `inputs`."""
-        return Ingredients(
+    ) -> CacheKey:
+        """The key of `stage` with its declared `settings` and the content digests of its `inputs`."""
+        return CacheKey(
             stage=stage.name,
             version=stage.version,
             settings=dict(settings),
@@ -57,18 +57,18 @@ class Ingredients:
         )
 
     @property
-    def key(self) -> str:
-        """The key, 64 hexadecimal digits."""
-        chosen = {k: v for k, v in self.settings.items() if k not in self.defaults or self.defaults[k] != v}
+    def digest(self) -> str:
+        """The key as 64 hexadecimal digits."""
+        non_default = {k: v for k, v in self.settings.items() if k not in self.defaults or self.defaults[k] != v}
         body: dict[str, Any] = {
-            "format": HASH_FORMAT,
+            "format": KEY_FORMAT,
             "stage": self.stage,
             "version": self.version,
-            "settings": chosen,
+            "settings": non_default,
             "inputs": dict(self.inputs),
         }
         if self.backend is not None:
             body["backend"] = self.backend
         if self.seed is not None:
             body["seed"] = self.seed
-        return blake3(canonical(body).encode()).hexdigest()
+        return blake3(canonical_json(body).encode()).hexdigest()

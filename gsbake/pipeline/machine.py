@@ -1,4 +1,4 @@
-"""The machine a run stands on: cores, memory, GPU, versions — found without importing anything heavy."""
+"""Properties of the machine: cores, memory, GPU and library versions, found without importing heavy libraries."""
 
 from __future__ import annotations
 
@@ -20,21 +20,21 @@ import psutil
 
 from gsbake.errors import UsageError
 
-#: The libraries whose versions are kept in manifests and shown by `doctor`.
+#: Libraries whose versions are stored in manifests and shown by `doctor`.
 LIBRARIES = (
     "gsbake", "numpy", "scipy", "numba", "torch", "pycolmap", "opencv-contrib-python-headless", "OpenImageIO", "scikit-image",
     "trimesh", "pymeshlab", "xatlas", "embreex", "safetensors", "pydantic", "blake3",
 )  # fmt: skip
 
-#: Environment variables that size the thread pools of the libraries stages use; all are read when a library loads.
-_POOLS = (
+#: Environment variables that set the sizes of the libraries' thread pools; they are read when a library loads.
+_THREAD_POOL_VARIABLES = (
     "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS", "NUMBA_NUM_THREADS",
     "OPENCV_FOR_THREADS_NUM", "OPENIMAGEIO_THREADS",
 )  # fmt: skip
 
 
 def default_threads() -> int:
-    """Physical cores this process may use: affinity and container quota count too."""
+    """Number of physical cores that this process may use, limited by CPU affinity and container quota."""
     limits = [psutil.cpu_count(logical=False) or psutil.cpu_count() or 1]
     if hasattr(os, "sched_getaffinity"):
         limits.append(len(os.sched_getaffinity(0)))
@@ -46,16 +46,16 @@ def default_threads() -> int:
 
 
 def thread_environment(threads: int) -> dict[str, str]:
-    """The environment in which every library's thread pool has `threads` threads.
+    """Environment variables that set every library's thread pool to `threads` threads.
 
-    Idle OpenMP threads sleep instead of spinning, and Numba takes OpenMP before it looks at a TBB that may be too old.
+    Idle OpenMP threads sleep instead of spinning. Numba tries OpenMP first, because an installed TBB may be too old.
     """
-    sizes = dict.fromkeys(_POOLS, str(threads))
+    sizes = dict.fromkeys(_THREAD_POOL_VARIABLES, str(threads))
     return sizes | {"OMP_WAIT_POLICY": "PASSIVE", "NUMBA_THREADING_LAYER_PRIORITY": "omp workqueue tbb"}
 
 
 def torch_cuda_build() -> str | None:
-    """CUDA version the installed torch was built for, read from its version file; None for a CPU build or no torch."""
+    """CUDA version that the installed torch was built for, read from its version file; None for a CPU build or without torch."""
     with suppress(ImportError, OSError, ValueError):
         spec = importlib.util.find_spec("torch")
         if spec is not None and spec.origin is not None:
@@ -66,7 +66,7 @@ def torch_cuda_build() -> str | None:
 
 
 def cuda_devices() -> int:
-    """GPUs the NVIDIA driver offers."""
+    """Number of GPUs that the NVIDIA driver reports."""
     for name in ("libcuda.so.1", "libcuda.so"):
         with suppress(OSError):
             driver = ctypes.CDLL(name)
@@ -77,35 +77,35 @@ def cuda_devices() -> int:
     return 0
 
 
-def cuda_lacks() -> str | None:
-    """What keeps the kernels from running on a GPU here, as half a sentence; None when nothing does. Imports neither torch nor Triton."""
+def missing_cuda_requirement() -> str | None:
+    """Why the CUDA kernels cannot run on this machine; None when they can. Imports neither torch nor Triton."""
     if torch_cuda_build() is None:
         return "torch is built for the CPU only"
     if not cuda_devices():
-        return "the NVIDIA driver offers no GPU"
+        return "the NVIDIA driver reports no GPU"
     if importlib.util.find_spec("triton") is None:
         return "the package triton is not installed"
     return None
 
 
-def resolve_device(asked: str) -> str:
-    """The device, "cpu" or "cuda", for auto|cpu|cuda. UsageError when CUDA is asked for in vain.
+def resolve_device(requested: str) -> str:
+    """The device, "cpu" or "cuda", for auto|cpu|cuda. Raises UsageError when CUDA is requested but not available.
 
-    auto is the CPU: the CUDA kernels have not been measured on a GPU yet (docs/cuda.md), so they are only taken when asked for.
+    auto is the CPU: the CUDA kernels have not been measured on a GPU yet (docs/cuda.md), so they must be requested.
     """
-    if asked not in ("auto", "cpu", "cuda"):
-        raise UsageError(f"--device is auto, cpu or cuda, not '{asked}'.")
-    if asked != "cuda":
+    if requested not in ("auto", "cpu", "cuda"):
+        raise UsageError(f"--device is auto, cpu or cuda, not '{requested}'.")
+    if requested != "cuda":
         return "cpu"
-    lacks = cuda_lacks()
-    if lacks:
-        raise UsageError(f"--device cuda cannot be had: {lacks}; leave the option out or give --device cpu.")
+    missing = missing_cuda_requirement()
+    if missing:
+        raise UsageError(f"--device cuda is not available: {missing}; omit the option or use --device cpu.")
     return "cuda"
 
 
 @cache
 def versions(names: tuple[str, ...] = LIBRARIES) -> dict[str, str]:
-    """{library: version} of those installed, and of Python."""
+    """{library: version} of the installed ones of `names`, and of Python."""
     out = {"python": platform.python_version()}
     for name in names:
         with suppress(metadata.PackageNotFoundError):
@@ -114,8 +114,8 @@ def versions(names: tuple[str, ...] = LIBRARIES) -> dict[str, str]:
 
 
 @cache
-def host_facts() -> Mapping[str, Any]:
-    """What a manifest says of the machine."""
+def host_info() -> Mapping[str, Any]:
+    """Properties of the machine for manifests."""
     return {
         "name": socket.gethostname(),
         "system": f"{platform.system()} {platform.release()} {platform.machine()}",
@@ -126,7 +126,7 @@ def host_facts() -> Mapping[str, Any]:
 
 
 def cpu_name() -> str:
-    """Model of the processor."""
+    """Model name of the processor."""
     with suppress(OSError):
         for line in Path("/proc/cpuinfo").read_text().splitlines():
             if line.startswith("model name"):
@@ -135,7 +135,7 @@ def cpu_name() -> str:
 
 
 def peak_memory() -> int:
-    """Largest resident memory of this process so far, in bytes (not that of the process it was forked from, as getrusage would say)."""
+    """Peak resident memory of this process in bytes, without that of the process it was forked from (getrusage includes it)."""
     with suppress(OSError):
         found = re.search(r"^VmHWM:\s*(\d+) kB", Path("/proc/self/status").read_text(), re.MULTILINE)
         if found:

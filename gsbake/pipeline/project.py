@@ -1,4 +1,4 @@
-"""What an output folder remembers of its run, so that later commands need only `--out`: OUT/project.json."""
+"""Inputs and options of a run, stored in OUT/project.json, so that later commands need only `--out`."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ PROJECT = "project.json"
 
 @dataclass(frozen=True)
 class Project:
-    """The person's paths and choices; paths are absolute. `published` holds {file in OUT: digest} of the results put there."""
+    """The user's paths (absolute) and options. `published` holds {file in OUT: content digest} of the published results."""
 
     photos: str | None = None
     masks: str | None = None
@@ -26,7 +26,7 @@ class Project:
 
     @staticmethod
     def load(out: Path) -> Project | None:
-        """The project of an output folder; None when there is none yet, BadInputError when it cannot be read."""
+        """The project of an output folder; None when there is none. Raises BadInputError when it cannot be read."""
         path = out / PROJECT
         try:
             body = json.loads(path.read_text(encoding="utf-8"))
@@ -37,13 +37,13 @@ class Project:
             raise BadInputError(f"'{path}' cannot be read ({error}); delete it and give the photos again.") from error
 
     def save(self, out: Path) -> None:
-        """Write it, unless the file already says the same."""
+        """Write the file if its content changes."""
         text = json.dumps(asdict(self), indent=1, ensure_ascii=False)
         path = out / PROJECT
         if not path.exists() or path.read_text(encoding="utf-8") != text:
             write_atomic(path, text)
 
     def sources(self) -> dict[str, Path]:
-        """{"photos" | "masks" | "poses": path} of those given."""
+        """{"photos" | "masks" | "poses": path} of the paths given."""
         given = {"photos": self.photos, "masks": self.masks, "poses": self.poses}
         return {name: Path(path) for name, path in given.items() if path is not None}

@@ -1,6 +1,6 @@
-"""The ordered stages of a pipeline, loaded by reference ("module:attribute") only when they are needed.
+"""Registry of the pipeline's stages in running order, loaded on demand from "module:attribute" references.
 
-A reference, not an object, is what crosses to the worker process; it also keeps `--help` from importing any stage.
+References, not objects, are sent to worker processes; they also keep `--help` from importing stages.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from gsbake.pipeline.stage import Stage
 
 
 def load_stage(reference: str) -> Stage:
-    """The stage that "module:attribute" names."""
+    """Import the stage at "module:attribute". Raises TypeError when it is not a Stage."""
     module, _, attribute = reference.partition(":")
     stage = getattr(importlib.import_module(module), attribute)
     if not isinstance(stage, Stage):
@@ -33,13 +33,13 @@ class Registry:
         return tuple(self.references)
 
     def load(self, name: str) -> Stage:
-        """The stage called `name`; UsageError when there is none."""
+        """The stage `name`. Raises UsageError when there is none."""
         if name not in self.references:
             raise UsageError(f"There is no stage '{name}'; the stages are {', '.join(self.names)}.")
         return load_stage(self.references[name])
 
     def up_to(self, target: str | None = None) -> list[Stage]:
-        """`target` and every stage it needs, directly or not, in running order; all stages without a target."""
+        """`target` and its direct and indirect dependencies in running order; all stages without a target."""
         if target is None:
             return [self.load(name) for name in self.names]
         wanted = {target}

@@ -1,4 +1,4 @@
-"""A person's own file in place of a stage's output: registered as an artifact, used by every later stage until it is undone."""
+"""Replacement of a stage's output by the user's files, stored as an artifact that later stages read until it is undone."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ from gsbake.pipeline.digest import list_files, tree_digest
 from gsbake.pipeline.events import now
 from gsbake.pipeline.files import remove_tree, write_atomic
 from gsbake.pipeline.lease import Lease
-from gsbake.pipeline.store import MANIFEST, REPLACED, Artifact, Store
+from gsbake.pipeline.store import MANIFEST, REPLACEMENT, Artifact, Store
 
-_LABEL = "by-hand"
+_PREFIX = "by-hand"
 
 
 def replace_output(store: Store, stage: str, files: Mapping[str, Path], base: Artifact | None) -> Artifact:
-    """Put `files` ({name in the artifact: the person's file}) in place of the stage's output.
+    """Replace a stage's output by `files` ({name in the artifact: the user's file}).
 
-    Files of `base` (the output so far) that are not replaced are kept. The given files are copied, so they may be
-    edited or deleted afterwards.
+    Files of `base` (the current output) that are not replaced are kept. The user's files are copied, so they may be edited or deleted
+    afterwards.
     """
     with _lease(store, stage):
-        store.sweep(stage, _LABEL)
-        temporary = store.temporary(stage, _LABEL)
+        store.remove_leftovers(stage, _PREFIX)
+        temporary = store.temporary(stage, _PREFIX)
         try:
             kept = {name: base.folder / name for name in base.files if name not in files} if base is not None else {}
             for name, path in {**kept, **files}.items():
@@ -33,7 +33,7 @@ def replace_output(store: Store, stage: str, files: Mapping[str, Path], base: Ar
                 target.parent.mkdir(parents=True, exist_ok=True)
                 shutil.copyfile(path, target)
             digest = tree_digest(store.digests.files(temporary, list_files(temporary)))
-            final = store.stage_folder(stage) / f"{_LABEL}-{digest[:8]}"
+            final = store.stage_folder(stage) / f"{_PREFIX}-{digest[:8]}"
             manifest = {
                 "stage": stage,
                 "replaced": {name: str(path) for name, path in files.items()},
@@ -50,34 +50,34 @@ def replace_output(store: Store, stage: str, files: Mapping[str, Path], base: Ar
         finally:
             if temporary.exists():
                 remove_tree(temporary)
-        write_atomic(store.stage_folder(stage) / REPLACED, json.dumps({"folder": final.name}), durable=True)
-        _forget_others(store, stage, final.name)
+        write_atomic(store.stage_folder(stage) / REPLACEMENT, json.dumps({"folder": final.name}), durable=True)
+        _remove_other_replacements(store, stage, final.name)
     store.digests.save()
     return artifact
 
 
 def undo_replacement(store: Store, stage: str) -> None:
-    """Go back to the stage's own output; UsageError when nothing was replaced."""
-    note = store.stage_folder(stage) / REPLACED
-    if not note.exists():
-        raise UsageError(f"The output of stage '{stage}' in '{store.out}' was not replaced, so there is nothing to undo.")
+    """Restore the stage's own output. Raises UsageError when it was not replaced."""
+    record = store.stage_folder(stage) / REPLACEMENT
+    if not record.exists():
+        raise UsageError(f"The output of stage '{stage}' in '{store.out}' was not replaced; there is nothing to undo.")
     with _lease(store, stage):
-        note.unlink(missing_ok=True)
-        _forget_others(store, stage, "")
+        record.unlink(missing_ok=True)
+        _remove_other_replacements(store, stage, "")
 
 
 def folder_files(folder: Path) -> dict[str, Path]:
-    """{relative name: path} of a folder that replaces a whole output."""
+    """{relative name: path} of a folder that replaces the whole output."""
     return {name: folder / name for name in list_files(folder) if name != MANIFEST}
 
 
 def _lease(store: Store, stage: str) -> Lease:
-    lease = Lease(store.stage_folder(stage) / f"{_LABEL}.lease")
+    lease = Lease(store.stage_folder(stage) / f"{_PREFIX}.lease")
     lease.acquire()
     return lease
 
 
-def _forget_others(store: Store, stage: str, keep: str) -> None:
-    for entry in store.stage_folder(stage).glob(f"{_LABEL}-*"):
+def _remove_other_replacements(store: Store, stage: str, keep: str) -> None:
+    for entry in store.stage_folder(stage).glob(f"{_PREFIX}-*"):
         if entry.is_dir() and entry.name != keep:
             remove_tree(entry)

@@ -1,6 +1,6 @@
-"""The settings a stage declared, and a guard around all others.
+"""Access to the settings that a stage declares.
 
-A stage that read a field it did not declare would be served from the cache although that field had changed; so reading one raises.
+Reading an undeclared field raises: the field is not part of the cache key, so a change of it would go unnoticed.
 """
 
 from __future__ import annotations
@@ -13,11 +13,11 @@ from pydantic import BaseModel
 
 
 class UndeclaredSetting(Exception):
-    """A stage read a profile field that its declaration does not list (not an AttributeError, so getattr's default cannot hide it)."""
+    """A stage read a profile field that it does not declare. Not an AttributeError, so that getattr's default cannot hide it."""
 
 
 def flatten(profile: BaseModel) -> dict[str, Any]:
-    """{"section.key": value as JSON} of every field in every section of a profile."""
+    """{"section.key": JSON value} of all fields of a profile."""
     out: dict[str, Any] = {}
     for name, section in profile:
         if isinstance(section, BaseModel):
@@ -26,29 +26,29 @@ def flatten(profile: BaseModel) -> dict[str, Any]:
 
 
 def defaults(profile: type[BaseModel]) -> dict[str, Any]:
-    """{"section.key": the schema's default as JSON}."""
+    """{"section.key": JSON value} of the schema's defaults."""
     return flatten(profile())
 
 
-def declared(patterns: Iterable[str], names: Iterable[str]) -> list[str]:
-    """The names that the patterns ("train.iterations", "train.*") select, sorted; a pattern that selects none is an error."""
+def expand_patterns(patterns: Iterable[str], names: Iterable[str]) -> list[str]:
+    """Sorted names that match the patterns ("train.iterations", "train.*"). Raises UndeclaredSetting for a pattern without match."""
     names = list(names)
-    chosen: set[str] = set()
+    selected: set[str] = set()
     for pattern in patterns:
-        hits = fnmatch.filter(names, pattern)
-        if not hits:
+        matches = fnmatch.filter(names, pattern)
+        if not matches:
             raise UndeclaredSetting(f"the declared setting '{pattern}' matches no field of the profile")
-        chosen.update(hits)
-    return sorted(chosen)
+        selected.update(matches)
+    return sorted(selected)
 
 
 class SettingsView:
-    """`view.train.iterations`: the declared fields of a profile, by section; any other raises UndeclaredSetting."""
+    """The declared fields of a profile as `view.section.key`; any other field raises UndeclaredSetting."""
 
     def __init__(self, profile: BaseModel, patterns: Iterable[str], stage: str = "this stage") -> None:
         self._profile = profile
         self._stage = stage
-        self._names = frozenset(declared(patterns, flatten(profile)))
+        self._names = frozenset(expand_patterns(patterns, flatten(profile)))
 
     def __getattr__(self, section: str) -> Any:
         if section.startswith("_"):
@@ -57,7 +57,7 @@ class SettingsView:
         if not isinstance(model, BaseModel):
             raise UndeclaredSetting(f"stage '{self._stage}' reads section '{section}', which the profile does not have")
         if all(f"{section}.{key}" in self._names for key in type(model).model_fields):
-            return model  # all of it is declared: the section itself, with its type
+            return model  # all fields are declared: return the typed section
         return SectionView(model, section, self._names, self._stage)
 
 

@@ -1,7 +1,7 @@
-"""What a stage is: its declaration, and the context it runs in.
+"""Declaration of a stage, and the context that it runs in.
 
-A stage is a plain function from files to files. It reads only the inputs and settings it declares, writes into `ctx.out`
-(a temporary folder that the engine publishes atomically), and returns its figures for the manifest.
+A stage is a function from files to files. It reads only the inputs and settings it declares, writes into `ctx.out` (a temporary folder
+that the engine publishes atomically), and returns its results for the manifest.
 """
 
 from __future__ import annotations
@@ -15,23 +15,23 @@ from gsbake.monitor import Monitor
 
 
 class Context(Monitor, Protocol):
-    """What the engine hands to a running stage; also the monitor of its step."""
+    """What the engine passes to a running stage; also the monitor of its step."""
 
     out: Path  # empty folder to fill; published when the stage returns
     inputs: Mapping[str, Path]  # needed stage -> its artifact folder; "photos"/"masks"/"poses" -> the user's paths, when given
-    settings: Any  # ctx.settings.train.iterations; reading an undeclared field raises
+    settings: Any  # ctx.settings.train.iterations; reading an undeclared field raises UndeclaredSetting
     seed: int
     threads: int
     device: str  # "cpu" or "cuda"
-    checkpoint: Path  # folder that survives an interruption of this stage and vanishes when it is published
+    checkpoint: Path  # folder that survives an interruption of this stage; deleted when the artifact is published
 
 
 @dataclass(frozen=True)
 class Stage:
     """Declaration of a stage.
 
-    `needs` names the stages whose folders it reads, `sources` which of the user's paths ("photos", "masks", "poses") it reads,
-    `settings` the profile fields ("train.iterations" or "train.*"). `run` returns JSON-able results for the manifest.
+    `needs` names the stages whose artifacts it reads, `sources` which of the user's paths ("photos", "masks", "poses") it reads,
+    `settings` the profile fields ("train.iterations" or "train.*"). `run` returns JSON-serialisable results for the manifest.
     """
 
     name: str
@@ -41,5 +41,6 @@ class Stage:
     needs: tuple[str, ...] = ()
     sources: tuple[str, ...] = ()
     settings: tuple[str, ...] = ()
-    uses_device: bool = False  # the backend class (cpu/cuda) is part of the key
-    seeded: bool = False  # the seed is part of the key
+    summary: str = ""  # what came out in a few words, with results in braces: "{photos} photos, {masks} masks"
+    uses_device: bool = False  # the backend (cpu or cuda) is part of the cache key
+    seeded: bool = False  # the seed is part of the cache key

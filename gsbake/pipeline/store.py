@@ -1,8 +1,8 @@
-"""Where artifacts lie and when they count: OUT/stages/<stage>/<key>/ with a manifest that is written last.
+"""Artifact store: OUT/stages/<stage>/<key>/, each with a manifest that is written last.
 
-A stage fills a temporary folder beside the final one (same file system); it is flushed to disk and renamed in one step. So a
-folder with the right name is whole, whatever was killed when. Its files' digests stand in the manifest and are compared at every
-look-up: a file that was edited or damaged afterwards makes the artifact count as missing.
+A stage fills a temporary folder beside the final one (same file system), which is flushed to disk and renamed atomically. So a folder with
+a final name is complete even after a crash. The manifest lists the digests of its files; they are checked at every look-up, and a
+modified or damaged file invalidates the artifact.
 """
 
 from __future__ import annotations
@@ -20,15 +20,15 @@ from blake3 import blake3
 
 from gsbake.pipeline.digest import DigestCache, list_files, tree_digest
 from gsbake.pipeline.files import remove_tree, sync, sync_tree, write_atomic
-from gsbake.pipeline.key import SHORT, Ingredients
+from gsbake.pipeline.key import KEY_PREFIX_LENGTH, CacheKey
 
 MANIFEST = "manifest.json"
-REPLACED = "replaced.json"
+REPLACEMENT = "replaced.json"
 
 
 @dataclass(frozen=True)
 class Artifact:
-    """A published stage folder: its files' digests, their common digest, and the manifest."""
+    """A published artifact folder: {file: digest} and the manifest; `by_hand` when it holds the user's files."""
 
     folder: Path
     files: Mapping[str, str]
@@ -37,13 +37,13 @@ class Artifact:
 
     @property
     def digest(self) -> str:
-        """Content digest of all files, the manifest left out."""
+        """Content digest of all files except the manifest."""
         return tree_digest(self.files)
 
 
 @dataclass(frozen=True)
 class Lookup:
-    """What the store holds for a key: a whole artifact, or why there is none."""
+    """Result of a look-up: a valid artifact, or what is wrong with the stored one."""
 
     artifact: Artifact | None = None
     faults: tuple[str, ...] = field(default=())
@@ -57,28 +57,28 @@ class Store:
         self.digests = DigestCache(out / "digests.json")
 
     def stage_folder(self, stage: str) -> Path:
-        """Folder of all artifacts of a stage."""
+        """Folder with all artifacts of a stage."""
         return self.out / "stages" / stage
 
     def folder(self, stage: str, key: str) -> Path:
-        """Final folder of the artifact with this key."""
-        return self.stage_folder(stage) / key[:SHORT]
+        """Final folder of the artifact of a key."""
+        return self.stage_folder(stage) / key[:KEY_PREFIX_LENGTH]
 
     def checkpoint(self, stage: str, key: str) -> Path:
         """Folder that survives an interruption of the stage."""
-        return self.stage_folder(stage) / f"{key[:SHORT]}.checkpoint"
+        return self.stage_folder(stage) / f"{key[:KEY_PREFIX_LENGTH]}.checkpoint"
 
-    def look_up(self, what: Ingredients) -> Lookup:
-        """The artifact for these ingredients, or what keeps the stored one from counting."""
-        folder = self.folder(what.stage, what.key)
+    def look_up(self, cache_key: CacheKey) -> Lookup:
+        """The artifact of a key, or what is wrong with the stored one."""
+        folder = self.folder(cache_key.stage, cache_key.digest)
         manifest = read_manifest(folder)
         if manifest is None:
             return Lookup()
         faults = []
-        if manifest.get("key") != what.key:
-            faults.append("another key shares its folder name")
+        if manifest.get("key") != cache_key.digest:
+            faults.append("its folder holds the artifact of another key")
         recorded = manifest.get("settings", {})
-        for name, value in what.settings.items():
+        for name, value in cache_key.settings.items():
             if name in recorded and recorded[name] != value:
                 faults.append(f"{name}: {recorded[name]} → {value} (the schema's default changed)")
         if not faults:
@@ -88,35 +88,35 @@ class Store:
         return Lookup(self._artifact(folder, manifest))
 
     def replacement(self, stage: str) -> Lookup | None:
-        """The output that a person put in place of this stage's own, if any."""
-        note = self.stage_folder(stage) / REPLACED
+        """The user's replacement of this stage's output; None when there is none."""
+        record = self.stage_folder(stage) / REPLACEMENT
         try:
-            folder = self.stage_folder(stage) / str(json.loads(note.read_text())["folder"])
+            folder = self.stage_folder(stage) / str(json.loads(record.read_text())["folder"])
         except (OSError, ValueError, KeyError):
             return None
         manifest = read_manifest(folder)
         if manifest is None:
-            return Lookup(None, ("the files put in place by hand are gone",))
+            return Lookup(None, ("its files are missing",))
         faults = self._file_faults(folder, manifest)
         return Lookup(None, tuple(faults)) if faults else Lookup(self._artifact(folder, manifest))
 
     def manifests(self, stage: str) -> list[tuple[Path, dict[str, Any]]]:
-        """All artifacts of the stage that it computed itself, the newest first."""
+        """(folder, manifest) of all artifacts that the stage computed, newest first."""
         found = []
         with suppress(FileNotFoundError):
             for folder in self.stage_folder(stage).iterdir():
-                if len(folder.name) == SHORT and (manifest := read_manifest(folder)) is not None:
+                if len(folder.name) == KEY_PREFIX_LENGTH and (manifest := read_manifest(folder)) is not None:
                     found.append((folder, manifest))
         return sorted(found, key=lambda pair: str(pair[1].get("finished", "")), reverse=True)
 
     def temporary(self, stage: str, key: str) -> Path:
-        """A new empty folder to fill for this key."""
-        folder = self.stage_folder(stage) / f"{key[:SHORT]}.tmp-{uuid.uuid4().hex[:8]}"
+        """A new empty folder for the output of this key."""
+        folder = self.stage_folder(stage) / f"{key[:KEY_PREFIX_LENGTH]}.tmp-{uuid.uuid4().hex[:8]}"
         folder.mkdir(parents=True)
         return folder
 
     def publish(self, temporary: Path, final: Path, manifest: Mapping[str, Any]) -> Artifact:
-        """Make the filled `temporary` folder the artifact `final`; the files' digests and sizes are added to the manifest."""
+        """Publish the folder `temporary` as the artifact `final`; digests and sizes of its files are added to the manifest."""
         sync_tree(temporary)
         names = [name for name in list_files(temporary) if name != MANIFEST]
         files = self.digests.files(temporary, names)
@@ -125,7 +125,7 @@ class Store:
         body["seal"] = _seal(body)
         write_atomic(temporary / MANIFEST, json.dumps(body, indent=1, ensure_ascii=False), durable=True)
         sync(temporary)
-        if final.exists():  # a damaged one, or one made with another default
+        if final.exists():  # a damaged artifact, or one of other schema defaults
             old = final.with_name(f"{final.name}.tmp-{uuid.uuid4().hex[:8]}")
             final.rename(old)
             temporary.rename(final)
@@ -135,13 +135,13 @@ class Store:
         sync(final.parent)
         return self._artifact(final, body)
 
-    def sweep(self, stage: str, key: str) -> None:
-        """Delete what killed runs left behind for this key; the caller holds its lease."""
+    def remove_leftovers(self, stage: str, key: str) -> None:
+        """Delete temporary files of killed runs for this key; the caller holds its lease."""
         with suppress(FileNotFoundError):
             for entry in self.stage_folder(stage).iterdir():
-                if entry.name.startswith(f"{key[:SHORT]}.tmp-"):
+                if entry.name.startswith(f"{key[:KEY_PREFIX_LENGTH]}.tmp-"):
                     remove_tree(entry)
-                elif entry.name.startswith(f".{key[:SHORT]}.") and entry.suffix == ".tmp":  # a lease half written
+                elif entry.name.startswith(f".{key[:KEY_PREFIX_LENGTH]}.") and entry.suffix == ".tmp":  # an incomplete lease file
                     entry.unlink(missing_ok=True)
 
     def _file_faults(self, folder: Path, manifest: Mapping[str, Any]) -> list[str]:
@@ -149,12 +149,12 @@ class Store:
         for name, entry in manifest.get("files", {}).items():
             path = folder / name
             try:
-                same = os.path.getsize(path) == entry["bytes"] and self.digests.file(path) == entry["digest"]
+                intact = os.path.getsize(path) == entry["bytes"] and self.digests.file(path) == entry["digest"]
             except OSError:
-                faults.append(f"{name} is gone from '{folder}'")
+                faults.append(f"{name} is missing in '{folder}'")
                 continue
-            if not same:
-                faults.append(f"{name} in '{folder}' was changed after it was written")
+            if not intact:
+                faults.append(f"{name} in '{folder}' was modified")
         return faults
 
     @staticmethod
@@ -164,7 +164,7 @@ class Store:
 
 
 def read_manifest(folder: Path) -> dict[str, Any] | None:
-    """The manifest of a folder; None when there is none, or not the one that was published (its seal is a digest of the rest)."""
+    """The manifest of a folder; None when it is missing or was modified (its `seal` is a digest of the other fields)."""
     try:
         body = json.loads((folder / MANIFEST).read_text(encoding="utf-8"))
     except (OSError, ValueError):

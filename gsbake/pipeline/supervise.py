@@ -1,4 +1,4 @@
-"""Running one stage in its worker process: messages, memory, signals, and what its end means."""
+"""Supervision of a stage's worker process: messages, peak memory, stop signals and exit status."""
 
 from __future__ import annotations
 
@@ -24,16 +24,18 @@ from gsbake.errors import BadInputError, GsbakeError, InterruptedRun
 from gsbake.pipeline.machine import thread_environment
 from gsbake.pipeline.worker import Job
 
-#: Seconds a stage has to react to a stop, and to write its checkpoint once it has.
-GRACE = 5.0
-GRACE_CHECKPOINT = 30.0
+#: Seconds for a stage to acknowledge a stop request, and then to write its checkpoint.
+STOP_TIMEOUT = 5.0
+CHECKPOINT_TIMEOUT = 30.0
 
-_SAMPLE = 0.5  # seconds between looks at the memory of the worker and its children
+#: Seconds between samples of the memory of the worker and its child processes.
+_MEMORY_SAMPLE_INTERVAL = 0.5
 _COMMAND = "from gsbake.pipeline.worker import main; main()"
+_STOPPED = "Stopped on request; the same command resumes the run."
 
 
 class StageFailed(GsbakeError):
-    """A stage ended in a way nobody foresaw; `details` holds the traceback."""
+    """Internal error in a stage; `details` holds the traceback."""
 
     def __init__(self, message: str, details: str = "") -> None:
         super().__init__(message)
@@ -41,7 +43,7 @@ class StageFailed(GsbakeError):
 
 
 class StopSignals:
-    """Counts SIGINT, SIGTERM and SIGHUP while it is entered, in place of their usual effect; inert outside the main thread."""
+    """Context that counts SIGINT, SIGTERM and SIGHUP instead of their default action; has no effect outside the main thread."""
 
     def __init__(self) -> None:
         self.count = 0
@@ -63,12 +65,12 @@ class StopSignals:
     def check(self) -> None:
         """Raise InterruptedRun if a stop was requested."""
         if self.count:
-            raise InterruptedRun("Stopped on request; the same command goes on from here.")
+            raise InterruptedRun(_STOPPED)
 
 
 @dataclass
 class Outcome:
-    """What a finished stage reported."""
+    """Report of a finished stage: results, seconds of its parts, decisions, warnings, run time and peak memory."""
 
     results: dict[str, Any] = field(default_factory=dict)
     parts: dict[str, float] = field(default_factory=dict)
@@ -79,7 +81,7 @@ class Outcome:
 
 
 class Worker:
-    """One worker process and the reading end of its pipe."""
+    """A worker process and the read end of its message pipe."""
 
     def __init__(self, job: Job, log: Path) -> None:
         read, write = os.pipe()
@@ -100,15 +102,15 @@ class Worker:
         os.set_blocking(read, False)
         self._selector = selectors.DefaultSelector()
         self._selector.register(read, selectors.EVENT_READ)
-        self._rest = b""
+        self._partial_line = b""
         self.peak = 0
-        self._sampled = -_SAMPLE
+        self._sampled = -_MEMORY_SAMPLE_INTERVAL
 
     def messages(self, timeout: float) -> tuple[list[dict[str, Any]], bool]:
-        """Messages that came within `timeout` seconds, and whether the worker has ended."""
+        """Messages received within `timeout` seconds, and whether the worker has ended."""
         ended = self.process.poll() is not None
         self._selector.select(0 if ended else timeout)
-        chunks = [self._rest]
+        chunks = [self._partial_line]
         while True:
             try:
                 chunk = os.read(self._read, 1 << 16)
@@ -119,13 +121,13 @@ class Worker:
                 self.process.wait()
                 break
             chunks.append(chunk)
-        *lines, self._rest = b"".join(chunks).split(b"\n")
+        *lines, self._partial_line = b"".join(chunks).split(b"\n")
         return [json.loads(line) for line in lines], ended
 
-    def sample(self) -> None:
-        """Look at the memory of the worker and all its children."""
+    def sample_memory(self) -> None:
+        """Update the peak memory of the worker and its child processes."""
         now = time.monotonic()
-        if now - self._sampled < _SAMPLE:
+        if now - self._sampled < _MEMORY_SAMPLE_INTERVAL:
             return
         self._sampled = now
         with suppress(psutil.Error):
@@ -137,12 +139,12 @@ class Worker:
             self.peak = max(self.peak, total)
 
     def terminate(self) -> None:
-        """Ask the stage to stop."""
+        """Request the stage to stop."""
         with suppress(ProcessLookupError):
             self.process.send_signal(signal.SIGTERM)
 
     def kill(self) -> None:
-        """End the worker and its children at once."""
+        """Kill the worker and its child processes."""
         with suppress(psutil.Error):
             for child in psutil.Process(self.process.pid).children(recursive=True):
                 with suppress(psutil.Error):
@@ -152,17 +154,20 @@ class Worker:
         self.process.wait()
 
     def close(self) -> None:
-        """Leave no process and no handle behind."""
+        """Kill the worker if it still runs, and close the pipe."""
         if self.process.poll() is None:
             self.kill()
         self._selector.close()
         os.close(self._read)
 
 
-def supervise(job: Job, log: Path, stop: StopSignals, on_message: Callable[[dict[str, Any]], None], *, grace: float = GRACE) -> Outcome:
-    """Run the job to its end and return what it reported; raises what it raised.
+def supervise(
+    job: Job, log: Path, stop: StopSignals, on_message: Callable[[dict[str, Any]], None], *, stop_timeout: float = STOP_TIMEOUT
+) -> Outcome:
+    """Run a job in a worker process and return its report. Raises the errors that the stage raised.
 
-    A stop is passed on to the stage; one that has not reacted after `grace` seconds, or a second signal, ends it by force.
+    A stop request is sent to the stage. The worker is killed at a second signal, or when it has not acknowledged within `stop_timeout`
+    seconds.
     """
     outcome = Outcome()
     start = time.perf_counter()
@@ -182,56 +187,56 @@ def supervise(job: Job, log: Path, stop: StopSignals, on_message: Callable[[dict
                     case "warning":
                         outcome.warnings.append(message["text"])
                     case "stopping":
-                        deadline = time.monotonic() + max(grace, GRACE_CHECKPOINT)
+                        deadline = time.monotonic() + max(stop_timeout, CHECKPOINT_TIMEOUT)
                 on_message(message)
-            worker.sample()
+            worker.sample_memory()
             if stop.count and deadline is None:
-                deadline = time.monotonic() + grace
+                deadline = time.monotonic() + stop_timeout
                 worker.terminate()
                 on_message({"kind": "stop sent"})
             if not last and (stop.count > 1 or (deadline is not None and time.monotonic() > deadline)):
                 worker.kill()
-                raise InterruptedRun("Stopped by force; the same command goes on from the last checkpoint.")
+                raise InterruptedRun("Killed on request; the same command resumes from the last checkpoint.")
         if not last:
-            raise _ended(worker, log, stop)
+            raise _unexpected_exit(worker, log, stop)
     finally:
         worker.close()
     outcome.seconds = time.perf_counter() - start
     if last["kind"] == "failed":
-        raise _error(last, worker.peak)
+        raise _reported_error(last, worker.peak)
     outcome.results, outcome.parts = last["results"], last["parts"]
     outcome.peak_bytes = max(worker.peak, last["peak"])
     return outcome
 
 
-def _error(message: dict[str, Any], peak: int) -> GsbakeError:
+def _reported_error(message: dict[str, Any], peak: int) -> GsbakeError:
     """The exception that a failed worker reported."""
     kind = message["error"]
     if kind == "MemoryError":
         return BadInputError(
-            f"Memory ran out ({message['message']}; {peak / 1e9:.1f} GB in use): choose a smaller profile, or lower ingest.max_size, "
+            f"Out of memory ({message['message']}; {peak / 1e9:.1f} GB in use): use a smaller profile, or reduce ingest.max_size, "
             "train.max_size or bake.size."
         )
     if kind == "InterruptedRun":
-        return InterruptedRun("Stopped on request; the same command goes on from here.")
+        return InterruptedRun(_STOPPED)
     if kind == "unexpected":
         return StageFailed(message["message"], message["traceback"])
     error: GsbakeError = getattr(errors, kind)(message["message"])
     return error
 
 
-def _ended(worker: Worker, log: Path, stop: StopSignals) -> GsbakeError:
-    """What it means that a worker ended without a word."""
+def _unexpected_exit(worker: Worker, log: Path, stop: StopSignals) -> GsbakeError:
+    """The error of a worker that ended without reporting a result."""
     code = worker.process.returncode
     if stop.count:
-        return InterruptedRun("Stopped on request; the same command goes on from here.")
+        return InterruptedRun(_STOPPED)
     with suppress(OSError):
         tail = log.read_text(errors="replace")[-4000:]
         if code == -signal.SIGKILL:
             total = psutil.virtual_memory().total
             return InterruptedRun(
-                f"The stage was killed by the system, most likely for lack of memory (it used {worker.peak / 1e9:.1f} GB of "
-                f"{total / 1e9:.1f} GB): the same command goes on from the last checkpoint, a smaller profile needs less."
+                f"The stage was killed by the system, probably out of memory ({worker.peak / 1e9:.1f} GB of {total / 1e9:.1f} GB used): "
+                "the same command resumes from the last checkpoint; a smaller profile needs less memory."
             )
         name = signal.Signals(-code).name if code < 0 else f"exit code {code}"
         return StageFailed(f"the stage's process ended with {name}", tail)

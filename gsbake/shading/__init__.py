@@ -1,1 +1,1 @@
-"""Light and reflection: the environment map, its prefiltered tables, the GGX BRDF and split-sum shading."""
+"""Image-based lighting: environment map, prefiltering, GGX BRDF and split-sum shading."""

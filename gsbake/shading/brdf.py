@@ -1,12 +1,12 @@
-"""The split-sum table: directional albedo of GGX as scale and bias of F0.
+"""Split-sum table: directional albedo of GGX as scale and bias of F0.
 
 Karis, *Real Shading in Unreal Engine 4*, 2013: with Schlick's Fresnel term, ∫ f (n·l) dl = F0·A(n·v, roughness) + B(n·v, roughness). Here
-the microfacet model is the one of the glTF specification and of Cycles: GGX with α = roughness² and the height-correlated Smith term
+the microfacet model is that of the glTF specification and of Cycles: GGX with α = roughness² and the height-correlated Smith term
 
     G2/G1(v) = n·l (n·v + Λ_v) / (n·l Λ_v + n·v Λ_l),   Λ_x = √(α² + (1 − α²)(n·x)²)      (Heitz, JCGT 2014)
 
-Half-vectors are drawn from the visible normals (Dupuy & Benyoub, *Sampling Visible GGX Normals with Spherical Caps*, HPG 2023) on a
-stratified grid, so that each sample weighs G2/G1 ≤ 1 and a small grid is exact enough down to grazing angles.
+Half-vectors are sampled from the visible normals (Dupuy & Benyoub, *Sampling Visible GGX Normals with Spherical Caps*, HPG 2023) on a
+stratified grid. Each sample has the weight G2/G1 ≤ 1, so a small grid is accurate down to grazing angles.
 """
 
 from __future__ import annotations
@@ -17,15 +17,16 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-#: Nodes along √(n·v) and along roughness, both from 0 to 1 inclusive. The square root spends nodes on grazing angles, where A and B bend.
-COSINES = 48
-ROUGHNESSES = 32
+#: Table nodes along √(n·v) and along roughness, both from 0 to 1 inclusive. The square root places more nodes at grazing angles, where the
+#: curvature of A and B is high.
+COSINE_NODES = 48
+ROUGHNESS_NODES = 32
 
 
-def integrate(cosine: NDArray[np.float64], alpha: NDArray[np.float64], strata: int = 32) -> NDArray[np.float64]:
-    """A and B (n, 2) at n·v (n,) and α (n,) by strata² samples each; `cosine` may be 0."""
+def directional_albedo(cosine: NDArray[np.float64], alpha: NDArray[np.float64], strata: int = 32) -> NDArray[np.float64]:
+    """A and B (n, 2) at n·v (n,) and α (n,), from strata² samples each; `cosine` may be 0."""
     k = (np.arange(strata) + 0.5) / strata
-    phi, cap = (g.ravel()[None] for g in np.meshgrid(np.pi * k, k))  # the lobe is symmetric: half the azimuths
+    phi, cap = (g.ravel()[None] for g in np.meshgrid(np.pi * k, k))  # symmetric lobe: half of the azimuths
     nv, a = cosine[:, None], alpha[:, None]
     sin_v = np.sqrt(np.clip(1.0 - nv * nv, 0.0, None))
     stretch = 1.0 / np.sqrt((a * sin_v) ** 2 + nv**2 + 1e-30)
@@ -47,32 +48,32 @@ def integrate(cosine: NDArray[np.float64], alpha: NDArray[np.float64], strata: i
 
 
 @lru_cache(maxsize=1)
-def table() -> NDArray[np.float32]:
-    """The table (ROUGHNESSES, COSINES, 2), read-only, computed once per process."""
-    rough, root = np.meshgrid(np.linspace(0.0, 1.0, ROUGHNESSES), np.linspace(0.0, 1.0, COSINES), indexing="ij")
-    # A perfect mirror seen edge-on is 0/0; 1e-4 is its limit to five digits.
+def split_sum_table() -> NDArray[np.float32]:
+    """The table (ROUGHNESS_NODES, COSINE_NODES, 2), read-only; computed once per process."""
+    rough, root = np.meshgrid(np.linspace(0.0, 1.0, ROUGHNESS_NODES), np.linspace(0.0, 1.0, COSINE_NODES), indexing="ij")
+    # A perfect mirror at grazing incidence is 0/0; 1e-4 gives its limit to five digits.
     cosine, alpha = np.maximum(root.ravel() ** 2, 1e-4), np.maximum(rough.ravel() ** 2, 1e-4)
-    rows = [integrate(cosine[i : i + COSINES], alpha[i : i + COSINES]) for i in range(0, len(alpha), COSINES)]
-    out = np.concatenate(rows).reshape(ROUGHNESSES, COSINES, 2).astype(np.float32)
+    rows = [directional_albedo(cosine[i : i + COSINE_NODES], alpha[i : i + COSINE_NODES]) for i in range(0, len(alpha), COSINE_NODES)]
+    out = np.concatenate(rows).reshape(ROUGHNESS_NODES, COSINE_NODES, 2).astype(np.float32)
     out.flags.writeable = False
     return out
 
 
 @lru_cache(maxsize=8)
-def _tensor(dtype: torch.dtype, device: torch.device) -> torch.Tensor:
-    return torch.tensor(table().reshape(-1, 2), dtype=dtype, device=device)
+def _table_tensor(dtype: torch.dtype, device: torch.device) -> torch.Tensor:
+    return torch.tensor(split_sum_table().reshape(-1, 2), dtype=dtype, device=device)
 
 
 def scale_and_bias(cosine: torch.Tensor, roughness: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """A and B, (n,) each, at n·v (n,) > 0 and roughness (n,); bilinear in √(n·v) and roughness, differentiable in both."""
-    lut = _tensor(cosine.dtype, cosine.device)
-    x = cosine.sqrt() * (COSINES - 1)
-    y = roughness.clamp(0.0, 1.0) * (ROUGHNESSES - 1)
-    col = x.detach().floor().long().clamp(0, COSINES - 2)
-    row = y.detach().floor().long().clamp(0, ROUGHNESSES - 2)
+    """A and B, (n,) each, at n·v (n,) > 0 and roughness (n,); bilinear in √(n·v) and roughness; differentiable in both."""
+    lut = _table_tensor(cosine.dtype, cosine.device)
+    x = cosine.sqrt() * (COSINE_NODES - 1)
+    y = roughness.clamp(0.0, 1.0) * (ROUGHNESS_NODES - 1)
+    col = x.detach().floor().long().clamp(0, COSINE_NODES - 2)
+    row = y.detach().floor().long().clamp(0, ROUGHNESS_NODES - 2)
     fx, fy = (x - col).unsqueeze(1), (y - row).unsqueeze(1)
-    base = row * COSINES + col
+    base = row * COSINE_NODES + col
     top = lut[base] * (1.0 - fx) + lut[base + 1] * fx
-    bottom = lut[base + COSINES] * (1.0 - fx) + lut[base + COSINES + 1] * fx
+    bottom = lut[base + COSINE_NODES] * (1.0 - fx) + lut[base + COSINE_NODES + 1] * fx
     both = top * (1.0 - fy) + bottom * fy
     return both[:, 0], both[:, 1]

@@ -1,8 +1,8 @@
-"""The prefiltered light as shading sees it: one flat table of octahedral levels and its lookups.
+"""Prefiltered light: a flat table of octahedral levels, and its differentiable look-ups.
 
-`filter_cube` applies the constant operator of `prefilter` inside autograd; `LightTables` looks directions up, trilinear over the square's
-two coordinates and roughness, differentiable with respect to the table, the directions and the roughness. Everything here is plain PyTorch
-and runs on any device; `kernels` holds the CPU twin that shading uses.
+`prefilter_cube_map` applies the constant operator of `prefilter` in autograd. `LightTables` interpolates trilinearly over the octahedral
+coordinates and roughness, differentiable with respect to table, directions and roughness. This module is PyTorch and runs on any device;
+`split_sum_kernel` is the equivalent CPU kernel.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ import scipy.sparse
 import torch
 
 from gsbake.shading import octahedral
-from gsbake.shading.prefilter import Layout, operator
+from gsbake.shading.prefilter import Layout, prefilter_operator
 
 
-def _sparse(matrix: scipy.sparse.csr_matrix, dtype: torch.dtype, device: torch.device) -> torch.Tensor:
+def _sparse_tensor(matrix: scipy.sparse.csr_matrix, dtype: torch.dtype, device: torch.device) -> torch.Tensor:
     csr = matrix.tocsr()
     csr.sort_indices()
     with warnings.catch_warnings():
@@ -30,9 +30,9 @@ def _sparse(matrix: scipy.sparse.csr_matrix, dtype: torch.dtype, device: torch.d
 
 @lru_cache(maxsize=8)
 def _matrices(size: int, dtype: torch.dtype, device: torch.device) -> tuple[torch.Tensor, ...]:
-    """Reduction and weights of a map size with their transposes, as torch matrices."""
-    op = operator(size)
-    return tuple(_sparse(m, dtype, device) for m in (op.reduce, op.reduce.T, op.weights, op.weights.T))
+    """Downsampling and filter weights for a map size, each with its transpose."""
+    op = prefilter_operator(size)
+    return tuple(_sparse_tensor(m, dtype, device) for m in (op.reduce, op.reduce.T, op.weights, op.weights.T))
 
 
 class _Filter(torch.autograd.Function):
@@ -51,39 +51,39 @@ class _Filter(torch.autograd.Function):
         return both[:fine] + reduce_t @ both[fine:], None
 
 
-def clamp_through(value: torch.Tensor, low: float, high: float) -> torch.Tensor:
-    """Clamped, with the gradient of the unclamped value: a parameter that has left the range can come back."""
+def clamp_straight_through(value: torch.Tensor, low: float, high: float) -> torch.Tensor:
+    """Clamp with a straight-through gradient, so that a parameter outside the range can return."""
     return value + (value.clamp(low, high) - value).detach()
 
 
 @dataclass(frozen=True)
 class LightTables:
-    """Prefiltered light: `table` (layout.texels, 3), linear RGB radiance."""
+    """Prefiltered light; `table` (layout.texels, 3) is linear RGB radiance."""
 
     table: torch.Tensor
     layout: Layout
 
     def specular(self, directions: torch.Tensor, roughness: torch.Tensor) -> torch.Tensor:
-        """Radiance (n, 3) convolved with the head-on GGX lobe around unit `directions` (n, 3), at `roughness` (n,).
+        """Radiance (n, 3) convolved with the GGX lobe at normal incidence around unit `directions` (n, 3), for `roughness` (n,).
 
-        Linear between the levels' roughnesses. Roughness beyond the first or last level reads that level and keeps the slope beside it as
-        its gradient.
+        Linear between the roughness levels. Roughness outside their range gives the first or last level, with the gradient of the adjacent
+        interval.
         """
         knots = torch.tensor(self.layout.roughness, dtype=roughness.dtype, device=roughness.device)
-        rough = clamp_through(roughness, self.layout.roughness[0], self.layout.roughness[-1])
+        rough = clamp_straight_through(roughness, self.layout.roughness[0], self.layout.roughness[-1])
         level = torch.bucketize(rough.detach(), knots[1:-1], right=True)
         t = ((rough - knots[level]) / (knots[level + 1] - knots[level])).unsqueeze(1)
         u, v = octahedral.encode(directions)
         return (1.0 - t) * self._bilinear(u, v, level) + t * self._bilinear(u, v, level + 1)
 
     def diffuse(self, normals: torch.Tensor) -> torch.Tensor:
-        """Irradiance / π (n, 3) around unit `normals` (n, 3): what a white Lambertian surface returns."""
+        """Irradiance / π (n, 3) at unit `normals` (n, 3): the outgoing radiance of a white Lambertian surface."""
         u, v = octahedral.encode(normals)
         last = len(self.layout.sizes) - 1
         return self._bilinear(u, v, torch.full(u.shape, last, dtype=torch.long, device=u.device))
 
     def detach(self) -> LightTables:
-        """The same light without gradient."""
+        """A copy without gradient."""
         return LightTables(self.table.detach(), self.layout)
 
     def _bilinear(self, u: torch.Tensor, v: torch.Tensor, level: torch.Tensor) -> torch.Tensor:
@@ -91,7 +91,7 @@ class LightTables:
         start = torch.tensor(self.layout.offsets, device=u.device)[level]
         x = (u + 1.0) * (0.5 * size) + 0.5
         y = (v + 1.0) * (0.5 * size) + 0.5
-        # The clamp acts on the integers, so that even a NaN reads inside the table.
+        # The clamp is on integers, so that NaN coordinates stay inside the table too.
         col = torch.minimum(x.detach().floor().long().clamp_min(0), size)
         row = torch.minimum(y.detach().floor().long().clamp_min(0), size)
         fx, fy = (x - col).unsqueeze(1), (y - row).unsqueeze(1)
@@ -101,7 +101,7 @@ class LightTables:
         return (1.0 - fy) * ((1.0 - fx) * t00 + fx * t01) + fy * ((1.0 - fx) * t10 + fx * t11)
 
 
-def filter_cube(radiance: torch.Tensor) -> LightTables:
+def prefilter_cube_map(radiance: torch.Tensor) -> LightTables:
     """Prefilter a cube map of radiance (6, N, N, 3), float32 or float64, on any device; differentiable once."""
     size = radiance.shape[1]
-    return LightTables(_Filter.apply(radiance.reshape(-1, 3), size), operator(size).layout)
+    return LightTables(_Filter.apply(radiance.reshape(-1, 3), size), prefilter_operator(size).layout)

@@ -1,7 +1,7 @@
-"""Equirectangular images of the environment and where their pixels point.
+"""Equirectangular environment images: conventions, sampling and HDR export.
 
-All images have the sky's top in row 0 and are (h, 2h, 3); pixel (i, j) (row, column) stands for u = (j + ½)/2h from left to right and
-v = 1 − (i + ½)/h from bottom to top. Two conventions map (u, v) to directions; both show the world unmirrored from inside:
+Images are (h, 2h, 3) with the zenith in row 0; the centre of pixel (i, j) (row, column) is at u = (j + ½)/2h from left to right and
+v = 1 − (i + ½)/h from bottom to top. Two conventions map (u, v) to directions; both show the world from inside, not mirrored:
 
 `blender`, Z-up (Cycles' equirectangular mapping):   u = atan2(y, −x)/2π + ½,   v = atan2(z, √(x² + y²))/π + ½
     centre of the image −X, at u = ¼ −Y, at u = ¾ +Y, at the left and right edges +X.
@@ -9,8 +9,8 @@ v = 1 − (i + ½)/h from bottom to top. Two conventions map (u, v) to direction
 `gltf`, Y-up (three.js and the Khronos sample viewer):   u = atan2(z, x)/2π + ½,   v = asin(y)/π + ½
     centre of the image +X, at u = ¼ −Z, at u = ¾ +Z, at the edges −X.
 
-glTF's (x, y, z) is Blender's (x, −z, y), so the centre of one file is seen at −X by Blender and at +X by a glTF viewer: a file written for
-one has to be turned by half a turn (columns rolled by h) for the other. Blender's importer does the change of axes for meshes only.
+glTF's (x, y, z) is Blender's (x, −z, y), so the centre of a file is at −X in Blender and at +X in a glTF viewer: a file for one has to be
+rotated by 180° (columns rolled by h) for the other. Blender's importer converts the axes of meshes only.
 """
 
 from __future__ import annotations
@@ -28,27 +28,27 @@ Convention = Literal["blender", "gltf"]
 
 
 def directions(height: int, convention: Convention = "blender", subdivide: int = 1) -> Array:
-    """Unit directions (height·k, 2·height·k, 3) of the pixel centres of an image whose pixels are cut in k × k parts."""
+    """Unit directions (height·k, 2·height·k, 3) of the centres of pixels subdivided into k × k parts."""
     rows = height * subdivide
     elevation = np.pi * (0.5 - (np.arange(rows) + 0.5) / rows)[:, None]
     azimuth = 2.0 * np.pi * ((np.arange(2 * rows) + 0.5) / (2 * rows) - 0.5)[None, :]
-    ahead, right, up = np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)
-    up = np.broadcast_to(up, ahead.shape)
-    return np.stack([-ahead, right, up] if convention == "blender" else [ahead, up, right], axis=-1)
+    forward, right, up = np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)
+    up = np.broadcast_to(up, forward.shape)
+    return np.stack([-forward, right, up] if convention == "blender" else [forward, up, right], axis=-1)
 
 
 def coordinates(dirs: Array, convention: Convention = "blender") -> tuple[Array, Array]:
     """u from left to right and v from bottom to top, (n,) each in [0, 1], of directions (n, 3)."""
     x, y, z = dirs.T
     if convention == "blender":
-        ahead, right, up = -x, y, z
+        forward, right, up = -x, y, z
     else:
-        ahead, right, up = x, z, y
-    return np.arctan2(right, ahead) / (2.0 * np.pi) + 0.5, np.arctan2(up, np.hypot(ahead, right)) / np.pi + 0.5
+        forward, right, up = x, z, y
+    return np.arctan2(right, forward) / (2.0 * np.pi) + 0.5, np.arctan2(up, np.hypot(forward, right)) / np.pi + 0.5
 
 
 def sample(image: NDArray[np.floating], dirs: Array, convention: Convention = "blender") -> Array:
-    """Values (n, c) of an equirectangular image (h, w, c) at directions (n, 3), bilinear, wrapped around and clamped at the poles."""
+    """Values (n, c) of an equirectangular image (h, w, c) at directions (n, 3), bilinear, wrapped horizontally and clamped at the poles."""
     height, width = image.shape[:2]
     u, v = coordinates(dirs, convention)
     x, y = u * width - 0.5, np.clip((1.0 - v) * height - 0.5, 0, height - 1)
@@ -69,4 +69,4 @@ def write_hdr(path: Path | str, image: NDArray[np.floating]) -> None:
     written = out is not None and out.open(str(path), spec) and out.write_image(pixels) and out.close()
     if not written:
         reason = out.geterror() if out is not None else oiio.geterror()
-        raise UsageError(f"Cannot write the environment image {path}: {reason.strip()}; check the folder and the free space.")
+        raise UsageError(f"Cannot write the environment image {path}: {reason.strip()}; check the folder and the free disk space.")

@@ -1,16 +1,16 @@
-"""Deferred split-sum shading: plain functions of G-buffers and a prefiltered light.
+"""Deferred split-sum shading of G-buffers under a prefiltered environment light.
 
     F0  = .04 (1 − metallic) + metallic · albedo
     out = (1 − metallic) · albedo · E(n) + L(d, roughness) · (F0 · A(n·v, roughness) + B(n·v, roughness))
 
-(METHOD §6; Karis, *Real Shading in Unreal Engine 4*, 2013; Munkberg et al., nvdiffrec, CVPR 2022.) On the CPU in float32 one Numba kernel
-per direction does it all; on other devices, and in float64, the same formulas run as PyTorch. A pixel knows its neighbours and the object
-only through `occlusion`, so a shading model with traced visibility can stand beside this one with the same signature.
+(METHOD §6; Karis, *Real Shading in Unreal Engine 4*, 2013; Munkberg et al., nvdiffrec, CVPR 2022.) On the CPU in float32, forward and
+backward pass are one Numba kernel each; other devices and float64 use PyTorch. Shadowing and inter-reflection enter through the occlusion
+and visibility arguments only.
 
-The light is looked up not along the mirror direction r but along the lobe's dominant direction d = f r + (1 − f) n with
-f = s (√s + α), s = 1 − α, α = roughness² (Lagarde & de Rousiers, *Moving Frostbite to PBR*, 2014): seen at a slant, a rough lobe
-is cut by the horizon and leans towards the normal. Against Monte Carlo of the full BRDF on a metal sphere in four lights this brought the
-error of split-sum from 16–73 % down to 10–23 % at roughness .6 and from 25–138 % to 4–15 % at .9.
+The light is evaluated along the lobe's dominant direction d = f r + (1 − f) n instead of the mirror direction r, with f = s (√s + α),
+s = 1 − α, α = roughness² (Lagarde & de Rousiers, *Moving Frostbite to PBR*, 2014): at grazing angles a rough lobe is clipped by the horizon
+and shifts towards the normal. Against Monte Carlo integration of the full BRDF on a metal sphere in four lights, this reduces the error of
+the split sum from 16–73 % to 10–23 % at roughness .6 and from 25–138 % to 4–15 % at .9.
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ def shade(
     metallic: torch.Tensor,
     tables: LightTables,
     occlusion: torch.Tensor | None = None,
-    diffuse_openness: torch.Tensor | None = None,
-    specular_openness: torch.Tensor | None = None,
+    diffuse_visibility: torch.Tensor | None = None,
+    specular_visibility: torch.Tensor | None = None,
 ) -> torch.Tensor:
     """Linear colours (n, 3) of n pixels.
 
@@ -44,76 +44,78 @@ def shade(
     view: (n, 3), unit vectors from the surface to the camera, unit frame.
     albedo: (n, 3), linear.
     roughness, metallic: (n,), 0…1; α = roughness².
-    tables: the light, in the same frame.
-    occlusion: (n,), the open share of the hemisphere, 1 = open; None leaves everything open. It scales the diffuse part and, by the
-    formula of Lagarde & de Rousiers (*Moving Frostbite to PBR*, 2014), the specular part.
-    diffuse_openness: (n,), scales the diffuse part instead, where the share of this very light that gets through is known.
-    specular_openness: (n,), scales the specular part instead, where it was traced what the lobe meets (`traced_openness`).
+    tables: the prefiltered light, in the same frame.
+    occlusion: (n,), ambient occlusion, 1 = unoccluded; None is unoccluded. It scales the diffuse term and, converted to specular occlusion
+    (Lagarde & de Rousiers, *Moving Frostbite to PBR*, 2014), the specular term.
+    diffuse_visibility: (n,), factor of the diffuse term instead of `occlusion`: the visible share of this light's irradiance.
+    specular_visibility: (n,), factor of the specular term instead of that from `occlusion`, see `traced_specular_visibility`.
 
     Notes
     -----
-    Normals that turn away from the viewer do not stop the gradient: n·v goes through (c + √(c² + 4 m²))/2 with m = .01, which is positive
-    and increasing everywhere and differs from c by less than m² / c in front.
+    n·v is clamped smoothly to (c + √(c² + 4 m²))/2 with m = .01, which is positive and increasing, and differs from c by less than m² / c
+    for c > 0. So normals that face away from the camera get a gradient too.
     """
     if occlusion is None:
-        open_d = open_s = torch.ones_like(roughness)
+        visibility_d = visibility_s = torch.ones_like(roughness)
     else:
-        open_d = occlusion if diffuse_openness is None else diffuse_openness
-        open_s = _specular_openness(normal, view, roughness, occlusion) if specular_openness is None else specular_openness
-    inputs = (normal, view, albedo, roughness, metallic, open_d, open_s, tables.table)
+        visibility_d = occlusion if diffuse_visibility is None else diffuse_visibility
+        visibility_s = _specular_occlusion(normal, view, roughness, occlusion) if specular_visibility is None else specular_visibility
+    inputs = (normal, view, albedo, roughness, metallic, visibility_d, visibility_s, tables.table)
     if all(t.device.type == "cpu" and t.dtype == torch.float32 for t in inputs):
         colour: torch.Tensor = _Kernel.apply(tables.layout, *inputs)
         return colour
-    return _reference(normal, view, albedo, roughness, metallic, open_d, open_s, tables)
+    return _reference(normal, view, albedo, roughness, metallic, visibility_d, visibility_s, tables)
 
 
-def traced_openness(
+def traced_specular_visibility(
     normal: torch.Tensor, view: torch.Tensor, roughness: torch.Tensor, occlusion: torch.Tensor, blocked: torch.Tensor
 ) -> torch.Tensor:
-    """Share (n,) of the specular lobe left open where it is known whether the mirror direction is `blocked` (n,).
+    """Visibility (n,) of the specular lobe, 1 = unoccluded, where a traced ray tells whether the mirror direction is `blocked` (n,).
 
-    The share of the mirror direction in the lobe's dominant one is open or blocked as that direction is, the rest as the formula for
-    `occlusion` (n,) says. Without gradient but that of the occlusion.
+    The weight of the mirror direction in the dominant direction is multiplied by the ray's visibility, the rest by the specular occlusion
+    from `occlusion` (n,). Only the occlusion gets a gradient.
     """
     with torch.no_grad():
-        mirror = _dominance(roughness)
-    ambient = _specular_openness(normal, view, roughness, occlusion)
+        mirror = _mirror_weight(roughness)
+    ambient = _specular_occlusion(normal, view, roughness, occlusion)
     return (1.0 - mirror) * ambient + mirror * (~blocked)
 
 
-def reflected(
+def mirror_reflection(
     normal: torch.Tensor, view: torch.Tensor, albedo: torch.Tensor, roughness: torch.Tensor, metallic: torch.Tensor, radiance: torch.Tensor
 ) -> torch.Tensor:
-    """What pixels (n, 3) reflect of `radiance` (n, 3) that comes along their mirror direction: the specular part of `shade`, the light in
-    place of the room, by the share that `traced_openness` takes from the room. Gradients go to albedo and metallic."""
+    """Specular reflection (n, 3) of `radiance` (n, 3) that arrives along the mirror direction.
+
+    It replaces the share of the environment that `traced_specular_visibility` blocks. Gradients go to albedo and metallic only.
+    """
     with torch.no_grad():
         cosine = _soft_cosine((_unit(normal) * view).sum(dim=1))
         scale, bias = brdf.scale_and_bias(cosine, roughness)
-        sent = _dominance(roughness).unsqueeze(1) * radiance
+        incident = _mirror_weight(roughness).unsqueeze(1) * radiance
     metal = metallic.unsqueeze(1)
     f0 = 0.04 * (1.0 - metal) + metal * albedo
-    return sent * (f0 * scale.unsqueeze(1) + bias.unsqueeze(1))
+    return incident * (f0 * scale.unsqueeze(1) + bias.unsqueeze(1))
 
 
 def _unit(normal: torch.Tensor) -> torch.Tensor:
     squared = (normal * normal).sum(dim=1, keepdim=True)
-    unit = normal * squared.clamp_min(float(kernels.SHORTEST)).rsqrt()
-    return torch.where(squared > float(kernels.SHORTEST), unit, unit.detach())
+    unit = normal * squared.clamp_min(float(kernels.MIN_SQUARED_LENGTH)).rsqrt()
+    return torch.where(squared > float(kernels.MIN_SQUARED_LENGTH), unit, unit.detach())
 
 
 def _soft_cosine(cosine: torch.Tensor) -> torch.Tensor:
-    return 0.5 * (cosine + (cosine * cosine + 4.0 * float(kernels.SOFTNESS) ** 2).sqrt())
+    return 0.5 * (cosine + (cosine * cosine + 4.0 * float(kernels.COSINE_CLAMP_WIDTH) ** 2).sqrt())
 
 
-def _dominance(roughness: torch.Tensor) -> torch.Tensor:
-    """Share (n,) of the mirror direction in the lobe's dominant direction: 1 when smooth, 0 at roughness 1."""
+def _mirror_weight(roughness: torch.Tensor) -> torch.Tensor:
+    """Weight (n,) of the mirror direction in the lobe's dominant direction: 1 at roughness 0, 0 at roughness 1."""
     alpha = roughness.clamp(0.0, 1.0).square()
-    smooth = 1.0 - alpha
-    return smooth.pow(1.5) + smooth * alpha
+    smoothness = 1.0 - alpha
+    return smoothness.pow(1.5) + smoothness * alpha
 
 
-def _specular_openness(normal: torch.Tensor, view: torch.Tensor, roughness: torch.Tensor, occlusion: torch.Tensor) -> torch.Tensor:
-    """Share (n,) of the specular lobe left open; depends on normal and roughness, but only occlusion gets its gradient."""
+def _specular_occlusion(normal: torch.Tensor, view: torch.Tensor, roughness: torch.Tensor, occlusion: torch.Tensor) -> torch.Tensor:
+    """Specular occlusion (n,) of Lagarde & de Rousiers, 1 = unoccluded. Only the ambient occlusion gets a gradient."""
     with torch.no_grad():
         cosine = _soft_cosine((_unit(normal) * view).sum(dim=1)).clamp_max(1.0)
         exponent = torch.exp2(-16.0 * roughness - 1.0)
@@ -126,21 +128,21 @@ def _reference(
     albedo: torch.Tensor,
     roughness: torch.Tensor,
     metallic: torch.Tensor,
-    open_d: torch.Tensor,
-    open_s: torch.Tensor,
+    visibility_d: torch.Tensor,
+    visibility_s: torch.Tensor,
     tables: LightTables,
 ) -> torch.Tensor:
-    """`shade` in PyTorch operations, any device and precision; the kernel is held against it."""
+    """Reference implementation of `shade` in PyTorch, for any device and precision."""
     unit = _unit(normal)
     cosine = (unit * view).sum(dim=1, keepdim=True)
-    mirror = _dominance(roughness).unsqueeze(1)
+    mirror = _mirror_weight(roughness).unsqueeze(1)
     dominant = (1.0 + mirror * (2.0 * cosine - 1.0)) * unit - mirror * view
     scale, bias = brdf.scale_and_bias(_soft_cosine(cosine.squeeze(1)), roughness)
     metal = metallic.unsqueeze(1)
     f0 = 0.04 * (1.0 - metal) + metal * albedo
     diffuse = (1.0 - metal) * albedo * tables.diffuse(unit)
     specular = tables.specular(dominant, roughness) * (f0 * scale.unsqueeze(1) + bias.unsqueeze(1))
-    return open_d.unsqueeze(1) * diffuse + open_s.unsqueeze(1) * specular
+    return visibility_d.unsqueeze(1) * diffuse + visibility_s.unsqueeze(1) * specular
 
 
 class _Kernel(torch.autograd.Function):
@@ -152,7 +154,7 @@ class _Kernel(torch.autograd.Function):
             np.array(layout.roughness, dtype=np.float32),
             np.array(layout.sizes, dtype=np.int64),
             np.array(layout.offsets, dtype=np.int64),
-            brdf.table(),
+            brdf.split_sum_table(),
         )
         out = torch.empty_like(flat[0])
         kernels.forward(*(t.numpy() for t in flat), *ctx.constants, out.numpy())
@@ -161,8 +163,8 @@ class _Kernel(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *grads: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
         flat = ctx.saved_tensors
-        own = [torch.empty_like(t) for t in flat[:-1]]
-        sink = torch.zeros((kernels.CHUNKS, *flat[-1].shape), dtype=flat[-1].dtype)
+        input_grads = [torch.empty_like(t) for t in flat[:-1]]
+        table_grad = torch.zeros((kernels.CHUNKS, *flat[-1].shape), dtype=flat[-1].dtype)
         arrays = [t.numpy() for t in flat]
-        kernels.backward(*arrays, *ctx.constants, grads[0].contiguous().numpy(), *(t.numpy() for t in own), sink.numpy())
-        return (None, *own, sink.sum(dim=0))
+        kernels.backward(*arrays, *ctx.constants, grads[0].contiguous().numpy(), *(t.numpy() for t in input_grads), table_grad.numpy())
+        return (None, *input_grads, table_grad.sum(dim=0))

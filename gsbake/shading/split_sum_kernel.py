@@ -1,11 +1,11 @@
-"""Split-sum shading on the CPU in one pass per direction, float32 (Numba); the readable twin is `shade._reference`.
+"""Numba kernels of split-sum shading on the CPU in float32; the reference implementation is `split_sum._reference`.
 
-Each pixel is independent: the forward kernel writes its colour, the backward kernel computes the pixel again and writes the gradients of
-its inputs. Gradients of the light table collide between pixels, so the pixels are cut in a fixed number of chunks that each add into a
-table of their own; the sum does not depend on the number of threads.
+Pixels are independent: the forward kernel writes the colour, the backward kernel recomputes the pixel and writes the gradients of its
+inputs. Gradients of the light table are summed over pixels, in a fixed number of chunks with one table each, so the result does not depend
+on the number of threads.
 
-Every literal is float32: one float64 constant would widen the whole chain. `nnan` is not among the fast-math flags, because the index
-guards must hold for NaN.
+All literals are float32: a float64 constant would widen the whole expression. The fast-math flags omit `nnan`, because the index clamps
+must hold for NaN.
 """
 
 from __future__ import annotations
@@ -16,10 +16,11 @@ from typing import Any
 import numpy as np
 from numba import njit, prange
 
-from gsbake.shading.octahedral import SHORTEST as SHORTEST_DIRECTION
+from gsbake.shading.octahedral import MIN_L1_NORM
 
 _FLAGS: Any = {"fastmath": {"nsz", "arcp", "contract", "afn", "reassoc"}, "error_model": "numpy", "cache": True}
 
+#: Pixel chunks with separate gradient tables; fixed, for results that do not depend on the number of threads.
 CHUNKS = 8
 
 _0 = np.float32(0.0)
@@ -27,16 +28,16 @@ _1 = np.float32(1.0)
 _2 = np.float32(2.0)
 _HALF = np.float32(0.5)
 _1_5 = np.float32(1.5)
-_NEXT = np.uint64(1)
-_TINY = np.float32(SHORTEST_DIRECTION)
+_U1 = np.uint64(1)
+_MIN_L1_NORM = np.float32(MIN_L1_NORM)
 _F0 = np.float32(0.04)
 
-#: Squared length under which a normal has no direction worth a gradient.
-SHORTEST = np.float32(1e-4)
+#: Squared length below which a normal gets no gradient.
+MIN_SQUARED_LENGTH = np.float32(1e-4)
 
-#: Half-width of the soft clamp of n·v: n·v → (c + √(c² + 4 m²)) / 2.
-SOFTNESS = np.float32(0.01)
-_SOFT = np.float32(4.0) * SOFTNESS * SOFTNESS
+#: Width m of the smooth clamp of c = n·v: (c + √(c² + 4 m²)) / 2.
+COSINE_CLAMP_WIDTH = np.float32(0.01)
+_CLAMP_TERM = np.float32(4.0) * COSINE_CLAMP_WIDTH * COSINE_CLAMP_WIDTH
 
 
 @njit(inline="always", **_FLAGS)
@@ -45,9 +46,9 @@ def _sign(x: Any) -> Any:
 
 
 @njit(inline="always", **_FLAGS)
-def _square(x: Any, y: Any, z: Any) -> Any:
-    """Octahedral coordinates u, v in [−1, 1]."""
-    inverse = _1 / max(abs(x) + abs(y) + abs(z), _TINY)
+def _encode(x: Any, y: Any, z: Any) -> Any:
+    """Octahedral coordinates u, v in [−1, 1] of a direction."""
+    inverse = _1 / max(abs(x) + abs(y) + abs(z), _MIN_L1_NORM)
     p = x * inverse
     q = y * inverse
     if z < _0:
@@ -56,9 +57,9 @@ def _square(x: Any, y: Any, z: Any) -> Any:
 
 
 @njit(inline="always", **_FLAGS)
-def _square_back(x: Any, y: Any, z: Any, gu: Any, gv: Any) -> Any:
-    """Gradient with respect to x, y, z."""
-    inverse = _1 / max(abs(x) + abs(y) + abs(z), _TINY)
+def _encode_backward(x: Any, y: Any, z: Any, gu: Any, gv: Any) -> Any:
+    """Gradient of `_encode` with respect to x, y, z."""
+    inverse = _1 / max(abs(x) + abs(y) + abs(z), _MIN_L1_NORM)
     gp = gu
     gq = gv
     if z < _0:
@@ -70,13 +71,13 @@ def _square_back(x: Any, y: Any, z: Any, gu: Any, gv: Any) -> Any:
 
 @njit(inline="always", **_FLAGS)
 def _cell(x: Any, last: Any) -> Any:
-    """Index of the cell that holds x, within 0…last; 0 for NaN. Unsigned, which spares Numba's wrap-around test at every access."""
+    """Index of the cell that contains x, clamped to 0…last; 0 for NaN. Unsigned, so that Numba omits the wrap-around test."""
     return np.uint64(np.int64(min(x, np.float32(last)))) if x >= _0 else np.uint64(0)
 
 
 @njit(inline="always", **_FLAGS)
 def _taps(u: Any, v: Any, size: Any, start: Any) -> Any:
-    """First tap, row stride and fractions of the bilinear lookup in one level."""
+    """Index of the first texel, row stride and fractions of the bilinear interpolation in one level."""
     half = _HALF * np.float32(size)
     x = (u + _1) * half + _HALF
     y = (v + _1) * half + _HALF
@@ -87,31 +88,31 @@ def _taps(u: Any, v: Any, size: Any, start: Any) -> Any:
 
 
 @njit(inline="always", **_FLAGS)
-def _read(table: Any, base: Any, stride: Any, fx: Any, fy: Any, c: Any) -> Any:
-    top = table[base, c] + fx * (table[base + _NEXT, c] - table[base, c])
-    bottom = table[base + stride, c] + fx * (table[base + stride + _NEXT, c] - table[base + stride, c])
+def _bilinear(table: Any, base: Any, stride: Any, fx: Any, fy: Any, c: Any) -> Any:
+    top = table[base, c] + fx * (table[base + _U1, c] - table[base, c])
+    bottom = table[base + stride, c] + fx * (table[base + stride + _U1, c] - table[base + stride, c])
     return top + fy * (bottom - top)
 
 
 @njit(inline="always", **_FLAGS)
-def _read_back(table: Any, out: Any, base: Any, stride: Any, fx: Any, fy: Any, c: Any, g: Any) -> Any:
-    """Add g into the four taps of `out`; gradient with respect to fx and fy."""
+def _bilinear_backward(table: Any, out: Any, base: Any, stride: Any, fx: Any, fy: Any, c: Any, g: Any) -> Any:
+    """Add the gradient g to the four texels of `out`; returns the gradients of fx and fy."""
     a = table[base, c]
-    b = table[base + _NEXT, c]
+    b = table[base + _U1, c]
     d = table[base + stride, c]
-    e = table[base + stride + _NEXT, c]
+    e = table[base + stride + _U1, c]
     gy = g * fy
     gx = g - gy
     out[base, c] += gx * (_1 - fx)
-    out[base + _NEXT, c] += gx * fx
+    out[base + _U1, c] += gx * fx
     out[base + stride, c] += gy * (_1 - fx)
-    out[base + stride + _NEXT, c] += gy * fx
+    out[base + stride + _U1, c] += gy * fx
     return gx * (b - a) + gy * (e - d), g * ((d - a) + fx * ((e - d) - (b - a)))
 
 
 @njit(inline="always", **_FLAGS)
-def _level(roughness: Any, knots: Any) -> Any:
-    """Lower level and position between it and the next, both clamped."""
+def _roughness_level(roughness: Any, knots: Any) -> Any:
+    """Lower roughness level and interpolation weight of the next one, both clamped."""
     last = knots.shape[0] - 2
     k = 0
     while k < last and roughness >= knots[k + 1]:
@@ -121,21 +122,21 @@ def _level(roughness: Any, knots: Any) -> Any:
 
 
 @njit(inline="always", **_FLAGS)
-def _dominance(roughness: Any) -> Any:
-    """Share of the mirror direction in the lobe's dominant direction, and its slope in roughness."""
+def _mirror_weight(roughness: Any) -> Any:
+    """Weight of the mirror direction in the lobe's dominant direction, and its derivative in roughness."""
     alpha = min(max(roughness, _0), _1)
     alpha *= alpha
-    smooth = _1 - alpha
-    root = math.sqrt(smooth)
-    slope = _2 * roughness * (smooth - alpha - _1_5 * root)
-    return smooth * (root + alpha), slope if _0 <= roughness <= _1 else _0
+    smoothness = _1 - alpha
+    root = math.sqrt(smoothness)
+    slope = _2 * roughness * (smoothness - alpha - _1_5 * root)
+    return smoothness * (root + alpha), slope if _0 <= roughness <= _1 else _0
 
 
 @njit(inline="always", **_FLAGS)
 def _geometry(normal: Any, view: Any, i: Any) -> Any:
-    """Inverse length, unit normal and its cosine to the view."""
+    """Inverse length of the normal, unit normal, and its cosine with the view direction."""
     x, y, z = normal[i, 0], normal[i, 1], normal[i, 2]
-    inverse = _1 / math.sqrt(max(x * x + y * y + z * z, SHORTEST))
+    inverse = _1 / math.sqrt(max(x * x + y * y + z * z, MIN_SQUARED_LENGTH))
     x *= inverse
     y *= inverse
     z *= inverse
@@ -143,8 +144,8 @@ def _geometry(normal: Any, view: Any, i: Any) -> Any:
 
 
 @njit(inline="always", **_FLAGS)
-def _brdf_cell(root: Any, roughness: Any, lut: Any) -> Any:
-    """Cell and fractions of the split-sum table at √(n·v) and roughness."""
+def _table_cell(root: Any, roughness: Any, lut: Any) -> Any:
+    """Cell and interpolation weights of the split-sum table at √(n·v) and roughness."""
     x = root * np.float32(lut.shape[1] - 1)
     y = min(max(roughness, _0), _1) * np.float32(lut.shape[0] - 1)
     col = _cell(x, lut.shape[1] - 2)
@@ -154,137 +155,137 @@ def _brdf_cell(root: Any, roughness: Any, lut: Any) -> Any:
 
 @njit(parallel=True, **_FLAGS)
 def forward(
-    normal: Any, view: Any, albedo: Any, roughness: Any, metallic: Any, open_d: Any, open_s: Any,
+    normal: Any, view: Any, albedo: Any, roughness: Any, metallic: Any, visibility_d: Any, visibility_s: Any,
     table: Any, knots: Any, sizes: Any, offsets: Any, lut: Any, out: Any,
 ) -> None:  # fmt: skip
-    """Colours `out` (n, 3) of n pixels; `open_d`, `open_s` (n,) scale the diffuse and the specular part."""
+    """Colours `out` (n, 3) of n pixels; `visibility_d`, `visibility_s` (n,) are factors of the diffuse and specular terms."""
     n = normal.shape[0]
     for chunk in prange(CHUNKS):
         for pixel in range(chunk * n // CHUNKS, (chunk + 1) * n // CHUNKS):
             i = np.uint64(pixel)
             inverse, nx, ny, nz, c = _geometry(normal, view, i)
-            root = math.sqrt(_HALF * (c + math.sqrt(c * c + _SOFT)))
-            row, col, fx, fy = _brdf_cell(root, roughness[i], lut)
-            a0 = lut[row, col, 0] + fx * (lut[row, col + _NEXT, 0] - lut[row, col, 0])
-            a1 = lut[row + _NEXT, col, 0] + fx * (lut[row + _NEXT, col + _NEXT, 0] - lut[row + _NEXT, col, 0])
-            b0 = lut[row, col, 1] + fx * (lut[row, col + _NEXT, 1] - lut[row, col, 1])
-            b1 = lut[row + _NEXT, col, 1] + fx * (lut[row + _NEXT, col + _NEXT, 1] - lut[row + _NEXT, col, 1])
+            root = math.sqrt(_HALF * (c + math.sqrt(c * c + _CLAMP_TERM)))
+            row, col, fx, fy = _table_cell(root, roughness[i], lut)
+            a0 = lut[row, col, 0] + fx * (lut[row, col + _U1, 0] - lut[row, col, 0])
+            a1 = lut[row + _U1, col, 0] + fx * (lut[row + _U1, col + _U1, 0] - lut[row + _U1, col, 0])
+            b0 = lut[row, col, 1] + fx * (lut[row, col + _U1, 1] - lut[row, col, 1])
+            b1 = lut[row + _U1, col, 1] + fx * (lut[row + _U1, col + _U1, 1] - lut[row + _U1, col, 1])
             scale = a0 + fy * (a1 - a0)
             bias = b0 + fy * (b1 - b0)
 
-            mirror, _ = _dominance(roughness[i])
-            along = _1 + mirror * (_2 * c - _1)
-            u, v = _square(along * nx - mirror * view[i, 0], along * ny - mirror * view[i, 1], along * nz - mirror * view[i, 2])
-            level, t = _level(roughness[i], knots)
+            mirror, _ = _mirror_weight(roughness[i])
+            coeff = _1 + mirror * (_2 * c - _1)
+            u, v = _encode(coeff * nx - mirror * view[i, 0], coeff * ny - mirror * view[i, 1], coeff * nz - mirror * view[i, 2])
+            level, t = _roughness_level(roughness[i], knots)
             base0, stride0, fx0, fy0 = _taps(u, v, sizes[level], offsets[level])
             base1, stride1, fx1, fy1 = _taps(u, v, sizes[level + 1], offsets[level + 1])
-            u, v = _square(nx, ny, nz)
+            u, v = _encode(nx, ny, nz)
             last = sizes.shape[0] - 1
             base2, stride2, fx2, fy2 = _taps(u, v, sizes[last], offsets[last])
             metal = metallic[i]
             for ch in range(3):
-                lower = _read(table, base0, stride0, fx0, fy0, ch)
-                upper = _read(table, base1, stride1, fx1, fy1, ch)
-                irradiance = _read(table, base2, stride2, fx2, fy2, ch)
+                lower = _bilinear(table, base0, stride0, fx0, fy0, ch)
+                upper = _bilinear(table, base1, stride1, fx1, fy1, ch)
+                irradiance = _bilinear(table, base2, stride2, fx2, fy2, ch)
                 f0 = _F0 * (_1 - metal) + metal * albedo[i, ch]
                 light = lower + t * (upper - lower)
-                out[i, ch] = open_d[i] * (_1 - metal) * albedo[i, ch] * irradiance + open_s[i] * light * (f0 * scale + bias)
+                out[i, ch] = visibility_d[i] * (_1 - metal) * albedo[i, ch] * irradiance + visibility_s[i] * light * (f0 * scale + bias)
 
 
 @njit(parallel=True, **_FLAGS)
 def backward(
-    normal: Any, view: Any, albedo: Any, roughness: Any, metallic: Any, open_d: Any, open_s: Any,
+    normal: Any, view: Any, albedo: Any, roughness: Any, metallic: Any, visibility_d: Any, visibility_s: Any,
     table: Any, knots: Any, sizes: Any, offsets: Any, lut: Any, grad: Any,
-    g_normal: Any, g_view: Any, g_albedo: Any, g_roughness: Any, g_metallic: Any, g_open_d: Any, g_open_s: Any, g_table: Any,
+    g_normal: Any, g_view: Any, g_albedo: Any, g_roughness: Any, g_metallic: Any, g_visibility_d: Any, g_visibility_s: Any, g_table: Any,
 ) -> None:  # fmt: skip
-    """Gradients of all inputs from `grad` (n, 3); `g_table` (CHUNKS, texels, 3) starts at zero and is summed by the caller."""
+    """Gradients of all inputs from `grad` (n, 3); `g_table` (CHUNKS, texels, 3) is zero on entry and summed by the caller."""
     n = normal.shape[0]
     for chunk in prange(CHUNKS):
-        sink = g_table[chunk]
+        table_grad = g_table[chunk]
         for pixel in range(chunk * n // CHUNKS, (chunk + 1) * n // CHUNKS):
             i = np.uint64(pixel)
             inverse, nx, ny, nz, c = _geometry(normal, view, i)
-            hyperbola = math.sqrt(c * c + _SOFT)
-            root = math.sqrt(_HALF * (c + hyperbola))
-            row, col, fx, fy = _brdf_cell(root, roughness[i], lut)
-            a00, a01, a10, a11 = lut[row, col, 0], lut[row, col + _NEXT, 0], lut[row + _NEXT, col, 0], lut[row + _NEXT, col + _NEXT, 0]
-            b00, b01, b10, b11 = lut[row, col, 1], lut[row, col + _NEXT, 1], lut[row + _NEXT, col, 1], lut[row + _NEXT, col + _NEXT, 1]
+            soft_root = math.sqrt(c * c + _CLAMP_TERM)
+            root = math.sqrt(_HALF * (c + soft_root))
+            row, col, fx, fy = _table_cell(root, roughness[i], lut)
+            a00, a01, a10, a11 = lut[row, col, 0], lut[row, col + _U1, 0], lut[row + _U1, col, 0], lut[row + _U1, col + _U1, 0]
+            b00, b01, b10, b11 = lut[row, col, 1], lut[row, col + _U1, 1], lut[row + _U1, col, 1], lut[row + _U1, col + _U1, 1]
             scale = (_1 - fy) * (a00 + fx * (a01 - a00)) + fy * (a10 + fx * (a11 - a10))
             bias = (_1 - fy) * (b00 + fx * (b01 - b00)) + fy * (b10 + fx * (b11 - b10))
 
-            mirror, mirror_slope = _dominance(roughness[i])
-            along = _1 + mirror * (_2 * c - _1)
-            rx = along * nx - mirror * view[i, 0]
-            ry = along * ny - mirror * view[i, 1]
-            rz = along * nz - mirror * view[i, 2]
-            u, v = _square(rx, ry, rz)
-            level, t = _level(roughness[i], knots)
+            mirror, mirror_slope = _mirror_weight(roughness[i])
+            coeff = _1 + mirror * (_2 * c - _1)
+            rx = coeff * nx - mirror * view[i, 0]
+            ry = coeff * ny - mirror * view[i, 1]
+            rz = coeff * nz - mirror * view[i, 2]
+            u, v = _encode(rx, ry, rz)
+            level, t = _roughness_level(roughness[i], knots)
             base0, stride0, fx0, fy0 = _taps(u, v, sizes[level], offsets[level])
             base1, stride1, fx1, fy1 = _taps(u, v, sizes[level + 1], offsets[level + 1])
-            u, v = _square(nx, ny, nz)
+            u, v = _encode(nx, ny, nz)
             last = sizes.shape[0] - 1
             base2, stride2, fx2, fy2 = _taps(u, v, sizes[last], offsets[last])
             metal = metallic[i]
 
-            g_u = g_v = g_un = g_vn = g_t = g_scale = g_bias = g_metal = g_od = g_os = _0
+            g_u = g_v = g_un = g_vn = g_t = g_scale = g_bias = g_metal = g_vd = g_vs = _0
             half0 = _HALF * np.float32(sizes[level])
             half1 = _HALF * np.float32(sizes[level + 1])
             half2 = _HALF * np.float32(sizes[last])
             for ch in range(3):
                 g = grad[i, ch]
-                base_colour = albedo[i, ch]
-                lower = _read(table, base0, stride0, fx0, fy0, ch)
-                upper = _read(table, base1, stride1, fx1, fy1, ch)
-                irradiance = _read(table, base2, stride2, fx2, fy2, ch)
-                f0 = _F0 * (_1 - metal) + metal * base_colour
+                base = albedo[i, ch]
+                lower = _bilinear(table, base0, stride0, fx0, fy0, ch)
+                upper = _bilinear(table, base1, stride1, fx1, fy1, ch)
+                irradiance = _bilinear(table, base2, stride2, fx2, fy2, ch)
+                f0 = _F0 * (_1 - metal) + metal * base
                 light = lower + t * (upper - lower)
                 reflectance = f0 * scale + bias
-                g_d = g * open_d[i]
-                g_s = g * open_s[i]
-                g_od += g * (_1 - metal) * base_colour * irradiance
-                g_os += g * light * reflectance
+                g_d = g * visibility_d[i]
+                g_s = g * visibility_s[i]
+                g_vd += g * (_1 - metal) * base * irradiance
+                g_vs += g * light * reflectance
                 g_albedo[i, ch] = g_d * (_1 - metal) * irradiance + g_s * light * scale * metal
-                g_metal += g_s * light * scale * (base_colour - _F0) - g_d * base_colour * irradiance
+                g_metal += g_s * light * scale * (base - _F0) - g_d * base * irradiance
                 g_scale += g_s * light * f0
                 g_bias += g_s * light
                 g_light = g_s * reflectance
                 g_t += g_light * (upper - lower)
-                du, dv = _read_back(table, sink, base0, stride0, fx0, fy0, ch, g_light * (_1 - t))
+                du, dv = _bilinear_backward(table, table_grad, base0, stride0, fx0, fy0, ch, g_light * (_1 - t))
                 g_u += du * half0
                 g_v += dv * half0
-                du, dv = _read_back(table, sink, base1, stride1, fx1, fy1, ch, g_light * t)
+                du, dv = _bilinear_backward(table, table_grad, base1, stride1, fx1, fy1, ch, g_light * t)
                 g_u += du * half1
                 g_v += dv * half1
-                du, dv = _read_back(table, sink, base2, stride2, fx2, fy2, ch, g_d * (_1 - metal) * base_colour)
+                du, dv = _bilinear_backward(table, table_grad, base2, stride2, fx2, fy2, ch, g_d * (_1 - metal) * base)
                 g_un += du * half2
                 g_vn += dv * half2
             g_metallic[i] = g_metal
-            g_open_d[i] = g_od
-            g_open_s[i] = g_os
+            g_visibility_d[i] = g_vd
+            g_visibility_s[i] = g_vs
 
-            # Split-sum table: slopes along √(n·v) and roughness.
+            # Split-sum table: derivatives along √(n·v) and roughness.
             d_root = g_scale * ((_1 - fy) * (a01 - a00) + fy * (a11 - a10)) + g_bias * ((_1 - fy) * (b01 - b00) + fy * (b11 - b10))
             d_rough = g_scale * ((_1 - fx) * (a10 - a00) + fx * (a11 - a01)) + g_bias * ((_1 - fx) * (b10 - b00) + fx * (b11 - b01))
             inside = _1 if _0 <= roughness[i] <= _1 else _0
-            g_c = d_root * np.float32(lut.shape[1] - 1) * _HALF / root * _HALF * (_1 + c / hyperbola)
+            g_c = d_root * np.float32(lut.shape[1] - 1) * _HALF / root * _HALF * (_1 + c / soft_root)
 
-            # Dominant direction (1 + f (2c − 1)) n − f v and cosine c = n·v, back to the unit normal, then through the normalisation.
-            gx, gy, gz = _square_back(rx, ry, rz, g_u, g_v)
+            # Gradients of the dominant direction (1 + f (2c − 1)) n − f v and the cosine c = n·v, through the normalisation of the normal.
+            gx, gy, gz = _encode_backward(rx, ry, rz, g_u, g_v)
             g_along = gx * nx + gy * ny + gz * nz
             g_c += _2 * mirror * g_along
             g_mirror = (_2 * c - _1) * g_along - (gx * view[i, 0] + gy * view[i, 1] + gz * view[i, 2])
             g_roughness[i] = (
                 g_t / (knots[level + 1] - knots[level]) + inside * d_rough * np.float32(lut.shape[0] - 1) + g_mirror * mirror_slope
             )
-            hx, hy, hz = _square_back(nx, ny, nz, g_un, g_vn)
-            hx += along * gx + g_c * view[i, 0]
-            hy += along * gy + g_c * view[i, 1]
-            hz += along * gz + g_c * view[i, 2]
+            hx, hy, hz = _encode_backward(nx, ny, nz, g_un, g_vn)
+            hx += coeff * gx + g_c * view[i, 0]
+            hy += coeff * gy + g_c * view[i, 1]
+            hz += coeff * gz + g_c * view[i, 2]
             g_view[i, 0] = g_c * nx - mirror * gx
             g_view[i, 1] = g_c * ny - mirror * gy
             g_view[i, 2] = g_c * nz - mirror * gz
             radial = hx * nx + hy * ny + hz * nz
-            keep = inverse if inverse * inverse * SHORTEST < _1 else _0
+            keep = inverse if inverse * inverse * MIN_SQUARED_LENGTH < _1 else _0
             g_normal[i, 0] = keep * (hx - radial * nx)
             g_normal[i, 1] = keep * (hy - radial * ny)
             g_normal[i, 2] = keep * (hz - radial * nz)

@@ -18,11 +18,11 @@ from torch import Tensor
 
 from gsbake.surfels import spherical_harmonics as harmonics
 from gsbake.surfels.raster.reference import rotation_matrix
-from gsbake.surfels.transfer import DEFAULT, Transfer, named
+from gsbake.surfels.transfer import DEFAULT_TRANSFER, Transfer, transfer_by_name
 
 #: Start values of roughness (.27) and metallic (.05) before the sigmoid. A smooth start lets reflections teach the light at once; from the
 #: paper's .646 the light stays a blur and the surfaces stay rough (docs/decisions/0003-smooth-start.md).
-ROUGHNESS_START, METALLIC_START = -1.0, -3.0
+ROUGHNESS_INIT, METALLIC_INIT = -1.0, -3.0
 FORMAT = "gsbake surfels 1"
 
 
@@ -69,15 +69,15 @@ class Surfels:
         return own | {f"attributes.{k}": v for k, v in self.attributes.items()}
 
     @staticmethod
-    def of(tensors: dict[str, Tensor], transfer: Transfer) -> Surfels:
+    def from_tensors(tensors: dict[str, Tensor], transfer: Transfer) -> Surfels:
         """The surfels whose `tensors()` and transfer these are."""
         attributes = {k.removeprefix("attributes."): v for k, v in tensors.items() if k.startswith("attributes.")}
         return Surfels(attributes=attributes, transfer=transfer, **{k: v for k, v in tensors.items() if "." not in k})
 
-    def joined(self, more: Surfels) -> Surfels:
+    def concat(self, more: Surfels) -> Surfels:
         """These surfels, then `more`; sharpness and transfer stay this one's."""
         other = more.tensors()
-        return Surfels.of({k: v if k == "gamma" else torch.cat([v, other[k]]) for k, v in self.tensors().items()}, self.transfer)
+        return Surfels.from_tensors({k: v if k == "gamma" else torch.cat([v, other[k]]) for k, v in self.tensors().items()}, self.transfer)
 
     def features(self, camera_centre: Tensor) -> Tensor:
         """What is blended per surfel: rgb (n, 3) seen from `camera_centre` (3,), or base colour, roughness, metallic (n, 5)."""
@@ -95,12 +95,12 @@ class Surfels:
 
     def to(self, device: str | torch.device) -> Surfels:
         """The surfels with all tensors on `device`."""
-        return Surfels.of({k: v.to(device) for k, v in self.tensors().items()}, self.transfer)
+        return Surfels.from_tensors({k: v.to(device) for k, v in self.tensors().items()}, self.transfer)
 
     def save(self, path: Path) -> None:
         """Write as safetensors; the transfer is named in the metadata unless it is the default."""
         # one key for both: with several their order in the file is by chance, and its digest with it
-        kind = FORMAT if self.transfer.name == DEFAULT else f"{FORMAT}, {self.transfer.name}"
+        kind = FORMAT if self.transfer.name == DEFAULT_TRANSFER else f"{FORMAT}, {self.transfer.name}"
         save_file({k: v.detach().contiguous().cpu() for k, v in self.tensors().items()}, str(path), {"format": kind})
 
     @staticmethod
@@ -109,10 +109,10 @@ class Surfels:
         with safe_open(str(path), "pt") as file:
             all_ = {k: file.get_tensor(k) for k in file.keys()}  # noqa: SIM118 (safetensors has no iterator)
             kind = (file.metadata() or {}).get("format", FORMAT)
-        return Surfels.of(all_, named(kind.removeprefix(FORMAT).removeprefix(", ") or DEFAULT))
+        return Surfels.from_tensors(all_, transfer_by_name(kind.removeprefix(FORMAT).removeprefix(", ") or DEFAULT_TRANSFER))
 
 
-def quaternion_to(normals: Tensor) -> Tensor:
+def quaternion_from_normal(normals: Tensor) -> Tensor:
     """Shortest rotations (n, 4) that turn +z to the unit normals (n, 3)."""
     w = 1 + normals[:, 2]
     q = torch.stack([w, -normals[:, 1], normals[:, 0], torch.zeros_like(w)], 1)
@@ -130,7 +130,7 @@ def create(
     sh_degree: int,
     sdf: float,
     gamma: float,
-    transfer: str = DEFAULT,
+    transfer: str = DEFAULT_TRANSFER,
 ) -> Surfels:
     """New surfels at points (n, 3) with unit normals (n, 3), neighbour distance `spacing` (n,) and sRGB colours (n, 3) in 0..1 or
     None (grey)."""
@@ -143,8 +143,8 @@ def create(
         linear = ((rgb + 0.055) / 1.055).clamp_min(0.04) ** 2.4
         attributes = {
             "albedo": torch.logit(linear.clamp(0.02, 0.98)),
-            "roughness": torch.full((n,), ROUGHNESS_START),
-            "metallic": torch.full((n,), METALLIC_START),
+            "roughness": torch.full((n,), ROUGHNESS_INIT),
+            "metallic": torch.full((n,), METALLIC_INIT),
         }
     else:
         sh = torch.zeros(n, (sh_degree + 1) ** 2, 3)
@@ -152,4 +152,5 @@ def create(
         attributes = {"sh": sh}
     # σ of .6 neighbour distances: discs overlap without smearing
     log_scale = torch.from_numpy(np.log(0.6 * np.maximum(spacing, 1e-5)).astype(np.float32))[:, None].repeat(1, 2)
-    return Surfels(position, quaternion_to(normal), log_scale, torch.full((n,), sdf), torch.tensor([gamma]), attributes, named(transfer))
+    rotation, samples = quaternion_from_normal(normal), torch.full((n,), sdf)
+    return Surfels(position, rotation, log_scale, samples, torch.tensor([gamma]), attributes, transfer_by_name(transfer))

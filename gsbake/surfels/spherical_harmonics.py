@@ -20,7 +20,7 @@ SH0 = 0.28209479177387814  # Y_00
 SH1 = 0.4886025119029199  # Y_1m
 SH2 = (1.0925484305920792, 0.31539156525252005, 0.5462742152960396)  # xy, yz and xz; z²; x² − y²
 _0, _1, _2, _3, _4 = (np.float32(x) for x in (SH0, SH1, *SH2))
-_ONE, _TWO, _HALF, _SHORTEST = np.float32(1.0), np.float32(2.0), np.float32(0.5), np.float32(1e-12)
+_ONE, _TWO, _HALF, _MIN_LENGTH = np.float32(1.0), np.float32(2.0), np.float32(0.5), np.float32(1e-12)
 _CHUNK = 4096
 
 
@@ -44,7 +44,7 @@ def twin(sh: Tensor, position: Tensor, centre: Tensor) -> Tensor:
 def _basis(position, centre, i, degree, basis):  # type: ignore[no-untyped-def]
     """The basis at surfel i; `basis` (9,)."""
     x, y, z = position[i, 0] - centre[0], position[i, 1] - centre[1], position[i, 2] - centre[2]
-    inverse = _ONE / max(np.sqrt(x * x + y * y + z * z), _SHORTEST)
+    inverse = _ONE / max(np.sqrt(x * x + y * y + z * z), _MIN_LENGTH)
     x, y, z = x * inverse, y * inverse, z * inverse
     basis[0] = _0
     if degree > 0:

@@ -34,7 +34,7 @@ from torch import Tensor
 from gsbake.errors import BadInputError
 
 #: |s| (unit frame) below which the sharpness aimed at no longer follows the median, and the share of the peak it aims at there.
-SETTLED, SETTLED_SHARE = 0.1, 0.95
+TARGET_MEDIAN_MIN, TARGET_SHARE = 0.1, 0.95
 
 _C = math.log(100.0)
 _EC = 100.0
@@ -47,7 +47,7 @@ class Transfer:
     name: str
     peak: float
     value: Callable[[Tensor], Tensor]
-    reach: Callable[[Tensor], Tensor]
+    inverse: Callable[[Tensor], Tensor]
 
     def opacity(self, sdf: Tensor, gamma: Tensor) -> Tensor:
         """Opacity in [0, peak] of SDF samples (n,) at sharpness `gamma` (scalar or (n,)); even in sdf."""
@@ -55,16 +55,16 @@ class Transfer:
 
     def distance(self, alpha: Tensor, gamma: Tensor) -> Tensor:
         """|s| whose opacity is alpha at sharpness `gamma`; 0 where alpha is the peak or more, alpha below 1e-12 counts as 1e-12."""
-        return self.reach(alpha.clamp(1e-12, self.peak)).clamp_min(0) / gamma
+        return self.inverse(alpha.clamp(1e-12, self.peak)).clamp_min(0) / gamma
 
-    def reach_of(self, share: float) -> float:
+    def half_width(self, share: float) -> float:
         """x at which the opacity is this share, in (0, 1], of the peak."""
-        return float(self.reach(torch.tensor(share * self.peak, dtype=torch.float64)))
+        return float(self.inverse(torch.tensor(share * self.peak, dtype=torch.float64)))
 
-    def median_target(self, median: float) -> float:
+    def target_sharpness(self, median: float) -> float:
         """Sharpness aimed at for a median |s| > 0: half the peak at the median while the samples are wide, then the constant γ with
         .95 of the peak at .1."""
-        return self.reach_of(0.5) / median if median > SETTLED else self.reach_of(SETTLED_SHARE) / SETTLED
+        return self.half_width(0.5) / median if median > TARGET_MEDIAN_MIN else self.half_width(TARGET_SHARE) / TARGET_MEDIAN_MIN
 
 
 def _bell(x: Tensor) -> Tensor:
@@ -93,10 +93,10 @@ TRANSFERS = {
         Transfer("neus", 1 - math.exp(-_C), _neus, lambda a: torch.log((_EC - 1 / _EC - a * _EC) / a)),
     )
 }
-DEFAULT = "sech2"
+DEFAULT_TRANSFER = "sech2"
 
 
-def named(name: str) -> Transfer:
+def transfer_by_name(name: str) -> Transfer:
     """The transfer of this name; BadInputError if there is none."""
     if name not in TRANSFERS:
         raise BadInputError(f"the surfels were trained with an unknown transfer {name!r}; this version knows {', '.join(TRANSFERS)}.")

@@ -67,8 +67,8 @@ def test_the_clock_counts_what_a_stages_process_takes_and_remembers_it(tmp_path:
         return StageState(name, name, "run", (), None, Artifact(tmp_path / name / "key", {}, {}))
 
     clock, train = CpuClock(tmp_path / "cpu.json"), state("train")
-    clock.starts(train)
+    clock.stage_started(train)
     subprocess.run([sys.executable, "-c", "import time\nwhile time.process_time() < 0.5: pass"], check=True)
-    clock.finished(train)
+    clock.stage_finished(train)
     assert clock.total([train]) > 0.4  # what the process says of itself, whatever else runs
     assert CpuClock(tmp_path / "cpu.json").total([train, state("mesh")]) == clock.total([train])

@@ -35,9 +35,9 @@ Run = Callable[..., End]
 @pytest.fixture
 def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> Iterator[Run]:
     """Run a command in this process, in an empty current folder, over the toy stages."""
-    import gsbake.cli.session
+    import gsbake.api
 
-    monkeypatch.setattr(gsbake.cli.session, "REGISTRY", toy_bake.REGISTRY)
+    monkeypatch.setattr(gsbake.api, "REGISTRY", toy_bake.REGISTRY)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("COLUMNS", "200")
     handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
@@ -73,7 +73,13 @@ def test_run_puts_the_results_and_then_serves_them(run: Run, capture: Path, tmp_
     assert {p.name for p in out.iterdir()} >= {"asset.glb", "cameras.json", "light.hdr", "report.html", "events.jsonl"}
     assert (out / "asset.glb").read_text() == "glb ply 30000"
     assert "gsbake: warning (ingest): photo 3 is blurred" in end.err
-    assert "mesh: Meshing (it has not run yet)" in end.out and "asset.glb" in end.out.splitlines()[-1]
+    lines = end.out.splitlines()
+    assert [line.split()[1] for line in lines[:4]] == ["ingest:", "mesh:", "export:", "report:"]  # one line a stage
+    assert lines[1].endswith("faces 30 000") and "all used" not in end.out
+    assert [line.split()[0] for line in lines[4:]] == ["Asset", "Warnings", "Report", "Time"]
+    assert lines[4].split()[1] == "out/tankard/asset.glb"
+    told = run("run", capture, "--out", "other", "-v").out
+    assert "mesh: Meshing (not run yet)" in told and "ingest: skip.redundant_photos: all used (none twice)" in told
     again = run("run", capture)
     assert again.out.count("cached") == 4 and again.err == ""
     manifest = json.loads(next(out.glob("stages/ingest/*/manifest.json")).read_text())
@@ -157,9 +163,9 @@ def test_replace_and_undo(run: Run, capture: Path, tmp_path: Path) -> None:
         (["run", "tankard", "--masks", "nomasks"], 42, "nomasks does not exist"),
         (["run"], 2, "give the folder of photos"),
         (["mesh", "--out", "new"], 2, "holds no run yet"),
-        (["run", "tankard", "--out", "tankard/images/a.jpg"], 2, "a file of that name is in the way"),
+        (["run", "tankard", "--out", "tankard/images/a.jpg"], 2, "a file of that name exists"),
         (["run", "tankard", "--out", "/proc/nowhere"], 42, "choose another with --out"),
-        (["run", "tankard", "--device", "cuda"], 2, "--device cuda cannot be had"),
+        (["run", "tankard", "--device", "cuda"], 2, "--device cuda is not available"),
     ],
 )
 def test_each_mistake_has_its_sentence_and_code(

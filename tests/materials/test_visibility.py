@@ -181,7 +181,7 @@ class Tray:
             ray = rng.normal(size=(len(texels), 3))
             ray = ray / np.linalg.norm(ray, axis=1, keepdims=True) + normal
             hits = self.box.caster.first_hit(at + 1e-4 * normal, ray)
-            direct[~hits.hit] += cube[cubemap.texel(32, ray[~hits.hit])] / rounds
+            direct[~hits.hit] += cube[cubemap.texel_index(32, ray[~hits.hit])] / rounds
             faces, bary = self.box.caster.faces[hits.face[hits.hit]], hits.bary[hits.hit]
             column, row = (np.einsum("nk,nkd->nd", bary, self.box.uv[faces]) * texels.size).astype(int).T
             links.append((np.flatnonzero(hits.hit), slot[row * texels.size + column]))

@@ -1,4 +1,4 @@
-"""The engine on toy stages: what runs, what is served, what a manifest says, and how failures end."""
+"""The engine on toy stages: cache hits and misses, manifests, and errors."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def total(steps: int, words: int, seed: int = 0) -> int:
     return value
 
 
-def test_runs_once_and_then_serves(tmp_path: Path, photos: Path) -> None:
+def test_second_run_is_cached(tmp_path: Path, photos: Path) -> None:
     first, seen = engine(tmp_path / "out", photos)
     states = first.run()
     assert seen.ran == ["read", "sum", "tell"] and seen.cached == []
@@ -42,7 +42,7 @@ def test_runs_once_and_then_serves(tmp_path: Path, photos: Path) -> None:
     assert again.ran == [] and again.cached == ["read", "sum", "tell"]
 
 
-def test_manifest_tells_all(tmp_path: Path, photos: Path) -> None:
+def test_manifest_content(tmp_path: Path, photos: Path) -> None:
     states = engine(tmp_path / "out", photos)[0].run()
     manifest = json.loads((states[1].artifact.folder / "manifest.json").read_text())  # type: ignore[union-attr]
     assert manifest["settings"] == {"sum.step_seconds": 0.0, "sum.steps": 10}
@@ -59,11 +59,11 @@ def test_manifest_tells_all(tmp_path: Path, photos: Path) -> None:
     assert read["inputs"]["photos"]["files"].keys() == {"a.txt", "b.txt"}
     events = [json.loads(line) for line in (tmp_path / "out" / "events.jsonl").read_text().splitlines()]
     assert [e["event"] for e in events if e.get("stage") == "sum"] == ["stage started", "decision", "stage finished"]
-    assert manifest["decisions"] == [{"what": "rest", "choice": "left out", "evidence": "a sum needs none", "saved_s": 12.3}]
+    assert manifest["decisions"] == [{"what": "rest", "choice": "skipped", "evidence": "not needed", "saved_s": 12.3}]
     assert events[-1]["event"] == "run ended" and events[-1]["exit_code"] == 0
 
 
-def test_declared_field_runs_only_what_reads_it(tmp_path: Path, photos: Path) -> None:
+def test_changed_setting_reruns_only_the_stages_that_declare_it(tmp_path: Path, photos: Path) -> None:
     engine(tmp_path / "out", photos)[0].run()
     changed, seen = engine(tmp_path / "out", photos, Toy(sum=Sum(steps=11)))
     assert [(s.name, s.status) for s in changed.plan()] == [("read", "cached"), ("sum", "run"), ("tell", "waits")]
@@ -72,7 +72,7 @@ def test_declared_field_runs_only_what_reads_it(tmp_path: Path, photos: Path) ->
     assert seen.cached == ["read"] and seen.ran == ["sum", "tell"]
     back, seen = engine(tmp_path / "out", photos, Toy(sum=Sum(ignored="y")))
     back.run()
-    assert seen.ran == []  # back to the old value, and an undeclared field does not count
+    assert seen.ran == []  # the old value again, and an undeclared field
 
 
 def test_early_cut_off(tmp_path: Path, photos: Path) -> None:
@@ -85,14 +85,14 @@ def test_early_cut_off(tmp_path: Path, photos: Path) -> None:
     assert seen.ran == ["read"] and seen.cached == ["sum", "tell"]
 
 
-def test_reasons_name_files(tmp_path: Path, photos: Path) -> None:
+def test_reasons_name_changed_files(tmp_path: Path, photos: Path) -> None:
     engine(tmp_path / "out", photos)[0].run()
     (photos / "b.txt").unlink()
     (photos / "c.txt").write_text("four")
     assert engine(tmp_path / "out", photos)[0].plan()[0].reasons == ("photos: c.txt added, b.txt removed",)
 
 
-def test_new_field_at_its_default_keeps_keys(tmp_path: Path, photos: Path) -> None:
+def test_new_field_at_its_default_keeps_the_keys(tmp_path: Path, photos: Path) -> None:
     engine(tmp_path / "out", photos)[0].run()
     registry = Registry(
         {"read": "tests.pipeline.toy:READ", "sum": "tests.pipeline.test_engine:WIDER_SUM", "tell": "tests.pipeline.toy:TELL"}
@@ -104,17 +104,17 @@ def test_new_field_at_its_default_keeps_keys(tmp_path: Path, photos: Path) -> No
     assert other.plan()[1].reasons == ("sum.extra: 7 → 8",)
 
 
-def test_changed_default_is_noticed(tmp_path: Path, photos: Path) -> None:
+def test_changed_default_is_detected(tmp_path: Path, photos: Path) -> None:
     engine(tmp_path / "out", photos)[0].run()
     assert engine(tmp_path / "out", photos, OtherDefault())[0].plan()[1].status == "run"
 
 
-def test_damaged_and_half_written_outputs_do_not_count(tmp_path: Path, photos: Path) -> None:
+def test_damaged_artifacts_are_invalid(tmp_path: Path, photos: Path) -> None:
     states = engine(tmp_path / "out", photos)[0].run()
     folder = states[1].artifact.folder  # type: ignore[union-attr]
     (folder / "total.txt").write_text("123")
     again, seen = engine(tmp_path / "out", photos)
-    assert "total.txt" in again.plan()[1].reasons[0] and "changed after" in again.plan()[1].reasons[0]
+    assert "total.txt" in again.plan()[1].reasons[0] and "was modified" in again.plan()[1].reasons[0]
     again.run()
     assert seen.ran == ["sum"] and (folder / "total.txt").read_text() == str(total(10, 3))
     (folder / "manifest.json").unlink()
@@ -127,10 +127,10 @@ def test_damaged_and_half_written_outputs_do_not_count(tmp_path: Path, photos: P
     again.run()
     assert seen.ran == ["sum"] and (folder / "manifest.json").read_text() != text.replace('"total": ', '"total": 1')
     (folder / "total.txt").unlink()
-    assert "is gone" in engine(tmp_path / "out", photos)[0].plan()[1].reasons[0]
+    assert "is missing" in engine(tmp_path / "out", photos)[0].plan()[1].reasons[0]
 
 
-def test_seed_and_only_needed_stages(tmp_path: Path, photos: Path) -> None:
+def test_seed_and_target(tmp_path: Path, photos: Path) -> None:
     engine(tmp_path / "out", photos)[0].run()
     seeded, seen = engine(tmp_path / "out", photos, seed=4)
     assert seeded.plan()[1].reasons == ("seed: 0 → 4",)
@@ -141,7 +141,7 @@ def test_seed_and_only_needed_stages(tmp_path: Path, photos: Path) -> None:
         seeded.run("sun")
 
 
-def test_copy_of_the_capture_has_the_same_keys(tmp_path: Path, photos: Path) -> None:
+def test_copied_photos_have_the_same_keys(tmp_path: Path, photos: Path) -> None:
     engine(tmp_path / "out", photos)[0].run()
     shutil.copytree(photos, tmp_path / "elsewhere")
     moved, seen = engine(tmp_path / "out", tmp_path / "elsewhere")
@@ -162,12 +162,12 @@ def test_undeclared_setting_fails_the_stage(tmp_path: Path, photos: Path) -> Non
     ("kind", "error", "text", "code"),
     [
         ("bad", BadInputError, "The toy is broken; buy another.", 42),
-        ("memory", BadInputError, "Memory ran out", 42),
+        ("memory", BadInputError, "Out of memory", 42),
         ("full", BadInputError, "is full; free some space", 42),
-        ("other", StageFailed, "ValueError: nobody foresaw this", 1),
+        ("other", StageFailed, "ValueError: unexpected value", 1),
     ],
 )
-def test_failures_keep_their_meaning(tmp_path: Path, kind: str, error: type[BadInputError], text: str, code: int) -> None:
+def test_errors_of_a_stage_are_raised_again(tmp_path: Path, kind: str, error: type[BadInputError], text: str, code: int) -> None:
     folder = tmp_path / "photos"
     folder.mkdir()
     (folder / "kind.txt").write_text(kind)
@@ -177,7 +177,7 @@ def test_failures_keep_their_meaning(tmp_path: Path, kind: str, error: type[BadI
     assert "\n" not in str(caught.value)
 
 
-def test_crash_in_native_code_is_a_sentence(tmp_path: Path, photos: Path) -> None:
+def test_native_crash_raises_stage_failed(tmp_path: Path, photos: Path) -> None:
     with pytest.raises(StageFailed, match="ended with SIGABRT"):
         engine(tmp_path / "out", photos, registry=only("crash"))[0].run()
     saved = list((tmp_path / "out" / "errors").iterdir())
@@ -186,9 +186,9 @@ def test_crash_in_native_code_is_a_sentence(tmp_path: Path, photos: Path) -> Non
 
 def test_unwritable_output(tmp_path: Path, photos: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "file").write_text("")
-    with pytest.raises(UsageError, match="a file of that name is in the way"):
+    with pytest.raises(UsageError, match="a file of that name exists"):
         engine(tmp_path / "file", photos)[0].run()
-    with pytest.raises(BadInputError, match="cannot be made"):
+    with pytest.raises(BadInputError, match="cannot be created"):
         engine(Path("/proc/gsbake-out"), photos)[0].run()
 
     def refuse(path: Path, *_: object) -> None:
@@ -199,13 +199,13 @@ def test_unwritable_output(tmp_path: Path, photos: Path, monkeypatch: pytest.Mon
         engine(tmp_path / "out", photos)[0].run()
 
 
-def test_disk_error_leaves_other_errors_alone(tmp_path: Path) -> None:
+def test_disk_error_ignores_other_errors(tmp_path: Path) -> None:
     assert disk_error(ValueError("x"), tmp_path) is None
     assert disk_error(PermissionError(13, "Permission denied", "/elsewhere/photo.jpg"), tmp_path) is None
     assert disk_error(PermissionError(13, "Permission denied", str(tmp_path / "a" / "b")), tmp_path) is not None
 
 
-# Stages and profiles that only these tests need.
+# Stages and profiles of these tests only.
 from gsbake.pipeline.stage import Stage  # noqa: E402
 from tests.pipeline import toy  # noqa: E402
 

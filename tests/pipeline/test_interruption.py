@@ -1,4 +1,4 @@
-"""Kills, signals and two runs at once: whatever happens, the same command goes on and the result is whole."""
+"""Kills, signals and concurrent runs: the same command resumes and gives a complete result."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from pathlib import Path
 import psutil
 import pytest
 
-from gsbake.pipeline.lease import Holder, Lease, boot_id
+from gsbake.pipeline.lease import Lease, LeaseHolder, boot_id
 from tests.pipeline.test_engine import total
 from tests.pipeline.toy import Sum, Toy, engine
 
@@ -31,7 +31,7 @@ def photos(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def started() -> Iterator[list[subprocess.Popen[str]]]:
-    """Processes a test started; none outlives it."""
+    """Processes that a test started; killed at its end."""
     processes: list[subprocess.Popen[str]] = []
     yield processes
     for process in processes:
@@ -49,7 +49,7 @@ def start(processes: list[subprocess.Popen[str]], *arguments: object) -> subproc
 
 
 def wait_for(out: Path, pattern: str, seconds: float = 20.0) -> Path:
-    """The first file under `out` that matches, as soon as it is there."""
+    """Wait for a file under `out` that matches, and return it."""
     end = time.monotonic() + seconds
     while time.monotonic() < end:
         for path in out.glob(pattern):
@@ -69,7 +69,7 @@ def wait_until_step(out: Path, step: int) -> None:
         time.sleep(0.02)
 
 
-def test_kill_9_then_the_same_command(tmp_path: Path, photos: Path, started: list[subprocess.Popen[str]]) -> None:
+def test_run_resumes_after_kill(tmp_path: Path, photos: Path, started: list[subprocess.Popen[str]]) -> None:
     out = tmp_path / "out"
     process = start(started, out, photos, "chain", 60, 0.05)
     wait_until_step(out, 5)
@@ -77,7 +77,7 @@ def test_kill_9_then_the_same_command(tmp_path: Path, photos: Path, started: lis
     process.kill()
     process.communicate()
     gone, alive = psutil.wait_procs(workers, timeout=5)
-    assert gone and not alive  # the worker dies with its supervisor
+    assert gone and not alive  # the worker ends with its supervisor
     assert list((out / "stages" / "sum").glob("*.tmp-*"))
     assert not list((out / "stages" / "tell").glob("*")) if (out / "stages" / "tell").exists() else True
     reached = steps_done(out)
@@ -93,7 +93,7 @@ def test_kill_9_then_the_same_command(tmp_path: Path, photos: Path, started: lis
     assert left == [states[1].artifact.folder.name]  # type: ignore[union-attr]
 
 
-def test_killed_worker_is_an_interruption(tmp_path: Path, photos: Path, started: list[subprocess.Popen[str]]) -> None:
+def test_killed_worker_is_reported_as_interruption(tmp_path: Path, photos: Path, started: list[subprocess.Popen[str]]) -> None:
     out = tmp_path / "out"
     process = start(started, out, photos, "chain", 200, 0.05)
     wait_until_step(out, 3)
@@ -104,7 +104,7 @@ def test_killed_worker_is_an_interruption(tmp_path: Path, photos: Path, started:
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_signal_ends_with_75_in_seconds(tmp_path: Path, photos: Path, started: list[subprocess.Popen[str]], number: signal.Signals) -> None:
+def test_signal_ends_with_exit_code_75(tmp_path: Path, photos: Path, started: list[subprocess.Popen[str]], number: signal.Signals) -> None:
     out = tmp_path / "out"
     process = start(started, out, photos, "chain", 500, 0.05)
     wait_until_step(out, 3)
@@ -117,21 +117,21 @@ def test_signal_ends_with_75_in_seconds(tmp_path: Path, photos: Path, started: l
     assert steps_done(out) >= 3
 
 
-def test_deaf_stage_is_ended_by_force(tmp_path: Path, photos: Path, started: list[subprocess.Popen[str]]) -> None:
+def test_second_signal_kills_the_stage(tmp_path: Path, photos: Path, started: list[subprocess.Popen[str]]) -> None:
     out = tmp_path / "out"
     process = start(started, out, photos, "stubborn")
     wait_for(out, "stages/stubborn/*.tmp-*/half.txt")
     begin = time.monotonic()
     process.send_signal(signal.SIGINT)
     time.sleep(0.5)
-    process.send_signal(signal.SIGINT)  # the second one does not wait
+    process.send_signal(signal.SIGINT)  # the second signal does not wait for the timeout
     _, errors = process.communicate(timeout=20)
-    assert process.returncode == 75 and time.monotonic() - begin < 4 and "by force" in errors
+    assert process.returncode == 75 and time.monotonic() - begin < 4 and "Killed on request" in errors
     assert not [p for p in (out / "stages" / "stubborn").iterdir() if not p.name.startswith(".")]
 
 
 @pytest.mark.slow
-def test_deaf_stage_is_ended_after_the_grace(tmp_path: Path, photos: Path, started: list[subprocess.Popen[str]]) -> None:
+def test_stage_is_killed_after_the_timeout(tmp_path: Path, photos: Path, started: list[subprocess.Popen[str]]) -> None:
     process = start(started, tmp_path / "out", photos, "stubborn")
     wait_for(tmp_path / "out", "stages/stubborn/*.tmp-*/half.txt")
     begin = time.monotonic()
@@ -140,7 +140,7 @@ def test_deaf_stage_is_ended_after_the_grace(tmp_path: Path, photos: Path, start
     assert process.returncode == 75 and 4 < time.monotonic() - begin < 8
 
 
-def test_two_runs_at_once(tmp_path: Path, photos: Path, started: list[subprocess.Popen[str]]) -> None:
+def test_concurrent_runs_share_one_computation(tmp_path: Path, photos: Path, started: list[subprocess.Popen[str]]) -> None:
     out = tmp_path / "out"
     first = start(started, out, photos, "chain", 40, 0.05)
     wait_until_step(out, 2)
@@ -160,45 +160,45 @@ def dead_pid() -> int:
 @pytest.mark.parametrize(
     "holder",
     [
-        Holder(os.uname().nodename, boot_id(), dead_pid(), time.time() - 100),
-        Holder(os.uname().nodename, "another boot", 1, 0.0),
-        Holder(os.uname().nodename, boot_id(), os.getpid(), 12345.0),  # same number, another process
+        LeaseHolder(os.uname().nodename, boot_id(), dead_pid(), time.time() - 100),
+        LeaseHolder(os.uname().nodename, "another boot", 1, 0.0),
+        LeaseHolder(os.uname().nodename, boot_id(), os.getpid(), 12345.0),  # same pid, another process
     ],
     ids=["dead process", "other boot", "recycled pid"],
 )
-def test_lapsed_lease_is_taken_over(tmp_path: Path, holder: Holder) -> None:
+def test_stale_lease_is_taken_over(tmp_path: Path, holder: LeaseHolder) -> None:
     lease = Lease(tmp_path / "x.lease")
     lease.path.write_text(json.dumps(holder.__dict__))
     waited: list[object] = []
     assert lease.acquire(waited.append) == holder
     assert waited == []
-    assert Holder.read(lease.path).pid == os.getpid()  # type: ignore[union-attr]
+    assert LeaseHolder.read(lease.path).pid == os.getpid()  # type: ignore[union-attr]
     lease.release()
     assert not lease.path.exists()
 
 
-def test_lease_of_another_host_lapses_when_its_heart_stands_still(tmp_path: Path) -> None:
-    lease = Lease(tmp_path / "x.lease", patience=0.6)
-    holder = Holder("another-host", "b", 1, 0.0, beat=3)
+def test_lease_of_another_host_is_stale_without_heartbeats(tmp_path: Path) -> None:
+    lease = Lease(tmp_path / "x.lease", heartbeat_timeout=0.6)
+    holder = LeaseHolder("another-host", "b", 1, 0.0, beat=3)
     lease.path.write_text(json.dumps(holder.__dict__))
     beats = iter(range(4, 7))
 
-    def beat(seen: Holder | None) -> None:
+    def beat(_: LeaseHolder | None) -> None:
         number = next(beats, None)
-        if number is not None:  # three more heartbeats, then silence
+        if number is not None:  # three more heartbeats, then none
             lease.path.write_text(json.dumps({**holder.__dict__, "beat": number}))
 
     begin = time.monotonic()
     taken = lease.acquire(beat)
     lease.release()
     assert taken is not None and taken.beat == 6
-    assert time.monotonic() - begin > 1.0  # 3 polls with news, then the patience
+    assert time.monotonic() - begin > 1.0  # three polls with heartbeats, then the timeout
 
 
-def test_lease_heartbeat_moves_and_unreadable_lease_does_not_block(tmp_path: Path) -> None:
-    lease = Lease(tmp_path / "x.lease", beat=0.05)
+def test_lease_sends_heartbeats_and_replaces_an_unreadable_file(tmp_path: Path) -> None:
+    lease = Lease(tmp_path / "x.lease", heartbeat_interval=0.05)
     lease.path.write_text("{half a")
     assert lease.acquire() is None
     time.sleep(0.4)
-    assert Holder.read(lease.path).beat >= 2  # type: ignore[union-attr]
+    assert LeaseHolder.read(lease.path).beat >= 2  # type: ignore[union-attr]
     lease.release()

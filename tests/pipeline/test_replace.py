@@ -1,4 +1,4 @@
-"""A person's file in place of a stage's output, and back."""
+"""Replacement of a stage's output by the user's files, and undoing it."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def photos(tmp_path: Path) -> Path:
     return folder
 
 
-def test_replaced_output_feeds_the_stages_after_it(tmp_path: Path, photos: Path) -> None:
+def test_later_stages_read_the_replaced_output(tmp_path: Path, photos: Path) -> None:
     out, mine = tmp_path / "out", tmp_path / "mine.txt"
     mine.write_text("777")
     first, _ = engine(out, photos)
@@ -42,7 +42,7 @@ def test_replaced_output_feeds_the_stages_after_it(tmp_path: Path, photos: Path)
         undo_replacement(third.store, "sum")
 
 
-def test_replacing_again_drops_the_earlier_one_and_keeps_other_files(tmp_path: Path, photos: Path) -> None:
+def test_second_replacement_deletes_the_first_and_keeps_other_files(tmp_path: Path, photos: Path) -> None:
     made, _ = engine(tmp_path / "out", photos)
     made.run()
     folder = tmp_path / "mine"
@@ -57,7 +57,7 @@ def test_replacing_again_drops_the_earlier_one_and_keeps_other_files(tmp_path: P
     assert len([p for p in (tmp_path / "out" / "stages" / "sum").glob("by-hand-*")]) == 1
 
 
-def test_damaged_replacement_is_said(tmp_path: Path, photos: Path) -> None:
+def test_damaged_replacement_raises(tmp_path: Path, photos: Path) -> None:
     made, _ = engine(tmp_path / "out", photos)
     made.run()
     (tmp_path / "total.txt").write_text("2")

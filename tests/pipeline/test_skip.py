@@ -1,4 +1,4 @@
-"""Decisions on skipped work: evidence against profile, what is reported, and that seconds saved reach the manifest."""
+"""Decisions on skipped work: setting and evidence, report, and saved time in manifest and event log."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from tests.support.recorder import Recorder
     ("rule", "holds", "skip"),
     [("auto", True, True), ("auto", False, False), ("always", False, True), ("never", True, False)],
 )
-def test_the_profile_overrules_the_evidence(rule: Rule, holds: bool, skip: bool) -> None:
+def test_setting_overrides_evidence(rule: Rule, holds: bool, skip: bool) -> None:
     monitor = Recorder()
     assert skips(rule, holds) is skip
     assert decide_skip(monitor, "redundant_photos", rule, holds, "3 of 9", "dropped", "kept", 4.0) is skip
@@ -26,13 +26,13 @@ def test_the_profile_overrules_the_evidence(rule: Rule, holds: bool, skip: bool)
     assert monitor.saved["skip.redundant_photos"] == (4.0 if skip else None)
 
 
-def test_seconds_saved_reach_manifest_and_log(tmp_path: Path) -> None:
+def test_saved_time_is_in_manifest_and_event_log(tmp_path: Path) -> None:
     photos = tmp_path / "photos"
     photos.mkdir()
     (photos / "a.txt").write_text("one two")
     states = engine(tmp_path / "out", photos)[0].run()
     assert states[1].artifact is not None
-    done = {"what": "rest", "choice": "left out", "evidence": "a sum needs none", "saved_s": 12.3}
+    done = {"what": "rest", "choice": "skipped", "evidence": "not needed", "saved_s": 12.3}
     assert states[1].artifact.manifest["decisions"] == [done]
     lines = [json.loads(line) for line in (tmp_path / "out" / "events.jsonl").read_text().splitlines()]
     assert [e.get("saved_s") for e in lines if e["event"] == "decision"] == [None, 12.3]

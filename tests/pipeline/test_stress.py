@@ -1,4 +1,4 @@
-"""Faults at random: kills at any moment, files cut short, flipped or deleted; afterwards the same command gives the same result."""
+"""Random kills, and truncated, corrupted and deleted files; afterwards the same command gives the same result."""
 
 from __future__ import annotations
 
@@ -56,10 +56,10 @@ def test_damage_to_any_file(tmp_path: Path, photos: Path, seed: int) -> None:
     victims = sorted(p for p in out.rglob("*") if p.is_file() and p.name not in ("project.json", "events.jsonl"))
     for path in rng.sample(victims, 3):
         data = bytearray(path.read_bytes())
-        match rng.choice(("delete", "cut", "flip")):
+        match rng.choice(("delete", "truncate", "flip")):
             case "delete":
                 path.unlink()
-            case "cut":
+            case "truncate":
                 path.write_bytes(data[: len(data) // 2])
             case _ if data:
                 data[rng.randrange(len(data))] ^= 1 << rng.randrange(8)

@@ -1,4 +1,4 @@
-"""Toy stages for the engine's tests: words in files, counted, multiplied and slowly summed."""
+"""Toy stages for tests of the engine: read words, sum over steps, write the total."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class LaterSum(Sum):
 
 
 class LaterToy(BaseModel):
-    """The same profile in a later version: one more field."""
+    """The toy profile with one more field."""
 
     read: Read = Read()
     sum: LaterSum = LaterSum()
@@ -57,7 +57,7 @@ def _read(ctx: Context) -> dict[str, Any]:
 
 
 def _sum(ctx: Context) -> dict[str, Any]:
-    """A running digest over the steps, resumable, one line a step; 'pids' tells which processes took part."""
+    """Sum over steps, with a checkpoint after each."""
     state = {"step": 0, "total": ctx.seed}
     saved = ctx.checkpoint / "state.json"
     if saved.exists():
@@ -74,7 +74,7 @@ def _sum(ctx: Context) -> dict[str, Any]:
             ctx.progress(state["step"], steps, psnr=float(state["step"]))
             if ctx.stop_requested():
                 ctx.check_stop()
-    ctx.decide("rest", "left out", "a sum needs none", 12.345)
+    ctx.decide("rest", "skipped", "not needed", 12.345)
     (ctx.out / "total.txt").write_text(str(state["total"]))
     return {"total": state["total"]}
 
@@ -89,7 +89,7 @@ def _undeclared(ctx: Context) -> dict[str, Any]:
 
 
 def _stubborn(ctx: Context) -> dict[str, Any]:
-    """Neither polls nor reports; holds the interpreter's attention in small sleeps, deaf to signals."""
+    """Ignores SIGTERM and does not poll for stop requests."""
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     (ctx.out / "half.txt").write_text("half")
     ctx.progress(0, 1)
@@ -111,7 +111,7 @@ def _raise(ctx: Context) -> dict[str, Any]:
         raise MemoryError("no room")
     if kind == "full":
         raise OSError(28, "No space left on device", str(ctx.out / "x"))
-    raise ValueError("nobody foresaw this")
+    raise ValueError("unexpected value")
 
 
 READ = Stage("read", 1, "Read words", _read, sources=("photos",), settings=("read.*",))
@@ -131,7 +131,7 @@ def only(name: str) -> Registry:
 
 
 class Recorder(Observer):
-    """Remembers what it is told."""
+    """Observer that records its events."""
 
     def __init__(self) -> None:
         self.ran: list[str] = []
@@ -139,13 +139,13 @@ class Recorder(Observer):
         self.waited: list[str] = []
         self.reports: list[tuple[int, int, dict[str, float]]] = []
 
-    def served(self, state: Any) -> None:
+    def stage_reused(self, state: Any) -> None:
         self.cached.append(state.name)
 
-    def finished(self, state: Any) -> None:
+    def stage_finished(self, state: Any) -> None:
         self.ran.append(state.name)
 
-    def waits(self, name: str, holder: Any) -> None:
+    def stage_waiting(self, name: str, holder: Any) -> None:
         self.waited.append(str(holder))
 
     def progress(self, name: str, done: int, total: int, text: str, live: Mapping[str, float]) -> None:
@@ -153,13 +153,13 @@ class Recorder(Observer):
 
 
 def engine(out: Path, photos: Path, profile: BaseModel | None = None, registry: Registry = CHAIN, seed: int = 0) -> tuple[Engine, Recorder]:
-    """An engine over toy stages and the recorder that watches it."""
+    """An engine of toy stages, and the recorder that observes it."""
     recorder = Recorder()
     return Engine(registry, Request(out, {"photos": photos}, profile or Toy(), seed=seed), recorder), recorder
 
 
 def main() -> None:
-    """`OUT PHOTOS STAGES [STEPS SECONDS]`: a run in a process of its own, for tests that kill it."""
+    """Run `OUT PHOTOS STAGES [STEPS SECONDS]` in its own process, for tests that kill it."""
     out, photos, stages = sys.argv[1:4]
     numbers = {"steps": int(sys.argv[4]), "step_seconds": float(sys.argv[5])} if len(sys.argv) > 4 else {}
     registry = CHAIN if stages == "chain" else only(stages)

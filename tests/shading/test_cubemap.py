@@ -45,7 +45,7 @@ def test_solid_angles(size: int) -> None:
 
 def test_texel_inverts_directions() -> None:
     for size in (4, 5, 16):
-        assert (cubemap.texel(size, 3.0 * cubemap.directions(size).reshape(-1, 3)) == np.arange(6 * size * size)).all()
+        assert (cubemap.texel_index(size, 3.0 * cubemap.directions(size).reshape(-1, 3)) == np.arange(6 * size * size)).all()
 
 
 @pytest.mark.parametrize("size", [4, 5, 16])
@@ -75,11 +75,11 @@ def test_sampling_is_continuous_over_edges_and_corners() -> None:
 
 @pytest.mark.parametrize(("size", "coarse"), [(16, 8), (10, 5), (9, 5)])
 def test_reduction_keeps_constants_flux_and_first_moment(size: int, coarse: int) -> None:
-    matrix = cubemap.reduction(size, coarse)
+    matrix = cubemap.downsampling_matrix(size, coarse)
     np.testing.assert_allclose(matrix @ np.ones(6 * size * size), 1.0, rtol=1e-12)
     light = np.random.default_rng(4).random(6 * size * size)
     # The flux of the coarse map, with the solid angles that the reduction itself gives its texels.
-    angle = np.asarray(cubemap.interpolation(coarse, cubemap.directions(size).reshape(-1, 3)).T @ cubemap.solid_angles(size).ravel())
+    angle = np.asarray(cubemap.interpolation_matrix(coarse, cubemap.directions(size).reshape(-1, 3)).T @ cubemap.solid_angles(size).ravel())
     assert angle @ (matrix @ light) == pytest.approx(cubemap.solid_angles(size).ravel() @ light, rel=1e-12)
     np.testing.assert_allclose(angle, cubemap.solid_angles(coarse).ravel(), rtol=0.2)
 
@@ -92,8 +92,8 @@ def test_octahedral_round_trip_and_seams() -> None:
     np.testing.assert_allclose(octahedral.decode(np.stack([u.numpy(), v.numpy()], axis=1)), probe, atol=1e-12)
     for size in (4, 6):
         dirs = octahedral.texel_directions(size)
-        assert (octahedral.texel(size, dirs) == np.arange(size * size)).all()
-        border = octahedral.bordered(size)
+        assert (octahedral.texel_index(size, dirs) == np.arange(size * size)).all()
+        border = octahedral.border_indices(size)
         assert (border[1:-1, 1:-1].ravel() == np.arange(size * size)).all()
         # A border texel must be the neighbour across the fold: the point where both are equally near lies on the square's edge.
         for row in range(size):

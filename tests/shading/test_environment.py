@@ -133,5 +133,5 @@ def test_srgb() -> None:
 
 
 def test_colourfulness() -> None:
-    assert neutral_light.colourfulness(torch.full((6, 4, 4, 3), 0.7)).item() == pytest.approx(0.0, abs=1e-7)
-    assert neutral_light.colourfulness(torch.tensor([[1.0, 2.0, 3.0]])).item() == pytest.approx(2 / 3)
+    assert neutral_light.neutral_light_loss(torch.full((6, 4, 4, 3), 0.7)).item() == pytest.approx(0.0, abs=1e-7)
+    assert neutral_light.neutral_light_loss(torch.tensor([[1.0, 2.0, 3.0]])).item() == pytest.approx(2 / 3)

@@ -11,7 +11,7 @@ import torch
 from gsbake.geometry.vectors import unit
 from gsbake.shading import cubemap, prefilter
 from gsbake.shading.environment import EnvironmentLight
-from gsbake.shading.light_tables import LightTables, filter_cube
+from gsbake.shading.light_tables import LightTables, prefilter_cube_map
 
 
 def random_directions(count: int, seed: int = 0) -> np.ndarray:
@@ -48,7 +48,7 @@ def test_last_level_is_the_cosine_irradiance_of_a_single_texel() -> None:
     probe = random_directions(400)
     cosine = np.clip(probe @ cubemap.directions(size)[4, 20, 11], 0, None)
     expected = cosine[:, None] * flux / math.pi
-    got = filter_cube(cube).diffuse(torch.from_numpy(probe)).numpy()
+    got = prefilter_cube_map(cube).diffuse(torch.from_numpy(probe)).numpy()
     assert np.abs(got - expected).max() / expected.max() < 0.08  # worst at the terminator's kink
     assert np.sqrt(((got - expected) ** 2).mean() / (expected**2).mean()) < 0.04
 
@@ -105,7 +105,7 @@ def test_a_sun_is_brightest_where_it_stands(roughness: float) -> None:
 def test_no_seams() -> None:
     """Crossing the octahedron's edges and folds changes nothing by a jump, at any level."""
     cube = torch.from_numpy(np.random.default_rng(8).random((6, 16, 16, 3)))
-    tables = filter_cube(cube)
+    tables = prefilter_cube_map(cube)
     rng = np.random.default_rng(9)
     edge = rng.normal(size=(200, 3))
     edge[np.arange(200), rng.integers(0, 3, 200)] = 0.0
@@ -113,7 +113,7 @@ def test_no_seams() -> None:
     for roughness in (0.08, 0.16, 0.3, 0.7, 1.0):
         values = [lookup(tables, edge + 1e-7 * rng.normal(size=edge.shape), roughness) for _ in range(6)]
         assert np.ptp(values, axis=0).max() < 1e-4
-    step = [lookup(tables, edge[:20], k + s) for k in prefilter.ROUGHNESS[1:-1] for s in (-1e-7, 1e-7)]
+    step = [lookup(tables, edge[:20], k + s) for k in prefilter.ROUGHNESS_LEVELS[1:-1] for s in (-1e-7, 1e-7)]
     for below, above in zip(step[::2], step[1::2], strict=True):
         np.testing.assert_allclose(below, above, atol=1e-4)
 
@@ -131,8 +131,8 @@ def test_gradients() -> None:
     cube = torch.rand(6, 4, 4, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0), requires_grad=True)
     probe = torch.from_numpy(random_directions(5, 11)).requires_grad_(True)
     rough = torch.tensor([0.1, 0.2, 0.45, 0.6, 0.9], dtype=torch.float64, requires_grad=True)
-    assert torch.autograd.gradcheck(lambda c, d, r: filter_cube(c).specular(d, r), (cube, probe, rough), fast_mode=True)
-    assert torch.autograd.gradcheck(lambda c, d: filter_cube(c).diffuse(d), (cube, probe), fast_mode=True)
+    assert torch.autograd.gradcheck(lambda c, d, r: prefilter_cube_map(c).specular(d, r), (cube, probe, rough), fast_mode=True)
+    assert torch.autograd.gradcheck(lambda c, d: prefilter_cube_map(c).diffuse(d), (cube, probe), fast_mode=True)
 
 
 def test_roughness_below_the_first_level_can_come_back() -> None:
@@ -147,4 +147,4 @@ def test_roughness_below_the_first_level_can_come_back() -> None:
 
 def test_refuses_tiny_maps() -> None:
     with pytest.raises(ValueError, match="at least 4"):
-        prefilter.operator(2)
+        prefilter.prefilter_operator(2)

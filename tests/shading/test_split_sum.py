@@ -11,7 +11,7 @@ import torch
 from gsbake.geometry.vectors import unit
 from gsbake.shading.environment import EnvironmentLight
 from gsbake.shading.light_tables import LightTables
-from gsbake.shading.split_sum import _reference, reflected, shade, traced_openness
+from gsbake.shading.split_sum import _reference, mirror_reflection, shade, traced_specular_visibility
 
 
 def buffers(count: int, seed: int, dtype: torch.dtype = torch.float32) -> list[torch.Tensor]:
@@ -94,17 +94,17 @@ def test_object_as_bright_as_the_room_changes_nothing() -> None:
     normal, view, albedo, rough, metal = buffers(500, 5)
     level, whole = tables.specular(normal, rough), torch.ones(500)
     blocked = torch.arange(500) % 2 == 0
-    openness = traced_openness(normal, view, rough, whole, blocked)
+    openness = traced_specular_visibility(normal, view, rough, whole, blocked)
     direct = shade(normal, view, albedo, rough, metal, tables, whole, whole, openness)
-    both = direct + blocked[:, None] * reflected(normal, view, albedo, rough, metal, level)
+    both = direct + blocked[:, None] * mirror_reflection(normal, view, albedo, rough, metal, level)
     torch.testing.assert_close(both, shade(normal, view, albedo, rough, metal, tables), rtol=1e-4, atol=1e-5)
 
 
 def test_smooth_lobe_goes_by_its_mirror_direction_and_a_rough_one_by_the_ambient_share() -> None:
     normal, view, *_ = buffers(2, 6)
     half, blocked = torch.full((2,), 0.5), torch.tensor([True, False])
-    assert traced_openness(normal, view, torch.full((2,), 0.02), half, blocked).tolist() == pytest.approx([0, 1], abs=1e-3)
-    rough = traced_openness(normal, view, torch.ones(2), half, blocked)
+    assert traced_specular_visibility(normal, view, torch.full((2,), 0.02), half, blocked).tolist() == pytest.approx([0, 1], abs=1e-3)
+    rough = traced_specular_visibility(normal, view, torch.ones(2), half, blocked)
     assert rough.tolist() == pytest.approx([0.5, 0.5], abs=1e-3)
 
 

@@ -17,7 +17,7 @@ from gsbake.surfels.densification.clone_split import OPACITY_FLOOR, prune
 from gsbake.surfels.losses.terms import median_sharpness
 from gsbake.surfels.model import Surfels, create
 from gsbake.surfels.training.adam import Adam
-from gsbake.surfels.transfer import TRANSFERS, Transfer, named
+from gsbake.surfels.transfer import TRANSFERS, Transfer, transfer_by_name
 
 mp.mp.dps = 60
 LAYER = mp.log(100)  # optical depth of VolSDF's layer on the zero set, and half the layer's thickness in 1/γ for NeuS
@@ -123,11 +123,11 @@ def test_peak_and_decrease(transfer: Transfer) -> None:
 
 def test_published_table_of_sech2() -> None:
     """γ|s| at which o = .5, .1, .01, .005, 1/255."""
-    sech2 = named("sech2")
+    sech2 = transfer_by_name("sech2")
     for o, x in ((0.5, 1.763), (0.1, 3.637), (0.01, 5.986), (0.005, 6.682), (1 / 255, 6.926)):
         assert float(sech2.distance(torch.tensor(o), torch.tensor(1.0))) == pytest.approx(x, abs=1e-3)
-    assert sech2.reach_of(0.5) == pytest.approx(1.7627, abs=1e-4)
-    assert sech2.median_target(0.01) == pytest.approx(4.549, abs=2e-3)
+    assert sech2.half_width(0.5) == pytest.approx(1.7627, abs=1e-4)
+    assert sech2.target_sharpness(0.01) == pytest.approx(4.549, abs=2e-3)
 
 
 @each
@@ -142,9 +142,9 @@ def test_median_target_by_bisection(transfer: Transfer) -> None:
             low, high = (middle, high) if value > share * transfer.peak else (low, middle)
         return low
 
-    assert transfer.median_target(0.4) == pytest.approx(gamma_with(0.5, 0.4), rel=1e-9)
+    assert transfer.target_sharpness(0.4) == pytest.approx(gamma_with(0.5, 0.4), rel=1e-9)
     for median in (0.1, 0.01, 1e-6):
-        assert transfer.median_target(median) == pytest.approx(gamma_with(0.95, 0.1), rel=1e-9)
+        assert transfer.target_sharpness(median) == pytest.approx(gamma_with(0.95, 0.1), rel=1e-9)
     sdf, gamma = torch.tensor([0.4, -0.4, 0.4, 9.0]), torch.tensor([0.25], requires_grad=True)
     loss = median_sharpness(sdf, gamma, transfer)
     loss.backward()
@@ -163,7 +163,7 @@ def test_the_transfer_follows_the_surfels(transfer: Transfer, tmp_path: Path) ->
     surfels = ball(transfer.name)
     expected = float(LITERAL[transfer.name](mp.mpf("0.05"), mp.mpf(2)))
     some = surfels.select(torch.arange(10))
-    assert all(torch.allclose(s.opacity(), torch.tensor(expected)) for s in (surfels, some, some.joined(surfels)))
+    assert all(torch.allclose(s.opacity(), torch.tensor(expected)) for s in (surfels, some, some.concat(surfels)))
     surfels.save(tmp_path / "surfels.safetensors")
     again = Surfels.load(tmp_path / "surfels.safetensors")
     assert again.transfer.name == transfer.name and torch.equal(again.opacity(), surfels.opacity())

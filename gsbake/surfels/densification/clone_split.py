@@ -67,7 +67,7 @@ def replace_rows(surfels: Surfels, adam: Adam, keep: Tensor, children: Surfels |
     adam.select(names, keep, 0 if children is None else len(children))
     if children is None:
         return kept
-    return kept.joined(children)
+    return kept.concat(children)
 
 
 @torch.no_grad()

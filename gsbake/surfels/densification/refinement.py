@@ -44,7 +44,7 @@ def _visibility(surfels: Surfels, posed: PosedPhotos, max_size: int) -> tuple[to
         probe.position = surfels.position.clone().requires_grad_()
         out = rasterise(probe, TrainView(view.camera.name, torch.empty(0), None, r, t, centre, pinhole))
         out.alpha.sum().backward()
-        touched = out.stats.get("touched")
+        touched = out.stats.get("weight")
         if touched is not None:
             best = torch.maximum(best, touched)
         with torch.no_grad():
@@ -95,7 +95,7 @@ def prune_and_densify(surfels: Surfels, posed: PosedPhotos, refine: Any, max_siz
     added = _fill(kept, refine.densify_share, seed)
     counts["added"] = len(added)
     if len(added):
-        kept = kept.joined(added)
+        kept = kept.concat(added)
     return kept, counts | {"after": len(kept)}
 
 
@@ -118,6 +118,6 @@ def _fill(surfels: Surfels, share: float, seed: int) -> Surfels:
     one, other = one.select(same_side.nonzero()[:, 0]), other.select(same_side.nonzero()[:, 0])
     others = other.tensors()
     blended = {k: v if k in ("gamma", "quaternion") else (v + others[k]) / 2 for k, v in one.tensors().items()}
-    middle = Surfels.of(blended, one.transfer)
+    middle = Surfels.from_tensors(blended, one.transfer)
     middle.position = middle.position - middle.sdf[:, None] * middle.normal()
     return middle

@@ -16,8 +16,8 @@ from gsbake.shading import brdf
 from gsbake.shading import split_sum_kernel as kernels
 from gsbake.shading.light_tables import LightTables
 from gsbake.surfels.raster.blocks import JIT
-from gsbake.surfels.raster.gbuffer import ALPHA_SHADED
-from gsbake.surfels.raster.lanes import LANES, POWER, lanes, load, logarithm, power_of_two, select, store
+from gsbake.surfels.raster.gbuffer import SHADING_ALPHA_MIN
+from gsbake.surfels.raster.lanes import EXP2_COEFFICIENTS, LANES, broadcast, exp2, load, log, select, store
 from gsbake.surfels.raster.threads import run_chunks
 from gsbake.surfels.training.views import TrainView
 
@@ -26,12 +26,12 @@ CHANNELS = 8
 _ALPHA = CHANNELS + 4
 _ZERO, _ONE, _HALF = np.float32(0.0), np.float32(1.0), np.float32(0.5)
 _CHUNK = 16384
-_SHORTEST = np.float32(1e-12)
+_MIN_SQUARED_LENGTH = np.float32(1e-12)
 # the sRGB curve (IEC 61966-2-1)
 _KINK, _SLOPE, _SCALE, _OFFSET = (np.float32(x) for x in (srgb.KINK, srgb.SLOPE, srgb.SCALE, srgb.OFFSET))
 _EXPONENT = np.float32(1 / 2.4)
 _TO_BASE_2 = np.float32(1 / np.log(2))
-_POWER = np.array(POWER, np.float32)
+_POWER = np.array(EXP2_COEFFICIENTS, np.float32)
 
 
 @njit(**JIT)
@@ -45,7 +45,7 @@ def _gather(lo, hi, planes, size, width, index, rot, camera, normal, view, albed
             albedo[i, c] = planes[c, at] * inverse
         roughness[i], metallic[i] = planes[3, at] * inverse, planes[4, at] * inverse
         n0, n1, n2 = planes[5, at] * inverse, planes[6, at] * inverse, planes[7, at] * inverse
-        unit = _ONE / np.sqrt(max(n0 * n0 + n1 * n1 + n2 * n2, _SHORTEST))
+        unit = _ONE / np.sqrt(max(n0 * n0 + n1 * n1 + n2 * n2, _MIN_SQUARED_LENGTH))
         normal[i, 0], normal[i, 1], normal[i, 2] = n0 * unit, n1 * unit, n2 * unit
         x = (np.float32(at % width) + _HALF - cx) / fx
         y = (np.float32(at // width) + _HALF - cy) / fy
@@ -57,17 +57,17 @@ def _gather(lo, hi, planes, size, width, index, rot, camera, normal, view, albed
 @njit(**JIT)
 def _encode(lo, hi, linear, srgb, slope, p):  # type: ignore[no-untyped-def]
     """sRGB of linear values, clipped, and the curve's slope (beyond the ends that of the nearer end); blocks lo..hi of eight."""
-    one, p1, p2, p3, p4, p5 = lanes(p[0]), lanes(p[1]), lanes(p[2]), lanes(p[3]), lanes(p[4]), lanes(p[5])
-    zero, kink = lanes(_ZERO), lanes(_KINK)
+    one, p1, p2, p3, p4, p5 = broadcast(p[0]), broadcast(p[1]), broadcast(p[2]), broadcast(p[3]), broadcast(p[4]), broadcast(p[5])
+    zero, kink = broadcast(_ZERO), broadcast(_KINK)
     for i in range(lo, hi):
         at = np.uint64(i * LANES)
         x = load(linear, at)
         x = select(x < zero, zero, select(x > one, one, x))  # a NaN stays
         held = select(x < kink, kink, x)
-        power = power_of_two(_TO_BASE_2 * _EXPONENT * logarithm(held), one, p1, p2, p3, p4, p5)
+        power = exp2(_TO_BASE_2 * _EXPONENT * log(held), one, p1, p2, p3, p4, p5)
         curved = x > kink
         store(srgb, at, select(curved, _SCALE * power - _OFFSET, _SLOPE * x))
-        store(slope, at, select(curved, _SCALE * _EXPONENT * power / held, lanes(_SLOPE)))
+        store(slope, at, select(curved, _SCALE * _EXPONENT * power / held, broadcast(_SLOPE)))
 
 
 @njit(**JIT)
@@ -100,9 +100,9 @@ def _scatter(lo, hi, planes, index, normal, albedo, roughness, metallic, g_norma
         n0, n1, n2 = normal[i, 0], normal[i, 1], normal[i, 2]
         b0, b1, b2 = planes[5, at], planes[6, at], planes[7, at]
         square = (b0 * b0 + b1 * b1 + b2 * b2) * inverse * inverse
-        unit = _ONE / np.sqrt(max(square, _SHORTEST))
+        unit = _ONE / np.sqrt(max(square, _MIN_SQUARED_LENGTH))
         g0, g1, g2 = g_normal[i, 0], g_normal[i, 1], g_normal[i, 2]
-        along = g0 * n0 + g1 * n1 + g2 * n2 if square > _SHORTEST else _ZERO
+        along = g0 * n0 + g1 * n1 + g2 * n2 if square > _MIN_SQUARED_LENGTH else _ZERO
         factor = unit * inverse
         g0, g1, g2 = factor * (g0 - along * n0), factor * (g1 - along * n1), factor * (g2 - along * n2)
         grad[5, at] += g0
@@ -117,14 +117,14 @@ def _scatter(lo, hi, planes, index, normal, albedo, roughness, metallic, g_norma
         grad[_ALPHA, at] -= g_alpha * inverse
 
 
-class Shaded:
+class DeferredShading:
     """One photo's shading: made with the picture, kept for the gradient."""
 
     def __init__(self, planes: Any, view: TrainView, tables: LightTables) -> None:
         """Shade the blended planes (14, h, w), a contiguous float32 array, where alpha is above `ALPHA_SHADED`."""
         _, h, w = planes.shape
         self.planes, layout = planes.reshape(len(planes), -1), tables.layout
-        self.index = np.flatnonzero(self.planes[_ALPHA] > ALPHA_SHADED)
+        self.index = np.flatnonzero(self.planes[_ALPHA] > SHADING_ALPHA_MIN)
         n = self.count = len(self.index)
         normal, direction, albedo = (np.empty((n, 3), np.float32) for _ in range(3))
         roughness, metallic = (np.empty(n, np.float32) for _ in range(2))
@@ -136,7 +136,8 @@ class Shaded:
         opened = np.ones(n, np.float32)
         self.light = (
             normal, direction, albedo, roughness, metallic, opened, opened, tables.table.detach().contiguous().numpy(),
-            np.array(layout.roughness, np.float32), np.array(layout.sizes, np.int64), np.array(layout.offsets, np.int64), brdf.table(),
+            np.array(layout.roughness, np.float32), np.array(layout.sizes, np.int64), np.array(layout.offsets, np.int64),
+            brdf.split_sum_table(),
         )  # fmt: skip
         blocks = -(-3 * n // LANES)
         linear, srgb, slope = (np.zeros(blocks * LANES, np.float32) for _ in range(3))

@@ -15,7 +15,7 @@ from numba import njit
 
 from gsbake.surfels.losses.photometric import BYTE
 from gsbake.surfels.raster.blocks import JIT
-from gsbake.surfels.raster.lanes import LANES, lane_column, lane_row, lanes, load, logarithm, root, select, store, total
+from gsbake.surfels.raster.lanes import LANES, broadcast, lane_column, lane_row, load, log, select, sqrt, store, sum_lanes
 from gsbake.surfels.raster.threads import run_chunks
 
 #: Rows of one piece of work; one more on either side is computed for it.
@@ -24,7 +24,7 @@ STRIP = 64
 ALPHA_SURFACE, ENTROPY_MIN = np.float32(1e-3), np.float32(1e-6)
 ENTROPY_MAX = np.float32(1 - 1e-6)
 #: Squared length of the cross product below which the depth has no normal.
-SHORTEST = np.float32(1e-24)
+MIN_SQUARED_LENGTH = np.float32(1e-24)
 RING = 3
 _ZERO, _HALF, _ONE = np.float32(0.0), np.float32(0.5), np.float32(1.0)
 _U1, _U8 = np.uint64(1), np.uint64(LANES)
@@ -59,10 +59,10 @@ def _strips(  # type: ignore[no-untyped-def]
         s[o_frame + x] = _ONE if 0 < x < u_width - _U1 else _ZERO
     fx, fy, cx, cy = camera[0], camera[1], camera[2], camera[3]
     w_normal, w_entropy, w_distortion = weights[0], weights[1], weights[2]
-    r00, r01, r02 = lanes(rot[0, 0]), lanes(rot[0, 1]), lanes(rot[0, 2])
-    r10, r11, r12 = lanes(rot[1, 0]), lanes(rot[1, 1]), lanes(rot[1, 2])
-    r20, r21, r22 = lanes(rot[2, 0]), lanes(rot[2, 1]), lanes(rot[2, 2])
-    zero, one = lanes(_ZERO), lanes(_ONE)
+    r00, r01, r02 = broadcast(rot[0, 0]), broadcast(rot[0, 1]), broadcast(rot[0, 2])
+    r10, r11, r12 = broadcast(rot[1, 0]), broadcast(rot[1, 1]), broadcast(rot[1, 2])
+    r20, r21, r22 = broadcast(rot[2, 0]), broadcast(rot[2, 1]), broadcast(rot[2, 2])
+    zero, one = broadcast(_ZERO), broadcast(_ONE)
     ramp = (lane_column() + np.float32(4.0) * lane_row() + (_HALF - cx)) / fx
     step, pitch = np.float32(LANES) / fx, _ONE / fx
     p_depth, p_alpha = (channels + _DEPTH) * size, (channels + _ALPHA) * size
@@ -105,8 +105,8 @@ def _strips(  # type: ignore[no-untyped-def]
                     n0, n1, n2 = v1 * u2 - v2 * u1, v2 * u0 - v0 * u2, v0 * u1 - v1 * u0
                     square = n0 * n0 + n1 * n1 + n2 * n2
                     inside = select(load(s, o_m + slot + at) > _HALF, load(s, o_frame + at), zero)
-                    found = square > SHORTEST
-                    inverse = select(found, one / root(select(found, square, one)), zero)
+                    found = square > MIN_SQUARED_LENGTH
+                    inverse = select(found, one / sqrt(select(found, square, one)), zero)
                     n0, n1, n2 = n0 * inverse, n1 * inverse, n2 * inverse
                     # the blended normal in the camera's frame
                     w0, w1, w2 = load(s, o_n + at), load(s, o_n + row + at), load(s, o_n + row + row + at)
@@ -134,7 +134,7 @@ def _strips(  # type: ignore[no-untyped-def]
                 for x in range(np.uint64(3) * row):
                     s[o_n + x - _U8] = _ZERO
             if y0 <= y < y1:
-                sums[y, 0] = total(normal_sum)
+                sums[y, 0] = sum_lanes(normal_sum)
                 for j in range(3):
                     at, to = o_n + np.uint64(j) * row, np.uint64((channels - 3 + j) * size + y * width)
                     for x in range(u_width):
@@ -162,15 +162,15 @@ def _strips(  # type: ignore[no-untyped-def]
                 g_alpha = w_normal * inside - g * load(s, o_e + slot + at)
                 for c in range(3):
                     g_alpha = g_alpha - background[c] * load(s, o_g + np.uint64(c) * row + at)
-                held = select(alpha > ENTROPY_MIN, select(alpha < ENTROPY_MAX, alpha, lanes(ENTROPY_MAX)), lanes(ENTROPY_MIN))
+                held = select(alpha > ENTROPY_MIN, select(alpha < ENTROPY_MAX, alpha, broadcast(ENTROPY_MAX)), broadcast(ENTROPY_MIN))
                 rest = one - held
-                entropy_sum = entropy_sum - valid * (cover * logarithm(held) + (one - cover) * logarithm(rest))
+                entropy_sum = entropy_sum - valid * (cover * log(held) + (one - cover) * log(rest))
                 free = (alpha >= ENTROPY_MIN) & (alpha <= ENTROPY_MAX)
                 g_alpha = g_alpha + w_entropy * select(free, (held - cover) / (held * rest), zero)
                 store(s, o_d + at, g)
                 store(s, o_g + at, g_alpha)
-            sums[done, 0] += total(covered)
-            sums[done, 1] = total(entropy_sum)
+            sums[done, 0] += sum_lanes(covered)
+            sums[done, 1] = sum_lanes(entropy_sum)
             first = np.uint64(channels * size + done * width)
             plane = np.uint64(size)
             distortion = _ZERO
@@ -185,7 +185,7 @@ def _strips(  # type: ignore[no-untyped-def]
             sums[done, 2] = distortion
 
 
-def surface(
+def geometry_losses(
     planes: Any, channels: int, height: int, width: int, mask: Any, masked: bool, g_picture: Any, background: Any, rot: Any, camera: Any,
     weights: tuple[float, float, float], grad: Any,
 ) -> tuple[float, float, float]:  # fmt: skip

@@ -13,7 +13,7 @@ import numpy as np
 from numba import njit
 
 from gsbake.surfels.raster.blocks import JIT
-from gsbake.surfels.raster.lanes import LANES, lanes, load, select, store, total
+from gsbake.surfels.raster.lanes import LANES, broadcast, load, select, store, sum_lanes
 from gsbake.surfels.raster.threads import run_chunks
 
 TAPS = 11
@@ -32,7 +32,7 @@ _U1, _U2, _U3, _U4, _U5, _U8, _U11 = (np.uint64(i) for i in (1, 2, 3, 4, 5, LANE
 @njit(**JIT)
 def _across(s, source, target, blocks, k):  # type: ignore[no-untyped-def]
     """Blur one row of the scratch `s`; eight zeros lie on either side of it."""
-    k0, k1, k2, k3, k4, k5 = lanes(k[0]), lanes(k[1]), lanes(k[2]), lanes(k[3]), lanes(k[4]), lanes(k[5])
+    k0, k1, k2, k3, k4, k5 = broadcast(k[0]), broadcast(k[1]), broadcast(k[2]), broadcast(k[3]), broadcast(k[4]), broadcast(k[5])
     for i in range(blocks):
         at = source + i * _U8
         near = k0 * load(s, at) + k1 * (load(s, at - _U1) + load(s, at + _U1)) + k2 * (load(s, at - _U2) + load(s, at + _U2))
@@ -77,8 +77,8 @@ def _strips(  # type: ignore[no-untyped-def]
     for x in range(u_width):
         s[o_valid + x] = _ONE
     rows = np.empty(TAPS, np.uint64)
-    k0, k1, k2, k3, k4, k5 = lanes(k[0]), lanes(k[1]), lanes(k[2]), lanes(k[3]), lanes(k[4]), lanes(k[5])
-    zero, one = lanes(_ZERO), lanes(_ONE)
+    k0, k1, k2, k3, k4, k5 = broadcast(k[0]), broadcast(k[1]), broadcast(k[2]), broadcast(k[3]), broadcast(k[4]), broadcast(k[5])
+    zero, one = broadcast(_ZERO), broadcast(_ONE)
     count = np.float32(3 * height * width)
     per_l1, per_ssim = (_ONE - share) / count, -share / count
     for task in range(lo, hi):
@@ -124,7 +124,7 @@ def _strips(  # type: ignore[no-untyped-def]
                     store(s, o_part + row + at, zero - value * i2)
                     store(s, o_part + _U2 * row + at, _TWO * p * i2)
                 if y0 <= y_m < y1:
-                    ssim_rows[c * height + y_m] = total(similar)
+                    ssim_rows[c * height + y_m] = sum_lanes(similar)
                 to = r_p + np.uint64(y_m % TAPS) * p_slot
                 for j in range(_U3):
                     _across(s, o_part + j * row, to + j * row, blocks, k)
@@ -142,13 +142,13 @@ def _strips(  # type: ignore[no-untyped-def]
                     up, down = d > zero, d < zero
                     off = off + select(up, d, zero - d)
                     store(s, o_square + at, per_ssim * g + select(up, per_l1, select(down, -per_l1, _ZERO)))
-                l1_rows[c * height + y_p] = total(off)
+                l1_rows[c * height + y_p] = sum_lanes(off)
                 own = np.uint64((c * height + y_p) * width)
                 for x in range(u_width):
                     grad[own + x] = s[o_square + x]
 
 
-def colour(picture: Any, alpha: Any, rgb: Any, mask: Any, background: Any, height: int, width: int, share: float, grad: Any) -> float:
+def colour_loss(picture: Any, alpha: Any, rgb: Any, mask: Any, background: Any, height: int, width: int, share: float, grad: Any) -> float:
     """The loss of picture + background · (1 − alpha) against rgb · mask + background · (1 − mask); its gradient to the picture, `grad`.
 
     Flat contiguous arrays: `picture` and `grad` (3 h w) float32, `alpha` (h w) float32, `rgb` (3 h w) and `mask` (h w) 8-bit,

@@ -1,4 +1,4 @@
-"""The projection loss of Zhu et al. 2025 in one pass over the surfels, value and gradient (Numba); its twin is `losses.projection`."""
+"""The projection loss of Zhu et al. 2025 in one pass over the surfels, value and gradient (Numba); its twin is `terms.projection_loss`."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from torch import Tensor
 
 from gsbake.surfels.losses import terms as losses
 from gsbake.surfels.losses.geometry import ALPHA_SURFACE
-from gsbake.surfels.losses.terms import PROJECTION_RANGE
+from gsbake.surfels.losses.terms import PROJECTION_ERROR_MAX
 from gsbake.surfels.raster.blocks import JIT
 from gsbake.surfels.raster.projection import Pinhole
 from gsbake.surfels.raster.threads import run_chunks
 
 #: Surfels of one sum; fixed, so that the total does not depend on the number of threads.
 CHUNK = 4096
-NEAREST, RANGE, WHOLE = np.float32(1e-3), np.float32(PROJECTION_RANGE), np.float32(0.999)
+NEAREST, RANGE, WHOLE = np.float32(1e-3), np.float32(PROJECTION_ERROR_MAX), np.float32(0.999)
 _ZERO, _HALF, _ONE = np.float32(0.0), np.float32(0.5), np.float32(1.0)
 
 
@@ -69,7 +69,7 @@ def _backward(lo, hi, normal, sdf, rot, factor, sign, g_position, g_normal, g_sd
         g_sdf[i] = -(g0 * normal[i, 0] + g1 * normal[i, 1] + g2 * normal[i, 2])
 
 
-class _Projection(torch.autograd.Function):
+class _ProjectionLoss(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx: Any, position: Tensor, normal: Tensor, sdf: Tensor, visible: Tensor, depth: Tensor, alpha: Tensor, R: Tensor, t: Tensor,
@@ -98,10 +98,10 @@ class _Projection(torch.autograd.Function):
         return *grads, None, None, None, None, None, None
 
 
-def projection(
+def projection_loss(
     position: Tensor, normal: Tensor, sdf: Tensor, visible: Tensor, depth: Tensor, alpha: Tensor, R: Tensor, t: Tensor, view: Pinhole
 ) -> Tensor:
-    """`losses.projection` on the CPU, in one go; on a GPU that twin itself. Gradients to position, normal and sdf."""
+    """`terms.projection_loss` on the CPU, in one go; on a GPU that twin itself. Gradients to position, normal and sdf."""
     if position.is_cuda:
-        return losses.projection(position, normal, sdf, visible, depth, alpha, R, t, view)
-    return torch.Tensor(_Projection.apply(position, normal, sdf, visible, depth, alpha, R, t, view))
+        return losses.projection_loss(position, normal, sdf, visible, depth, alpha, R, t, view)
+    return torch.Tensor(_ProjectionLoss.apply(position, normal, sdf, visible, depth, alpha, R, t, view))

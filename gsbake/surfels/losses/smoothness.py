@@ -1,4 +1,4 @@
-"""Edge-aware smoothness of blended planes, value and gradient in one pass over the rows (Numba); its twin is `losses.smoothness`.
+"""Edge-aware smoothness of blended planes, value and gradient in one pass over the rows (Numba); its twin is `terms.smoothness_loss`.
 
 Each pair of neighbours inside the mask has a weight exp(−10 |∇grey|); a pixel's gradient is what its four pairs give it.
 """
@@ -12,7 +12,7 @@ from numba import njit
 
 from gsbake.surfels.losses.photometric import BYTE
 from gsbake.surfels.raster.blocks import JIT
-from gsbake.surfels.raster.lanes import LANES, POWER, lanes, load, power_of_two, select, store, total
+from gsbake.surfels.raster.lanes import EXP2_COEFFICIENTS, LANES, broadcast, exp2, load, select, store, sum_lanes
 from gsbake.surfels.raster.threads import run_chunks
 
 STRIP = 64
@@ -20,18 +20,18 @@ _ZERO, _ONE = np.float32(0.0), np.float32(1.0)
 _U1, _U8 = np.uint64(1), np.uint64(LANES)
 #: 2^(this · |∇grey|) is exp(−10 |∇grey|).
 EDGE = np.float32(-10 / np.log(2))
-_CONSTANTS = np.array(POWER, np.float32)
+_CONSTANTS = np.array(EXP2_COEFFICIENTS, np.float32)
 
 
 @njit(**JIT)
 def _edges(s, a, b, inside_a, inside_b, to, blocks, factor, p):  # type: ignore[no-untyped-def]
     """Weights of the pairs of two rows (or of a row and itself, one further)."""
-    one, p1, p2, p3, p4, p5 = lanes(p[0]), lanes(p[1]), lanes(p[2]), lanes(p[3]), lanes(p[4]), lanes(p[5])
-    zero = lanes(_ZERO)
+    one, p1, p2, p3, p4, p5 = broadcast(p[0]), broadcast(p[1]), broadcast(p[2]), broadcast(p[3]), broadcast(p[4]), broadcast(p[5])
+    zero = broadcast(_ZERO)
     for i in range(blocks):
         at = i * _U8
         d = load(s, b + at) - load(s, a + at)
-        edge = power_of_two(EDGE * select(d > zero, d, zero - d), one, p1, p2, p3, p4, p5)
+        edge = exp2(EDGE * select(d > zero, d, zero - d), one, p1, p2, p3, p4, p5)
         store(s, to + at, factor * edge * load(s, inside_a + at) * load(s, inside_b + at))
 
 
@@ -49,7 +49,7 @@ def _strips(lo, hi, planes, count, height, width, rgb, inside, across, down, gra
     o_g = o_step + row
     o_p = o_g + row
     s = np.zeros(o_p + np.uint64(3) * row, np.float32)
-    zero = lanes(_ZERO)
+    zero = broadcast(_ZERO)
     third = BYTE / np.float32(3.0)
     for strip in range(lo, hi):
         y0, y1 = strip * STRIP, min(height, (strip + 1) * STRIP)
@@ -95,12 +95,12 @@ def _strips(lo, hi, planes, count, height, width, rgb, inside, across, down, gra
                     at = np.uint64(c * size + y * width)
                     for x in range(u_width):
                         grad[at + x] = s[o_g + x]
-                sums[y] = total(value)
+                sums[y] = sum_lanes(value)
             for x in range(u_width):
                 s[o_above + x] = s[o_below + x]
 
 
-def smoothness(planes: Any, count: int, height: int, width: int, rgb: Any, inside: Any, weight: float, grad: Any) -> float:
+def smoothness_loss(planes: Any, count: int, height: int, width: int, rgb: Any, inside: Any, weight: float, grad: Any) -> float:
     """The weighted loss of the first `count` planes; its gradient to those rows of `grad`.
 
     Flat contiguous arrays: `planes` and `grad` (at least count h w) float32, `rgb` (3 h w) 8-bit, `inside` (h, w) bool.

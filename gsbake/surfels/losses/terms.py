@@ -13,13 +13,13 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from gsbake.surfels.raster.kernel import EXTRA
+from gsbake.surfels.raster.kernel import AUX_PLANES
 from gsbake.surfels.raster.projection import Pinhole
 from gsbake.surfels.training.views import TrainView
 from gsbake.surfels.transfer import Transfer
 
 #: Projection errors above this (unit frame) are other surfaces, not error.
-PROJECTION_RANGE = 0.1
+PROJECTION_ERROR_MAX = 0.1
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ def ssim(a: Tensor, b: Tensor) -> Tensor:
     return (((2 * ma * mb + 1e-4) * (2 * cov + 9e-4)) / ((ma * ma + mb * mb + 1e-4) * (va + vb + 9e-4))).mean()
 
 
-def colour(image: Tensor, target: Tensor, ssim_share: float) -> Tensor:
+def colour_loss(image: Tensor, target: Tensor, ssim_share: float) -> Tensor:
     """(1 − λ) L1 + λ (1 − SSIM) of sRGB images (3, h, w)."""
     loss = (1 - ssim_share) * (image - target).abs().mean()
     return loss + ssim_share * (1 - ssim(image, target)) if ssim_share else loss
@@ -65,10 +65,10 @@ def colour(image: Tensor, target: Tensor, ssim_share: float) -> Tensor:
 def median_sharpness(sdf: Tensor, gamma: Tensor, transfer: Transfer) -> Tensor:
     """relu(target(median |s|) − γ) with the transfer's target; the median is detached."""
     median = float(sdf.detach().abs().median()) if len(sdf) else 1.0
-    return F.relu(transfer.median_target(max(median, 1e-6)) - gamma).sum()
+    return F.relu(transfer.target_sharpness(max(median, 1e-6)) - gamma).sum()
 
 
-def projection(
+def projection_loss(
     position: Tensor, normal: Tensor, sdf: Tensor, visible: Tensor, depth: Tensor, alpha: Tensor, R: Tensor, t: Tensor, view: Pinhole
 ) -> Tensor:
     """Mean |D(uv(μ')) − z(μ')| over visible surfels with μ' = μ − s n inside the frame and errors below `PROJECTION_RANGE`.
@@ -89,7 +89,7 @@ def projection(
     seen = F.grid_sample(planes, grid, mode="bilinear", padding_mode="zeros", align_corners=False)[0, :, 0]
     # along the pixel's ray only z moves: the gradient through uv is left out, it chases depth edges
     error = (seen[0] - z).abs()
-    ok = (seen[1] > 0.999) & (error < PROJECTION_RANGE)
+    ok = (seen[1] > 0.999) & (error < PROJECTION_ERROR_MAX)
     return (error * ok).sum() / ok.sum().clamp_min(1)
 
 
@@ -120,7 +120,7 @@ def mask_entropy(alpha: Tensor, mask: Tensor) -> Tensor:
     return F.binary_cross_entropy(alpha.clamp(1e-6, 1 - 1e-6), mask)
 
 
-def smoothness(planes: Tensor, guide: Tensor, mask: Tensor) -> Tensor:
+def smoothness_loss(planes: Tensor, guide: Tensor, mask: Tensor) -> Tensor:
     """Edge-aware smoothness of (c, h, w) planes: mean |∇planes| · exp(−10 |∇grey|) inside the mask (h, w); guide (h, w) is the
     photo's grey."""
     loss = planes.new_zeros(())
@@ -132,7 +132,7 @@ def smoothness(planes: Tensor, guide: Tensor, mask: Tensor) -> Tensor:
     return loss
 
 
-def image(
+def image_losses(
     planes: Tensor, picture: Tensor, view: TrainView, masked: bool, background: Tensor, weights: ImageWeights, materials: bool
 ) -> tuple[Tensor, Tensor]:
     """Weighted sum of what one photo asks of its render, and the colour loss alone (both scalars).
@@ -141,12 +141,12 @@ def image(
     is composited over `background` (3,), like the photo where `masked`; else the photo is taken as it is, there is no mask loss, and
     pixels with alpha above ½ count as inside. With `materials` the features before the normals are smoothed.
     """
-    channels = planes.shape[0] - EXTRA
+    channels = planes.shape[0] - AUX_PLANES
     depth, alpha = planes[channels], planes[channels + 4]
     photo, cover, back = view.colour().to(planes.dtype), view.cover() if masked else None, background[:, None, None]
     cover = None if cover is None else cover.to(planes.dtype)
     target = photo if cover is None else photo * cover + back * (1 - cover)
-    first = colour(picture + back * (1 - alpha), target, weights.ssim)
+    first = colour_loss(picture + back * (1 - alpha), target, weights.ssim)
     total = first
     inside = ((alpha.detach() if cover is None else cover) > 0.5).to(planes.dtype)
     if weights.normal:
@@ -157,5 +157,5 @@ def image(
     if weights.distortion:
         total = total + weights.distortion * planes[channels + 1].mean()
     if materials and weights.smoothness:
-        total = total + weights.smoothness * smoothness(planes[: channels - 3], photo.mean(0), inside)
+        total = total + weights.smoothness * smoothness_loss(planes[: channels - 3], photo.mean(0), inside)
     return total, first

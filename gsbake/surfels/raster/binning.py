@@ -1,4 +1,4 @@
-"""Which surfels each 16x16 tile blends, front to back: one global depth sort, then a counting sort into tile lists (no sort per tile)."""
+"""Tile binning: per 16x16 tile the list of surfels, front to back, by one global depth sort and a counting sort into tiles."""
 
 from __future__ import annotations
 
@@ -12,18 +12,20 @@ from gsbake.surfels.raster.blocks import JIT, TILE
 from gsbake.surfels.raster.lanes import prefetch
 from gsbake.surfels.raster.threads import thread_count
 
-SHIFT = TILE.bit_length() - 1  # a division by TILE that knows nothing of negative numbers
-LOOK_AHEAD = 8
+#: log2 of the tile size: a shift divides box coordinates, which are not negative, by `TILE`.
+SHIFT = TILE.bit_length() - 1
+#: Surfels between prefetch and use.
+PREFETCH_DISTANCE = 8
 
 
 @njit(**JIT)
 def fill_tiles(order, box, tiles_x, offsets, cursor, ids, slots):  # type: ignore[no-untyped-def]
-    """Counting sort: append each surfel, front to back, to the lists of the tiles its box touches."""
+    """Counting sort: append each surfel, front to back, to the lists of the tiles that its box overlaps."""
     last = order.shape[0] - 1
     for i in range(last + 1):
-        coming = np.uint64(order[min(i + LOOK_AHEAD, last)])
-        prefetch(box, coming, 0)
-        prefetch(offsets, coming, 0)
+        upcoming = np.uint64(order[min(i + PREFETCH_DISTANCE, last)])
+        prefetch(box, upcoming, 0)
+        prefetch(offsets, upcoming, 0)
         g = order[i]
         slot = offsets[g]
         for ty in range(box[g, 2] >> SHIFT, (box[g, 3] >> SHIFT) + 1):
@@ -38,7 +40,7 @@ def fill_tiles(order, box, tiles_x, offsets, cursor, ids, slots):  # type: ignor
 
 @njit(**JIT)
 def count_tiles(box, visible, tiles_x, per_tile, per_surfel):  # type: ignore[no-untyped-def]
-    """How many pairs each tile and each surfel has; box (n, 4) int32 is clipped, inclusive xmin, xmax, ymin, ymax in pixels."""
+    """Count (tile, surfel) pairs per tile and per surfel; box (n, 4) int32: xmin, xmax, ymin, ymax in pixels, clipped, inclusive."""
     for g in range(box.shape[0]):
         n = 0
         if visible[g]:
@@ -51,7 +53,10 @@ def count_tiles(box, visible, tiles_x, per_tile, per_surfel):  # type: ignore[no
 
 @dataclass(frozen=True)
 class Bins:
-    """Tile lists: pairs of tile t are `ids[starts[t]:starts[t + 1]]`, front to back; `slots` their gradient slots."""
+    """Tile lists. Tile t blends the surfels `ids[starts[t]:starts[t + 1]]`, front to back; `slots` are the gradient slots of these pairs.
+
+    `offsets` (n + 1,) is the slot range of each surfel; `order` the sequence in which tiles are processed.
+    """
 
     starts: Any
     ids: Any
@@ -62,12 +67,12 @@ class Bins:
 
 
 def bin_surfels(depth: Any, box: Any, visible: Any, width: int, height: int) -> Bins:
-    """Depth-sort the visible surfels once and deal them to 16x16 tiles (numpy arrays in and out)."""
+    """Sort the visible surfels by depth and assign them to 16x16 tiles (numpy arrays in and out)."""
     n = len(depth)
     tiles_x, tiles_y = -(-width // TILE), -(-height // TILE)
     tiles = tiles_x * tiles_y
     idx = np.flatnonzero(visible).astype(np.uint64)
-    # positive float32 sort as their bits; the index below keeps ties stable
+    # the bits of positive float32 sort like their values; the index in the low half keeps the sort stable
     keys = (depth[idx.astype(np.int64)].view(np.uint32).astype(np.uint64) << np.uint64(32)) | idx
     keys.sort()
     front = (keys & np.uint64(0xFFFFFFFF)).astype(np.int64)
@@ -79,7 +84,7 @@ def bin_surfels(depth: Any, box: Any, visible: Any, width: int, height: int) -> 
     pairs = int(starts[-1])
     ids, slots = np.empty(pairs, np.int32), np.empty(pairs, np.int64)
     fill_tiles(front, box, tiles_x, offsets, starts[:-1].copy(), ids, slots)
-    # heavy tiles first, dealt in turn to the chunks, so that both threads end together
+    # longest lists first, distributed round-robin over the chunks: balances the threads
     order = np.argsort(-per_tile, kind="stable")
     chunks = max(1, thread_count() * 6)
     order = np.concatenate([order[i::chunks] for i in range(chunks)])

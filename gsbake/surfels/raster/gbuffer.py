@@ -11,14 +11,14 @@ import torch
 from torch import Tensor
 
 from gsbake.surfels.model import Surfels
-from gsbake.surfels.raster.kernel import EXTRA
+from gsbake.surfels.raster.kernel import AUX_PLANES
 from gsbake.surfels.raster.rasterise import Rendered, render
 from gsbake.surfels.training.views import TrainView
 
 if TYPE_CHECKING:
     from gsbake.shading.light_tables import LightTables
 
-ALPHA_SHADED = 1.0 / 255.0
+SHADING_ALPHA_MIN = 1.0 / 255.0
 
 
 def rasterise(surfels: Surfels, view: TrainView, cull_backfaces: bool = False) -> Rendered:
@@ -38,7 +38,7 @@ def view_directions(view: TrainView, index: Tensor) -> Tensor:
     return torch.stack([-x * z, -y * z, -z], 1) @ view.R
 
 
-def picture(planes: Tensor, view: TrainView, tables: LightTables | None) -> Tensor:
+def rendered_image(planes: Tensor, view: TrainView, tables: LightTables | None) -> Tensor:
     """Premultiplied sRGB picture (3, h, w) of blended planes (c + 6, h, w): their colours, or with light tables the shaded G-buffers.
     `gsbake.surfels.losses.deferred_shading` is its twin in training."""
     if tables is None:
@@ -48,10 +48,10 @@ def picture(planes: Tensor, view: TrainView, tables: LightTables | None) -> Tens
 
     h, w = planes.shape[1:]
     flat = planes.reshape(len(planes), -1)
-    over = flat[len(planes) - EXTRA + 4]
-    index = (over.detach() > ALPHA_SHADED).nonzero()[:, 0]
+    over = flat[len(planes) - AUX_PLANES + 4]
+    index = (over.detach() > SHADING_ALPHA_MIN).nonzero()[:, 0]
     alpha = over[index]
-    g = (flat[:, index] / alpha.clamp_min(ALPHA_SHADED)).T
+    g = (flat[:, index] / alpha.clamp_min(SHADING_ALPHA_MIN)).T
     normal = g[:, 5:8] * torch.rsqrt((g[:, 5:8] ** 2).sum(1, keepdim=True).clamp_min(1e-12))
     rgb = shade(normal, view_directions(view, index), g[:, :3], g[:, 3], g[:, 4], tables)
     image = planes.new_zeros(h * w, 3).index_copy(0, index, linear_to_srgb(rgb) * alpha[:, None])

@@ -19,12 +19,12 @@ import torch
 from numba import njit
 from torch import Tensor
 
-from gsbake.surfels.raster.blocks import FAST
+from gsbake.surfels.raster.blocks import FASTMATH
 from gsbake.surfels.raster.kernel import ALPHA_MIN
 from gsbake.surfels.raster.threads import run_chunks
 
 #: |cos| between ray and plane below which a surfel counts as edge-on and is skipped.
-EDGE_ON = 1e-3
+EDGE_ON_COS = 1e-3
 #: Coefficients are clamped to this: a surfel far smaller than a pixel is all low-pass anyway.
 COEF_MAX = np.float32(1e8)
 NEAR_Z = np.float32(0.02)
@@ -33,7 +33,7 @@ SCALE_MIN, QUATERNION_MIN = np.float32(1e-12), np.float32(1e-30)
 #: A surfel of this scale or more (or of none that is a number) is skipped: its square no longer fits a float32.
 SCALE_MAX = np.float32(1e18)
 
-_JIT: dict[str, Any] = {"nogil": True, "fastmath": FAST, "error_model": "numpy", "cache": True}
+_JIT: dict[str, Any] = {"nogil": True, "fastmath": FASTMATH, "error_model": "numpy", "cache": True}
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class Pinhole:
 
 
 @njit(**_JIT)
-def _axes(q0, q1, q2, q3):  # type: ignore[no-untyped-def]
+def _rotation(q0, q1, q2, q3):  # type: ignore[no-untyped-def]
     """Rotation matrix of a (w, x, y, z) quaternion of any length, row-major."""
     n = np.float32(1.0) / np.sqrt(max(q0 * q0 + q1 * q1 + q2 * q2 + q3 * q3, QUATERNION_MIN))
     w, x, y, z = q0 * n, q1 * n, q2 * n, q3 * n
@@ -64,7 +64,7 @@ def _axes(q0, q1, q2, q3):  # type: ignore[no-untyped-def]
 
 
 @njit(**_JIT)
-def _span(a, b, c, az, bz, cz, r2, focal, principal, size):  # type: ignore[no-untyped-def]
+def _extent(a, b, c, az, bz, cz, r2, focal, principal, size):  # type: ignore[no-untyped-def]
     """Extent in pixels of the projected disc along one axis; the whole screen when the disc reaches the camera plane."""
     lead = cz * cz - r2 * (az * az + bz * bz)
     if not lead > np.float32(1e-6) * cz * cz:
@@ -78,7 +78,7 @@ def _span(a, b, c, az, bz, cz, r2, focal, principal, size):  # type: ignore[no-u
 @njit(**_JIT)
 def _forward(lo, hi, mu, quat, log_scale, opacity, rot, t, fx, fy, cx, cy, width, height, cull, geo, box, visible, normal):  # type: ignore[no-untyped-def]
     for i in range(lo, hi):
-        r00, r01, r02, r10, r11, r12, r20, r21, r22, _w, _x, _y, _z, _n = _axes(quat[i, 0], quat[i, 1], quat[i, 2], quat[i, 3])
+        r00, r01, r02, r10, r11, r12, r20, r21, r22, _w, _x, _y, _z, _n = _rotation(quat[i, 0], quat[i, 1], quat[i, 2], quat[i, 3])
         normal[i, 0], normal[i, 1], normal[i, 2] = r02, r12, r22
         m0, m1, m2 = mu[i, 0], mu[i, 1], mu[i, 2]
         c0 = rot[0, 0] * m0 + rot[0, 1] * m1 + rot[0, 2] * m2 + t[0]
@@ -98,7 +98,7 @@ def _forward(lo, hi, mu, quat, log_scale, opacity, rot, t, fx, fy, cx, cy, width
         n0, n1, n2 = t1 * b2 - t2 * b1, t2 * b0 - t0 * b2, t0 * b1 - t1 * b0
         h = n0 * c0 + n1 * c1 + n2 * c2
         length = np.sqrt(c0 * c0 + c1 * c1 + c2 * c2)
-        if not abs(h) > np.float32(EDGE_ON) * length:
+        if not abs(h) > np.float32(EDGE_ON_COS) * length:
             continue
         if cull and h > np.float32(0.0):
             continue
@@ -117,8 +117,8 @@ def _forward(lo, hi, mu, quat, log_scale, opacity, rot, t, fx, fy, cx, cy, width
         geo[i, 7] = k * n1 / fy
         geo[i, 8] = c2
         r2 = np.float32(2.0) * np.log(np.float32(255.0) * opacity[i])
-        x_lo, x_hi = _span(t0 * su, b0 * sv, c0, t2 * su, b2 * sv, c2, r2, fx, cx, width)
-        y_lo, y_hi = _span(t1 * su, b1 * sv, c1, t2 * su, b2 * sv, c2, r2, fy, cy, height)
+        x_lo, x_hi = _extent(t0 * su, b0 * sv, c0, t2 * su, b2 * sv, c2, r2, fx, cx, width)
+        y_lo, y_hi = _extent(t1 * su, b1 * sv, c1, t2 * su, b2 * sv, c2, r2, fy, cy, height)
         low = np.sqrt(np.float32(0.5) * r2)
         x_lo, x_hi = min(x_lo, xc - low), max(x_hi, xc + low)
         y_lo, y_hi = min(y_lo, yc - low), max(y_hi, yc + low)
@@ -138,7 +138,7 @@ def _forward(lo, hi, mu, quat, log_scale, opacity, rot, t, fx, fy, cx, cy, width
 def _backward(lo, hi, mu, quat, log_scale, rot, t, fx, fy, visible, geo, g_geo, g_normal, g_mu, g_quat, g_scale, g_pose):  # type: ignore[no-untyped-def]
     """g_pose (12,) collects this chunk's share of the gradients of R (row-major) and t."""
     for i in range(lo, hi):
-        r00, r01, r02, r10, r11, r12, r20, r21, r22, qw, qx, qy, qz, qn = _axes(quat[i, 0], quat[i, 1], quat[i, 2], quat[i, 3])
+        r00, r01, r02, r10, r11, r12, r20, r21, r22, qw, qx, qy, qz, qn = _rotation(quat[i, 0], quat[i, 1], quat[i, 2], quat[i, 3])
         gn_0, gn_1, gn_2 = g_normal[i, 0], g_normal[i, 1], g_normal[i, 2]  # world normal
         gr00 = gr10 = gr20 = gr01 = gr11 = gr21 = np.float32(0.0)
         for j in range(3):
@@ -228,7 +228,7 @@ def _backward(lo, hi, mu, quat, log_scale, rot, t, fx, fy, visible, geo, g_geo, 
         g_quat[i, 3] = (dz - along * qz) * qn
 
 
-def _np(x: Tensor) -> Any:
+def _numpy(x: Tensor) -> Any:
     return x.detach().contiguous().numpy()
 
 
@@ -246,7 +246,7 @@ class Project(torch.autograd.Function):
         n = mu.shape[0]
         geo, normal = torch.empty(n, 9), torch.empty(n, 3)
         box, visible = torch.zeros(n, 4, dtype=torch.int32), torch.zeros(n, dtype=torch.bool)
-        args = [_np(x) for x in (mu, quat, log_scale, opacity, R, t)]
+        args = [_numpy(x) for x in (mu, quat, log_scale, opacity, R, t)]
         p = [np.float32(v) for v in (pinhole.fx, pinhole.fy, pinhole.cx, pinhole.cy)]
         outs = [x.numpy() for x in (geo, box, visible, normal)]
         run_chunks(lambda lo, hi: _forward(lo, hi, *args, *p, pinhole.width, pinhole.height, cull, *outs), n, 2, 2048)
@@ -261,9 +261,9 @@ class Project(torch.autograd.Function):
         mu, quat, log_scale, R, t, geo, visible = ctx.saved_tensors
         n = mu.shape[0]
         g_mu, g_quat, g_scale = torch.empty(n, 3), torch.empty(n, 4), torch.empty(n, 2)
-        args = [_np(x) for x in (mu, quat, log_scale, R, t)]
+        args = [_numpy(x) for x in (mu, quat, log_scale, R, t)]
         fx, fy = np.float32(ctx.pinhole.fx), np.float32(ctx.pinhole.fy)
-        rest = [_np(x) for x in (visible, geo, g_geo, g_normal)]
+        rest = [_numpy(x) for x in (visible, geo, g_geo, g_normal)]
         outs = [x.numpy() for x in (g_mu, g_quat, g_scale)]
         step = 4096  # fixed chunks: the pose sum does not depend on the number of threads
         poses = np.zeros((max(1, -(-n // step)), 12), np.float32)

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from gsbake.surfels.losses.terms import expected_depth
 from gsbake.surfels.raster.binning import bin_surfels
-from gsbake.surfels.raster.kernel import EXTRA, SLOT, backward_kernel, forward_kernel, sum_slots
+from gsbake.surfels.raster.kernel import AUX_PLANES, FEATURE_OFFSET, backward_kernel, forward_kernel, sum_slots
 from gsbake.surfels.raster.projection import Pinhole, Project
 from gsbake.surfels.raster.threads import run_chunks
 
@@ -26,8 +26,8 @@ class Rendered:
 
     `features` (c, h, w); `depth` Σ w z; `distortion` Σ_{i<j} w_i w_j (m_i − m_j)² on NDC depth; `alpha` Σ w; `median` depth where T
     crosses ½ (0 if it never does; no gradient); `normal` (n, 3) world normals of the surfels; `visible` (n,) bool;
-    `screen` (n, 9), whose `.grad` after backward holds the screen-space gradients (columns 0, 1: the centre, in pixels);
-    `touched` holds Σ w per surfel after backward. `planes` (c + 6, h, w) is what all of them are cut from.
+    `projected` (n, 9), whose `.grad` after backward holds the screen-space gradients (columns 0, 1: the centre, in pixels);
+    `stats["weight"]` holds Σ w per surfel after backward. `planes` (c + 6, h, w) is what all of them are cut from.
     """
 
     planes: Tensor
@@ -38,7 +38,7 @@ class Rendered:
     median: Tensor
     normal: Tensor
     visible: Tensor
-    screen: Tensor
+    projected: Tensor
     stats: dict[str, Tensor]
 
     def expected_depth(self) -> Tensor:
@@ -63,7 +63,7 @@ class _Blend(torch.autograd.Function):
         g, o, f = (x.detach().contiguous().numpy() for x in (geo, opacity, features))
         b = box.numpy()
         bins = bin_surfels(np.ascontiguousarray(g[:, 8]), b, visible.numpy(), width, height)
-        out = torch.empty(channels + EXTRA, height, width)
+        out = torch.empty(channels + AUX_PLANES, height, width)
         used = np.empty(len(bins.order), np.int64)
         kernel, image = forward_kernel(channels), out.numpy()
         run_chunks(
@@ -81,7 +81,7 @@ class _Blend(torch.autograd.Function):
         channels, n = features.shape[1], features.shape[0]
         g, o, f = (x.detach().contiguous().numpy() for x in (geo, opacity, features))
         planes = grad.contiguous().numpy()
-        result = np.empty((len(bins.ids), SLOT + channels), np.float32)
+        result = np.empty((len(bins.ids), FEATURE_OFFSET + channels), np.float32)
         kernel, image, b = backward_kernel(channels), out.numpy(), box.numpy()
         run_chunks(
             lambda lo, hi: kernel(
@@ -89,11 +89,11 @@ class _Blend(torch.autograd.Function):
             ),
             len(bins.order),
         )
-        sums = torch.empty(n, SLOT + channels)
+        sums = torch.empty(n, FEATURE_OFFSET + channels)
         total = sums.numpy()
         run_chunks(lambda lo, hi: sum_slots(lo, hi, bins.offsets, result, total), n, 2, 4096)
-        ctx.stats["touched"] = sums[:, 10]
-        return sums[:, :9].contiguous(), sums[:, 9].contiguous(), sums[:, SLOT:].contiguous(), None, None, None, None, None
+        ctx.stats["weight"] = sums[:, 10]
+        return sums[:, :9].contiguous(), sums[:, 9].contiguous(), sums[:, FEATURE_OFFSET:].contiguous(), None, None, None, None, None
 
 
 def render(

@@ -8,8 +8,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from gsbake.surfels.raster.kernel import ALPHA_MAX, ALPHA_MIN, NDC, T_STOP
-from gsbake.surfels.raster.projection import EDGE_ON, Pinhole
+from gsbake.surfels.raster.kernel import ALPHA_MAX, ALPHA_MIN, NDC_SCALE, TRANSMITTANCE_MIN
+from gsbake.surfels.raster.projection import EDGE_ON_COS, Pinhole
 
 
 def rotation_matrix(quaternion: Tensor) -> Tensor:
@@ -50,7 +50,7 @@ def render_reference(
     for i in torch.argsort(centre[:, 2].detach(), stable=True).tolist():
         c, (t, b, n) = centre[i], axes[i].unbind(1)
         h = n @ c
-        if not (c[2] > near and opacity[i] > ALPHA_MIN and abs(h) > EDGE_ON * c.norm()) or (cull_backfaces and h > 0):
+        if not (c[2] > near and opacity[i] > ALPHA_MIN and abs(h) > EDGE_ON_COS * c.norm()) or (cull_backfaces and h > 0):
             continue
         su, sv = log_scale[i].exp().unbind()
         dx = x - (pinhole.fx * c[0] / c[2] + pinhole.cx)
@@ -67,10 +67,10 @@ def render_reference(
         plane = r3 <= r2
         z = torch.where(plane, z_hit, c[2].expand(shape))
         alpha = (opacity[i] * torch.exp(-torch.where(plane, r3, r2).clamp_max(16) / 2)).clamp_max(ALPHA_MAX)
-        on = (alpha >= ALPHA_MIN) & (transmittance >= T_STOP)
+        on = (alpha >= ALPHA_MIN) & (transmittance >= TRANSMITTANCE_MIN)
         alpha = torch.where(on, alpha, torch.zeros_like(alpha))
         w = alpha * transmittance
-        m = -NDC / z
+        m = -NDC_SCALE / z
         accumulated = 1 - transmittance
         distortion = distortion + w * (m * m * accumulated + b2 - 2 * m * b1)
         b1, b2 = b1 + w * m, b2 + w * m * m

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from gsbake.geometry.cameras import Camera
 from gsbake.surfels.model import Surfels
-from gsbake.surfels.raster.gbuffer import picture, rasterise
+from gsbake.surfels.raster.gbuffer import rasterise, rendered_image
 from gsbake.surfels.training.views import TrainView, pose_of
 
 Image = NDArray[np.float32]
@@ -60,7 +60,7 @@ class SurfelRenderer:
         view = _view(camera, self.surfels.position.device)
         out = rasterise(self.surfels, view)
         tables = None if self.light is None else self.light.prefilter()  # type: ignore[attr-defined]
-        return picture(out.planes, view, tables).permute(1, 2, 0).cpu().numpy(), out.alpha.cpu().numpy()
+        return rendered_image(out.planes, view, tables).permute(1, 2, 0).cpu().numpy(), out.alpha.cpu().numpy()
 
 
 def _view(camera: Camera, device: torch.device) -> TrainView:

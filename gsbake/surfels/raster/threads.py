@@ -1,7 +1,7 @@
-"""Runs kernel calls that release the GIL on a small thread pool of our own.
+"""Thread pool for kernels that release the GIL.
 
-Work is cut into more chunks than threads, so that heavy tiles balance; results do not depend on the number of threads because every
-chunk writes only its own outputs.
+Work is split into more chunks than threads to balance the load. Each chunk writes only its own outputs, so results do not depend on the
+number of threads.
 """
 
 from __future__ import annotations
@@ -17,9 +17,8 @@ _configured = 0
 def configure(threads: int) -> None:
     """Give the kernels `threads` threads and torch one.
 
-    What torch is left with in a training step are many small operations: a team of OpenMP threads gains nothing on them, and whenever
-    another
-    process holds a core every barrier waits for it (seen: 10x slower steps beside one busy process).
+    Torch's share of a training step is many small operations, which gain nothing from OpenMP threads. When another process holds a core,
+    every OpenMP barrier waits for it (measured: 10x slower steps beside one busy process).
     """
     global _configured
     import torch
@@ -29,7 +28,7 @@ def configure(threads: int) -> None:
 
 
 def thread_count() -> int:
-    """Threads the kernels use: as configured, else torch's setting."""
+    """Threads of the kernels: the configured number, else torch's."""
     import torch
 
     return _configured or max(1, torch.get_num_threads())
@@ -41,7 +40,7 @@ def _pool(pid: int, threads: int) -> ThreadPoolExecutor:
 
 
 def run_chunks(call: Callable[[int, int], object], count: int, chunks_per_thread: int = 6, minimum: int = 1) -> None:
-    """Call `call(start, stop)` over 0..count in chunks of at least `minimum`, on all threads; errors are re-raised."""
+    """Run `call(start, stop)` over 0..count in chunks of at least `minimum` items on all threads; exceptions are re-raised."""
     threads = thread_count()
     if count <= 0:
         return

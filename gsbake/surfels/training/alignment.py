@@ -15,7 +15,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from gsbake.imaging.metrics import decibels
-from gsbake.surfels.raster.gbuffer import picture, rasterise
+from gsbake.surfels.raster.gbuffer import rasterise, rendered_image
 from gsbake.surfels.raster.rasterise import Rendered
 from gsbake.surfels.training.corrections import OFFSET, POWER, Correction, then
 from gsbake.surfels.training.views import TrainView
@@ -181,6 +181,6 @@ def scene_of(surfels: object, light: object, masked: bool, background: Tensor) -
 
     def draw(view: TrainView) -> tuple[Tensor, Rendered]:
         out = rasterise(surfels, view)  # type: ignore[arg-type]
-        return picture(out.planes, view, tables) + background[:, None, None] * (1 - out.alpha), out
+        return rendered_image(out.planes, view, tables) + background[:, None, None] * (1 - out.alpha), out
 
     return Scene(draw, masked, background)

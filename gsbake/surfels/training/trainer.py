@@ -17,12 +17,12 @@ from torch import Tensor
 from gsbake.imaging.metrics import decibels
 from gsbake.surfels.densification.clone_split import Statistics, densify, placement, prune
 from gsbake.surfels.densification.policies import GROWING, PRUNING
-from gsbake.surfels.losses import image as image_loss
-from gsbake.surfels.losses import projection as projection_loss
 from gsbake.surfels.losses import terms as losses
+from gsbake.surfels.losses.image import image_losses
+from gsbake.surfels.losses.projection import projection_loss
 from gsbake.surfels.losses.terms import ImageWeights
 from gsbake.surfels.model import Surfels
-from gsbake.surfels.raster.gbuffer import picture, rasterise
+from gsbake.surfels.raster.gbuffer import rasterise, rendered_image
 from gsbake.surfels.raster.rasterise import Rendered
 from gsbake.surfels.training.adam import Adam
 from gsbake.surfels.training.early_stopping import stands_still
@@ -104,15 +104,15 @@ class Trainer:
         w, s = self.plan.loss, self.surfels
         late = self.done >= SDF_FROM * self.plan.iterations
         weights = ImageWeights(w.ssim, w.normal, w.mask, w.distortion if late else 0.0, w.smoothness)
-        total, colour = image_loss.image(out.planes, tables, view, self.masked, self._background(view), weights)
-        if tables is not None and w.white_light:
-            from gsbake.shading.neutral_light import colourfulness
+        total, colour = image_losses(out.planes, tables, view, self.masked, self._background(view), weights)
+        if tables is not None and w.neutral_light:
+            from gsbake.shading.neutral_light import neutral_light_loss
 
-            total = total + w.white_light * colourfulness(self.light.radiance())
+            total = total + w.neutral_light * neutral_light_loss(self.light.radiance())
         if late and w.median:
             total = total + w.median * losses.median_sharpness(s.sdf, s.gamma, s.transfer)
         if late and w.projection:
-            total = total + w.projection * projection_loss.projection(
+            total = total + w.projection * projection_loss(
                 s.position, out.normal, s.sdf, out.visible, out.depth, out.alpha, view.R, view.t, view.pinhole
             )
         return total, colour
@@ -154,10 +154,10 @@ class Trainer:
             raise FloatingPointError(f"the loss became {value} at step {self.done} on photo {view.name}{blame}")
         rates = self.rates()
         with torch.no_grad():
-            grad = out.screen.grad
+            grad = out.projected.grad
             assert grad is not None
-            if "touched" in out.stats:
-                self.stats.add(grad, out.stats["touched"], max(view.pinhole.width, view.pinhole.height))
+            if "weight" in out.stats:
+                self.stats.add(grad, out.stats["weight"], max(view.pinhole.width, view.pinhole.height))
             for name, x in leaves.items():
                 if x.grad is not None:
                     self._update(name, x, rates[name], leaves)
@@ -217,7 +217,8 @@ class Trainer:
             photo, mask = view.colour(), view.cover()
             cover = torch.ones_like(out.alpha) if mask is None or not self.masked else mask
             background = self.background[:, None, None]
-            error = (picture(out.planes, view, tables) + background * (1 - out.alpha) - photo * cover - background * (1 - cover)) ** 2
+            rendered = rendered_image(out.planes, view, tables) + background * (1 - out.alpha)
+            error = (rendered - photo * cover - background * (1 - cover)) ** 2
             inside = (cover > 0.5) | (out.alpha > 0.5)
             total.append(decibels(float(error.mean(0)[inside].mean())))
         return sum(total) / len(total)
@@ -250,7 +251,7 @@ class Trainer:
 
     def restore(self, state: dict[str, Any]) -> None:
         """Go on from what `state` returned."""
-        self.surfels = Surfels.of(state["surfels"], self.surfels.transfer)
+        self.surfels = Surfels.from_tensors(state["surfels"], self.surfels.transfer)
         self.adam.load(state["adam"])
         self.generator.set_state(state["generator"])
         if self.light is not None:

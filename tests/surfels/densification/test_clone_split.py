@@ -10,7 +10,7 @@ import torch
 
 from gsbake.surfels.densification.clone_split import Statistics, densify, placement, prune
 from gsbake.surfels.initialisation import fibonacci_sphere, spacing
-from gsbake.surfels.model import Surfels, create, quaternion_to
+from gsbake.surfels.model import Surfels, create, quaternion_from_normal
 from gsbake.surfels.training.adam import Adam
 
 
@@ -35,7 +35,7 @@ def test_quaternions_turn_z_to_the_normal() -> None:
     n = torch.nn.functional.normalize(torch.randn(100, 3, generator=torch.Generator().manual_seed(0)), dim=1)
     n[0], n[1] = torch.tensor([0.0, 0.0, -1.0]), torch.tensor([0.0, 0.0, 1.0])
     s = ball(100)
-    s.quaternion = quaternion_to(n)
+    s.quaternion = quaternion_from_normal(n)
     assert torch.allclose(s.normal(), n, atol=1e-5)
 
 

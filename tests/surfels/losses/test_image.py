@@ -10,12 +10,12 @@ from torch import Tensor
 
 from gsbake.shading.environment import EnvironmentLight
 from gsbake.shading.light_tables import LightTables
-from gsbake.surfels.losses import image as image_loss
 from gsbake.surfels.losses import photometric as similarity
 from gsbake.surfels.losses import terms as losses
+from gsbake.surfels.losses.image import image_losses
 from gsbake.surfels.losses.terms import ImageWeights
 from gsbake.surfels.raster import threads
-from gsbake.surfels.raster.gbuffer import picture
+from gsbake.surfels.raster.gbuffer import rendered_image
 from gsbake.surfels.raster.projection import Pinhole
 from gsbake.surfels.training.views import TrainView
 
@@ -62,9 +62,9 @@ def test_colour(shape: tuple[int, int, int], share: float) -> None:
     assert view.mask is not None
     grad = torch.empty(shape)
     flat = [x.reshape(-1).numpy() for x in (image, alpha, view.rgb, view.mask, back)]
-    fast = similarity.colour(*flat, h, w, share, grad.view(-1).numpy())
+    fast = similarity.colour_loss(*flat, h, w, share, grad.view(-1).numpy())
     a, cover, behind = image.double().requires_grad_(), view.mask.double() / 255, back.double()[:, None, None]
-    slow = losses.colour(a + behind * (1 - alpha.double()), view.rgb.double() / 255 * cover + behind * (1 - cover), share)
+    slow = losses.colour_loss(a + behind * (1 - alpha.double()), view.rgb.double() / 255 * cover + behind * (1 - cover), share)
     slow.backward()
     assert fast == pytest.approx(float(slow.detach()), abs=1e-6)
     assert close(grad, a.grad, 1e-5)
@@ -78,9 +78,9 @@ def test_colour_where_the_pictures_agree() -> None:
     view, back = random_view(h, w), torch.tensor([0.9, 0.5, 0.13])
     image, grad = 0.3 * torch.rand(3, h, w, generator=torch.Generator().manual_seed(1)) * disc, torch.empty(3, h, w)
     flat = [v.reshape(-1).numpy() for v in (image, disc, view.rgb, (255 * disc).byte(), back)]
-    fast = similarity.colour(*flat, h, w, 0.2, grad.view(-1).numpy())
+    fast = similarity.colour_loss(*flat, h, w, 0.2, grad.view(-1).numpy())
     a, behind = image.double().requires_grad_(), back.double()[:, None, None] * (1 - disc.double())
-    slow = losses.colour(a + behind, view.rgb.double() / 255 * disc + behind, 0.2)
+    slow = losses.colour_loss(a + behind, view.rgb.double() / 255 * disc + behind, 0.2)
     slow.backward()
     assert fast == pytest.approx(float(slow.detach()), abs=1e-5)
     assert close(grad, a.grad, 1e-4)
@@ -105,8 +105,8 @@ def image_twin(
     planes: Tensor, tables: LightTables | None, view: TrainView, masked: bool, background: Tensor, weights: ImageWeights
 ) -> tuple[Tensor, Tensor]:
     turned = TrainView(view.name, view.rgb, view.mask, view.R.to(planes), view.t, view.centre, view.pinhole)
-    shaded = picture(planes, turned, tables)
-    return losses.image(planes, shaded, turned, masked, background.to(planes), weights, tables is not None)
+    shaded = rendered_image(planes, turned, tables)
+    return losses.image_losses(planes, shaded, turned, masked, background.to(planes), weights, tables is not None)
 
 
 @pytest.mark.parametrize("size", SIZES)
@@ -119,7 +119,7 @@ def image_twin(
 def test_image(size: tuple[int, int], masked: bool, weights: ImageWeights) -> None:
     view, planes, back = random_view(*size), random_planes(6, *size), torch.tensor([0.1, 0.5, 0.9])
     a, b = planes.clone().requires_grad_(), planes.double().requires_grad_()
-    fast, colour = image_loss.image(a, None, view, masked, back, weights)
+    fast, colour = image_losses(a, None, view, masked, back, weights)
     slow, colour_too = image_twin(b, None, view, masked, back, weights)
     assert float(fast.detach()) == pytest.approx(float(slow.detach()), rel=1e-5, abs=1e-6)
     assert float(colour) == pytest.approx(float(colour_too.detach()), abs=1e-6)
@@ -140,7 +140,7 @@ def test_image_of_materials(size: tuple[int, int], masked: bool, weights: ImageW
         light.raw += torch.randn(light.raw.shape, generator=torch.Generator().manual_seed(5))
     tables = light.prefilter()
     found = []
-    for dtype, call in ((torch.float32, image_loss.image), (torch.float64, image_twin)):
+    for dtype, call in ((torch.float32, image_losses), (torch.float64, image_twin)):
         leaf, table = planes.to(dtype, copy=True).requires_grad_(), tables.table.detach().to(dtype).requires_grad_()
         total, colour = call(leaf, LightTables(table, tables.layout), view, masked, back, weights)
         total.backward()
@@ -157,7 +157,7 @@ def test_image_of_materials(size: tuple[int, int], masked: bool, weights: ImageW
 def test_image_where_nothing_is() -> None:
     """No pixel is shaded, none has a depth: gradients are there and finite."""
     view, planes = random_view(20, 17), torch.zeros(14, 20, 17).requires_grad_()
-    image_loss.image(planes, EnvironmentLight(8).prefilter().detach(), view, True, torch.ones(3), ALL)[0].backward()
+    image_losses(planes, EnvironmentLight(8).prefilter().detach(), view, True, torch.ones(3), ALL)[0].backward()
     assert planes.grad is not None and bool(torch.isfinite(planes.grad).all()) and float(planes.grad.abs().max()) > 0
 
 
@@ -180,7 +180,7 @@ def test_the_number_of_threads_does_not_matter(monkeypatch: pytest.MonkeyPatch) 
     for count in (1, 3):
         monkeypatch.setattr(threads, "_configured", count)
         leaf = planes.clone().requires_grad_()
-        total, _ = image_loss.image(leaf, tables, view, True, back, ALL)
+        total, _ = image_losses(leaf, tables, view, True, back, ALL)
         total.backward()
         found.append((total.detach(), leaf.grad))
     (one, grad), (three, grad_too) = found

@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 import torch
 
-from gsbake.surfels.losses import projection as projection_loss
 from gsbake.surfels.losses import terms as losses
+from gsbake.surfels.losses.projection import projection_loss
 from gsbake.surfels.raster.projection import Pinhole
 
 H, W = 41, 52
@@ -28,8 +28,8 @@ def test_projection(n: int) -> None:
     view = Pinhole(W, H, 60.0, 55.0, 25.0, 20.0)
     leaves = [x.clone().requires_grad_() for x in (position, normal, sdf)]
     twins = [x.double().requires_grad_() for x in (position, normal, sdf)]
-    fast = projection_loss.projection(*leaves, visible, depth, alpha, turn, t, view)
-    slow = losses.projection(*twins, visible, depth.double(), alpha.double(), turn.double(), t.double(), view)
+    fast = projection_loss(*leaves, visible, depth, alpha, turn, t, view)
+    slow = losses.projection_loss(*twins, visible, depth.double(), alpha.double(), turn.double(), t.double(), view)
     assert float(fast.detach()) == pytest.approx(float(slow.detach()), rel=1e-4, abs=1e-9)
     (2 * fast).backward()
     (2 * slow).backward()
@@ -43,6 +43,6 @@ def test_projection(n: int) -> None:
 def test_no_surfel() -> None:
     nothing = torch.zeros(0, 3).requires_grad_()
     none, plane, view = torch.zeros(0), torch.ones(H, W), Pinhole(W, H, 9.0, 9.0, 9.0, 9.0)
-    value = projection_loss.projection(nothing, nothing.detach(), none, none.bool(), plane, plane, torch.eye(3), torch.zeros(3), view)
+    value = projection_loss(nothing, nothing.detach(), none, none.bool(), plane, plane, torch.eye(3), torch.zeros(3), view)
     value.backward()
     assert float(value.detach()) == 0 and nothing.grad is not None

@@ -10,10 +10,10 @@ import torch
 from torch import Tensor
 
 from gsbake.imaging.srgb_torch import linear_to_srgb
-from gsbake.pipeline.machine import cuda_lacks
+from gsbake.pipeline.machine import missing_cuda_requirement
 from gsbake.shading.light_tables import LightTables
-from gsbake.shading.neutral_light import colourfulness
-from gsbake.shading.prefilter import operator
+from gsbake.shading.neutral_light import neutral_light_loss
+from gsbake.shading.prefilter import prefilter_operator
 from gsbake.shading.split_sum import shade
 from gsbake.surfels import spherical_harmonics as harmonics
 from gsbake.surfels.densification.clone_split import Statistics
@@ -38,11 +38,17 @@ def view() -> TrainView:
 def image(materials: bool) -> Tensor:
     planes, weights = meta(14 if materials else 12, 29, 37), losses.ImageWeights(0.2, 0.1, 0.1, 0.1, 0.1)
     # an index of pixels has no size on "meta": the picture of materials is the test "shade"
-    return losses.image(planes, planes[:3], view().to("meta"), True, meta(3), weights, materials)[0]
+    return losses.image_losses(planes, planes[:3], view().to("meta"), True, meta(3), weights, materials)[0]
+
+
+def tables_of(size: int) -> LightTables:
+    """Prefiltered tables without data of a cube map with faces of `size`²."""
+    layout = prefilter_operator(size).layout
+    return LightTables(meta(layout.texels, 3), layout)
 
 
 PARTS: dict[str, Callable[[], Tensor]] = {
-    "colour": lambda: losses.colour(meta(3, 29, 37), meta(3, 29, 37), 0.2),
+    "colour": lambda: losses.colour_loss(meta(3, 29, 37), meta(3, 29, 37), 0.2),
     "normal": lambda: losses.normal_consistency(
         meta(3, 29, 37), meta(29, 37), losses.depth_normals(meta(29, 37), meta(3, 3), PINHOLE), meta(29, 37)
     ),
@@ -50,11 +56,11 @@ PARTS: dict[str, Callable[[], Tensor]] = {
     "image of materials": lambda: image(True),
     "harmonics": lambda: harmonics.colours(meta(9, 4, 3), meta(9, 3), meta(3)),
     "mask": lambda: losses.mask_entropy(meta(29, 37), meta(29, 37).detach()),
-    "smoothness": lambda: losses.smoothness(meta(5, 29, 37), meta(29, 37), meta(29, 37)),
-    "white light": lambda: colourfulness(meta(6, 8, 8, 3)),
+    "smoothness": lambda: losses.smoothness_loss(meta(5, 29, 37), meta(29, 37), meta(29, 37)),
+    "white light": lambda: neutral_light_loss(meta(6, 8, 8, 3)),
     "sRGB": lambda: linear_to_srgb(meta(9, 3)),
     "shade": lambda: shade(
-        meta(9, 3), meta(9, 3), meta(9, 3), meta(9), meta(9), LightTables(meta(operator(8).layout.texels, 3), operator(8).layout)
+        meta(9, 3), meta(9, 3), meta(9, 3), meta(9), meta(9), tables_of(8)
     ),
     "projection": lambda: project(meta(9, 3), meta(9, 4), meta(9, 2), meta(9), meta(3, 3), meta(3), PINHOLE, True)[0],
     "view directions": lambda: view_directions(view().to("meta"), torch.zeros(4, dtype=torch.long, device="meta")) * meta(4, 3),
@@ -85,7 +91,7 @@ def test_state_moves_as_a_whole() -> None:
     assert stats.mean_gradient().device.type == "meta"
 
 
-@pytest.mark.skipif(cuda_lacks() is not None, reason="no usable GPU")
+@pytest.mark.skipif(missing_cuda_requirement() is not None, reason="no usable GPU")
 @pytest.mark.slow
 def test_on_the_gpu() -> None:
     """Parity of planes and gradients, and a short training, against the CPU; in a process where Triton compiles."""

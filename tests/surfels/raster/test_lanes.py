@@ -5,22 +5,22 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from gsbake.surfels.raster.blocks import ACROSS, DOWN, TILE, pack, unpack
+from gsbake.surfels.raster.blocks import BLOCKS_ACROSS, BLOCKS_DOWN, TILE, pack, unpack
 from gsbake.surfels.raster.lanes import (
+    EXP2_COEFFICIENTS,
     LANES,
-    POWER,
+    any_lane,
+    broadcast,
+    exp2,
     lane_column,
     lane_row,
-    lanes,
     load,
-    logarithm,
-    power_of_two,
+    log,
     prefetch,
-    root,
     select,
-    some,
+    sqrt,
     store,
-    total,
+    sum_lanes,
 )
 
 
@@ -28,16 +28,16 @@ from gsbake.surfels.raster.lanes import (
 def _power(x, c, out):  # type: ignore[no-untyped-def]
     for i in range(0, x.shape[0], LANES):
         at = np.uint64(i)
-        y = power_of_two(load(x, at), lanes(c[0]), lanes(c[1]), lanes(c[2]), lanes(c[3]), lanes(c[4]), lanes(c[5]))
+        y = exp2(load(x, at), broadcast(c[0]), broadcast(c[1]), broadcast(c[2]), broadcast(c[3]), broadcast(c[4]), broadcast(c[5]))
         store(out, at, y)
 
 
 @njit(error_model="numpy")
-def _logarithm_and_root(x, log, square_root):  # type: ignore[no-untyped-def]
+def _log_and_sqrt(x, logarithms, roots):  # type: ignore[no-untyped-def]
     for i in range(0, x.shape[0], LANES):
         at = np.uint64(i)
-        store(log, at, logarithm(load(x, at)))
-        store(square_root, at, root(load(x, at)))
+        store(logarithms, at, log(load(x, at)))
+        store(roots, at, sqrt(load(x, at)))
 
 
 @njit(error_model="numpy")
@@ -49,23 +49,23 @@ def _operations(a, b, f, out):  # type: ignore[no-untyped-def]
     store(out, n * np.uint64(1), (f - x) / y)
     store(out, n * np.uint64(2), select((x < y) & (x > f), x, f))
     store(out, n * np.uint64(3), select((x <= y) & (y >= x), lane_column(), lane_row()))
-    return total(x), some(x > y), some(x > np.float32(1e9))
+    return sum_lanes(x), any_lane(x > y), any_lane(x > np.float32(1e9))
 
 
-def test_logarithm_and_root() -> None:
+def test_log_and_sqrt() -> None:
     near = 1 + np.linspace(-1e-3, 1e-3, 800)
     x = np.concatenate([np.geomspace(1.2e-38, 3e38, 8000), near, [1.0, 2.0, 0.5, 0.7071, 0.7072, 1.4142, 1.4143, 4.0]]).astype(np.float32)
-    log, square_root = np.empty_like(x), np.empty_like(x)
-    _logarithm_and_root(x, log, square_root)
+    logarithms, roots = np.empty_like(x), np.empty_like(x)
+    _log_and_sqrt(x, logarithms, roots)
     exact = np.log(x.astype(np.float64))
-    assert (np.abs(log - exact) <= np.maximum(3e-7 * np.abs(exact), 1e-8)).all()
-    assert np.array_equal(square_root, np.sqrt(x)) and log[x == 1].tolist() == [0.0] * int((x == 1).sum())
+    assert (np.abs(logarithms - exact) <= np.maximum(3e-7 * np.abs(exact), 1e-8)).all()
+    assert np.array_equal(roots, np.sqrt(x)) and logarithms[x == 1].tolist() == [0.0] * int((x == 1).sum())
 
 
 def test_power_of_two() -> None:
     x = np.linspace(-20, 5, 8000, dtype=np.float32)
     out = np.empty_like(x)
-    _power(x, np.array(POWER, np.float32), out)
+    _power(x, np.array(EXP2_COEFFICIENTS, np.float32), out)
     exact = np.exp2(x.astype(np.float64))
     assert np.abs(out / exact - 1).max() < 3e-7
     assert (out[x == np.round(x)] == exact[x == np.round(x)]).all()
@@ -93,7 +93,7 @@ def test_a_comparison_with_nan_is_false() -> None:
 
 def test_tiles_go_to_blocks_and_back() -> None:
     """Whole tiles, and tiles cut by the frame to any size."""
-    width, height, blocks = 40, 36, ACROSS * DOWN
+    width, height, blocks = 40, 36, BLOCKS_ACROSS * BLOCKS_DOWN
     image = np.arange(width * height, dtype=np.float32)
     for cols, rows in ((TILE, TILE), (5, 7), (TILE, 3), (1, TILE)):
         s, copy = np.full(blocks * LANES * 2, -1, np.float32), np.full_like(image, -1)

@@ -19,8 +19,8 @@ SETTINGS = (
 RUNNER = """
 import os, sys
 from pathlib import Path
-from gsbake.cli.options import Options
-from gsbake.cli.session import open_session
+from gsbake.api import RunOptions
+from gsbake.api import open_session
 from gsbake.pipeline.engine import Observer
 from gsbake.errors import GsbakeError
 
@@ -34,7 +34,7 @@ class Stopper(Observer):
             self.sent = True  # a second SIGTERM would not wait for the checkpoint
             os.kill(os.getpid(), number)
 
-session = open_session(Options(out=Path(out)), Stopper())
+session = open_session(RunOptions(out=Path(out)), Stopper())
 try:
     session.engine.run(stage)
 except GsbakeError as error:
@@ -45,7 +45,9 @@ except GsbakeError as error:
 def run(out: Path, stage: str, step: int = 0, number: int = 0) -> int:
     """Exit code of one run up to `stage`."""
     command = [sys.executable, "-c", RUNNER, str(out), stage, str(step), str(int(number))]
-    return subprocess.run(command, capture_output=True, timeout=300, check=False).returncode
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
+    print(done.stdout[-3000:], done.stderr[-3000:])
+    return done.returncode
 
 
 def gsbake(*args: object) -> None:

@@ -16,7 +16,7 @@ from gsbake.config.schema import Profile
 from gsbake.geometry.cameras import Camera, CameraSet
 from gsbake.surfels.initialisation import fibonacci_sphere, spacing
 from gsbake.surfels.model import Surfels, create
-from gsbake.surfels.raster.gbuffer import picture, rasterise
+from gsbake.surfels.raster.gbuffer import rasterise, rendered_image
 from gsbake.surfels.raster.projection import Pinhole
 from gsbake.surfels.training import alignment as align
 from gsbake.surfels.training.corrections import Correction, equalised, rotated, then, turned_by, without_common
@@ -51,7 +51,7 @@ def photographed(surfels: Surfels, view: TrainView) -> TrainView:
     """The view with what its camera sees of the surfels as its photo and mask."""
     with torch.no_grad():
         out = rasterise(surfels, view)
-        straight = picture(out.planes, view, None) / out.alpha.clamp_min(0.05)
+        straight = rendered_image(out.planes, view, None) / out.alpha.clamp_min(0.05)
     rgb, mask = ((255 * x).round().clamp(0, 255).to(torch.uint8) for x in (straight, out.alpha))
     return replace(view, rgb=rgb, mask=mask)
 

@@ -9,13 +9,13 @@ from torch import Tensor
 
 from gsbake.surfels.raster.cuda import kernels
 from gsbake.surfels.raster.cuda.binning import bin_surfels
-from gsbake.surfels.raster.kernel import EXTRA, SLOT
+from gsbake.surfels.raster.kernel import AUX_PLANES, FEATURE_OFFSET
 
 
 class Blend(torch.autograd.Function):
     """`apply(geo, opacity, features, box, visible, width, height, stats)` → planes (c + 6, h, w), see `gsbake.surfels.raster.kernel`.
 
-    Tensors lie on a CUDA device; on the CPU when Triton interprets (TRITON_INTERPRET=1). Σ w per surfel goes to stats["touched"] in
+    Tensors lie on a CUDA device; on the CPU when Triton interprets (TRITON_INTERPRET=1). Σ w per surfel goes to stats["weight"] in
     backward.
     """
 
@@ -35,7 +35,7 @@ class Blend(torch.autograd.Function):
         c = features.shape[1]
         g, o, f = (x.detach().contiguous() for x in (geo, opacity, features))
         bins = bin_surfels(g[:, 8], box, visible, width, height)
-        out = torch.empty(c + EXTRA, height, width, device=geo.device)
+        out = torch.empty(c + AUX_PLANES, height, width, device=geo.device)
         tiles = len(bins.starts) - 1
         used = torch.empty(tiles, dtype=torch.int64, device=geo.device)
         padded = max(16, 1 << (c - 1).bit_length())
@@ -52,13 +52,13 @@ class Blend(torch.autograd.Function):
         geo, opacity, features, out = ctx.saved_tensors
         bins, (n, c) = ctx.bins, features.shape
         planes = torch.cat([grad[: c + 2], grad[c + 4 : c + 5]]).contiguous()
-        rows = torch.zeros(len(bins.ids), SLOT + c, device=geo.device)  # rows behind a full tile stay zero
+        rows = torch.zeros(len(bins.ids), FEATURE_OFFSET + c, device=geo.device)  # rows behind a full tile stay zero
         kernels.backward[(len(bins.starts) - 1,)](
             bins.starts, bins.ids, bins.slots, geo, opacity, features, out, ctx.used, planes, rows,
             bins.tiles_x, out.shape[2], out.shape[1], C=c, **kernels.BACKWARD,
         )  # fmt: skip
-        sums = torch.zeros(n, SLOT + c, device=geo.device)
+        sums = torch.zeros(n, FEATURE_OFFSET + c, device=geo.device)
         if len(bins.front):
             sums[bins.front] = torch.segment_reduce(rows, "sum", lengths=bins.counts, axis=0, unsafe=True, initial=0)
-        ctx.stats["touched"] = sums[:, 10]
-        return sums[:, :9].contiguous(), sums[:, 9].contiguous(), sums[:, SLOT:].contiguous(), None, None, None, None, None
+        ctx.stats["weight"] = sums[:, 10]
+        return sums[:, :9].contiguous(), sums[:, 9].contiguous(), sums[:, FEATURE_OFFSET:].contiguous(), None, None, None, None, None

@@ -14,7 +14,7 @@ import triton
 import triton.language as tl
 
 from gsbake.surfels.raster.cuda.binning import TILE
-from gsbake.surfels.raster.kernel import ALPHA_MAX, ALPHA_MIN, NDC, T_STOP
+from gsbake.surfels.raster.kernel import ALPHA_MAX, ALPHA_MIN, NDC_SCALE, TRANSMITTANCE_MIN
 
 #: Surfels per step and warps per program. Forward: sixteen is the least depth of Triton's matrix product. Backward keeps three times the
 #: planes alive; at 8 numbers per thread and plane it just fits the 255 registers of a thread (ptxas for sm_90: 12 bytes spilled).
@@ -23,23 +23,23 @@ BACKWARD = {"CHUNK": 4, "num_warps": 4}
 
 _ALPHA_MIN = tl.constexpr(ALPHA_MIN)
 _ALPHA_MAX = tl.constexpr(ALPHA_MAX)
-_T_STOP = tl.constexpr(T_STOP)
-_NDC = tl.constexpr(NDC)
-_EDGE = tl.constexpr(TILE)
+_TRANSMITTANCE_MIN = tl.constexpr(TRANSMITTANCE_MIN)
+_NDC_SCALE = tl.constexpr(NDC_SCALE)
+_TILE = tl.constexpr(TILE)
 
 
 @triton.jit
 def _pixels(tiles_x, width, height):  # type: ignore[no-untyped-def]
     """Of this program's tile: pixel centres x and y (256,), flat index and whether it lies in the frame."""
     tile = tl.program_id(0)
-    lane = tl.arange(0, _EDGE * _EDGE)
-    px = tile % tiles_x * _EDGE + lane % _EDGE
-    py = tile // tiles_x * _EDGE + lane // _EDGE
+    lane = tl.arange(0, _TILE * _TILE)
+    px = tile % tiles_x * _TILE + lane % _TILE
+    py = tile // tiles_x * _TILE + lane // _TILE
     return px + 0.5, py + 0.5, py * width + px, (px < width) & (py < height)
 
 
 @triton.jit
-def _meet(geo, opacity, g, here, x, y, t_in, first):  # type: ignore[no-untyped-def]
+def _intersect(geo, opacity, g, here, x, y, t_in, first):  # type: ignore[no-untyped-def]
     """Surfels g (n,) on pixels (256,) with transmittance t_in: results are (256, n), or (1, n) for the surfels' own coefficients.
 
     `here` masks the chunk's end; `first` is 1/z of the tile's first surfel. α is 0 where a surfel is skipped.
@@ -67,10 +67,10 @@ def _meet(geo, opacity, g, here, x, y, t_in, first):  # type: ignore[no-untyped-
     alpha = tl.where((alpha >= _ALPHA_MIN) & here[None, :], alpha, 0.0)
     after = t_in[:, None] * tl.cumprod(1.0 - alpha, axis=1)
     t = after / (1.0 - alpha)
-    on = (alpha > 0.0) & (t >= _T_STOP)
+    on = (alpha > 0.0) & (t >= _TRANSMITTANCE_MIN)
     e = tl.where(on & (raw < _ALPHA_MAX), e, 0.0)  # α's gradient reaches ρ and o only where it is neither clamped nor skipped
     alpha = tl.where(on, alpha, 0.0)
-    return ux, uy, vx, vy, wx, wy, zc, dx, dy, inv, u, v, plane, iz, z, _NDC * (first - iz), e, alpha, t, on, after
+    return ux, uy, vx, vy, wx, wy, zc, dx, dy, inv, u, v, plane, iz, z, _NDC_SCALE * (first - iz), e, alpha, t, on, after
 
 
 @triton.jit
@@ -83,7 +83,7 @@ def forward(  # type: ignore[no-untyped-def]
     begin, end = tl.load(starts + tl.program_id(0)), tl.load(starts + tl.program_id(0) + 1)
     lane, c = tl.arange(0, CHUNK), tl.arange(0, CP)
     t_in = tl.where(inside, 1.0, 0.0)
-    blended = tl.zeros((_EDGE * _EDGE, CP), tl.float32)
+    blended = tl.zeros((_TILE * _TILE, CP), tl.float32)
     depth, b1, b2, median = t_in * 0.0, t_in * 0.0, t_in * 0.0, t_in * 0.0
     first = t_in * 0.0
     k = begin
@@ -93,7 +93,7 @@ def forward(  # type: ignore[no-untyped-def]
     while live:
         here = k + lane < end
         g = tl.load(ids + tl.minimum(k + lane, end - 1)).to(tl.int64)  # masked lanes repeat the last: their numbers must be finite
-        _ux, _uy, _vx, _vy, _wx, _wy, _zc, _dx, _dy, _inv, _u, _v, _plane, _iz, z, m, _e, alpha, t, on, after = _meet(
+        _ux, _uy, _vx, _vy, _wx, _wy, _zc, _dx, _dy, _inv, _u, _v, _plane, _iz, z, m, _e, alpha, t, on, after = _intersect(
             geo, opacity, g, here, x, y, t_in, first[:, None]
         )
         w = alpha * t
@@ -108,7 +108,7 @@ def forward(  # type: ignore[no-untyped-def]
         median = tl.where((t_in > 0.5) & (at < CHUNK), crossing, median)
         t_in = tl.min(tl.where(on, after, t_in[:, None]), 1)
         k += CHUNK
-        live = (k < end) & (tl.max(t_in, 0) >= _T_STOP)
+        live = (k < end) & (tl.max(t_in, 0) >= _TRANSMITTANCE_MIN)
     tl.store(used + tl.program_id(0), tl.minimum(k, end))
     size = width * height
     alpha_sum = 1.0 - t_in
@@ -154,7 +154,7 @@ def backward(  # type: ignore[no-untyped-def]
     while k < end:
         here = k + lane < end
         g = tl.load(ids + tl.minimum(k + lane, end - 1)).to(tl.int64)  # masked lanes repeat the last: their numbers must be finite
-        ux, uy, vx, vy, wx, wy, zc, dx, dy, inv, u, v, plane, iz, z, m, e, alpha, t, on, after = _meet(
+        ux, uy, vx, vy, wx, wy, zc, dx, dy, inv, u, v, plane, iz, z, m, e, alpha, t, on, after = _intersect(
             geo, opacity, g, here, x, y, t_in, first[:, None]
         )
         w = alpha * t
@@ -176,8 +176,8 @@ def backward(  # type: ignore[no-untyped-def]
         gu, gv = 2.0 * g_rho * flat * u * inv, 2.0 * g_rho * flat * v * inv  # of the numerators of u and v
         g_m = 2.0 * w * gd[:, None] * (m * total[:, None] - b1[:, None])
         g_z = w * gz[:, None]
-        tl.store(row + 8, tl.sum((g_z * z + g_m * _NDC * iz) / zc, 0), mask=here)
-        g_den = -(gu * u + gv * v) - flat * (inv * g_z * z + g_m * _NDC / zc)
+        tl.store(row + 8, tl.sum((g_z * z + g_m * _NDC_SCALE * iz) / zc, 0), mask=here)
+        g_den = -(gu * u + gv * v) - flat * (inv * g_z * z + g_m * _NDC_SCALE / zc)
         tl.store(row, -tl.sum(gu * ux + gv * vx + g_den * wx + g_low * dx, 0), mask=here)
         tl.store(row + 1, -tl.sum(gu * uy + gv * vy + g_den * wy + g_low * dy, 0), mask=here)
         tl.store(row + 2, tl.sum(gu * dx, 0), mask=here)

@@ -12,11 +12,11 @@ import torch
 from torch import Tensor
 
 from gsbake.surfels.raster.kernel import ALPHA_MIN
-from gsbake.surfels.raster.projection import COEF_MAX, EDGE_ON, NEAR_Z, QUATERNION_MIN, SCALE_MAX, SCALE_MIN, Pinhole
+from gsbake.surfels.raster.projection import COEF_MAX, EDGE_ON_COS, NEAR_Z, QUATERNION_MIN, SCALE_MAX, SCALE_MIN, Pinhole
 from gsbake.surfels.raster.reference import rotation_matrix
 
 #: The whole screen, as the box of a disc that reaches the camera's plane.
-_EVERYWHERE = 1e9
+_UNBOUNDED = 1e9
 _LOG_SCALE_MIN = math.log(SCALE_MIN)
 
 
@@ -33,7 +33,7 @@ def project(
     centre = mu @ R.T + t
     h = (normal * centre).sum(1)
     with torch.no_grad():
-        ok = (centre[:, 2] > float(NEAR_Z)) & (opacity > ALPHA_MIN) & (h.abs() > EDGE_ON * centre.norm(dim=1))
+        ok = (centre[:, 2] > float(NEAR_Z)) & (opacity > ALPHA_MIN) & (h.abs() > EDGE_ON_COS * centre.norm(dim=1))
         ok &= torch.isfinite(centre).all(1) & (log_scale.exp() < float(SCALE_MAX)).all(1)
         if cull:
             ok &= h <= 0
@@ -71,8 +71,8 @@ def _boxes(c: Tensor, a: Tensor, b: Tensor, opacity: Tensor, screen: Tensor, pin
     focal, principal = c.new_tensor([pinhole.fx, pinhole.fy]), c.new_tensor([pinhole.cx, pinhole.cy])
     size = c.new_tensor([pinhole.width, pinhole.height])
     low = (0.5 * r2).clamp_min(0).sqrt()
-    lower = torch.minimum(torch.where(bounded, focal * (mid - half) + principal, -_EVERYWHERE), screen - low) - 0.5
-    upper = torch.maximum(torch.where(bounded, focal * (mid + half) + principal, _EVERYWHERE), screen + low) - 0.5
+    lower = torch.minimum(torch.where(bounded, focal * (mid - half) + principal, -_UNBOUNDED), screen - low) - 0.5
+    upper = torch.maximum(torch.where(bounded, focal * (mid + half) + principal, _UNBOUNDED), screen + low) - 0.5
     # pixels whose centre j + .5 lies between; positive form, so that NaN is skipped
     seen = ((upper >= 0) & (lower <= size - 1)).all(1)
     inside = seen[:, None]

@@ -85,10 +85,10 @@ def compare(inputs: list[torch.Tensor], view: Pinhole, **options: bool) -> None:
         assert float((error > 5e-5 * size + 1e-7).float().mean()) < 0.01, name
     for name, a, b in zip(NAMES, numba_grads, triton_grads, strict=True):
         assert torch.isfinite(b).all() and float((a - b).norm()) <= 2e-3 * float(a.norm()) + 1e-5, name
-    touched = numba.stats["touched"]
-    assert torch.allclose(triton.stats["touched"], touched, rtol=1e-3, atol=1e-3 * float(touched.max()))
-    assert numba.screen.grad is not None and triton.screen.grad is not None
-    assert float((numba.screen.grad - triton.screen.grad).norm()) <= 2e-3 * float(numba.screen.grad.norm())
+    touched = numba.stats["weight"]
+    assert torch.allclose(triton.stats["weight"], touched, rtol=1e-3, atol=1e-3 * float(touched.max()))
+    assert numba.projected.grad is not None and triton.projected.grad is not None
+    assert float((numba.projected.grad - triton.projected.grad).norm()) <= 2e-3 * float(numba.projected.grad.norm())
 
 
 @pytest.mark.parametrize("seed", [0, 1])

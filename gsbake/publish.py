@@ -1,4 +1,4 @@
-"""The results of a run, put where they are looked for: asset.glb, cameras.json, light.hdr and report.html in OUT."""
+"""Publishing the results of a run in its output folder: asset.glb, cameras.json, light.hdr and report.html."""
 
 from __future__ import annotations
 

@@ -1,0 +1,200 @@
+"""gsbake from Python: `gsbake.run("photos", profile="relight")` brings an output folder up to date, as the command of that name does.
+
+The folder remembers photos, profile and settings, so that later calls may name it alone. Single steps are functions of plain paths too:
+`gsbake.capture.ingest.ingest`, `gsbake.mvs.stereo.run_stereo`, `gsbake.meshing.extract.extract_mesh` and so on, one per stage.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from gsbake.capture.sources import PHOTO_FOLDERS, discover, list_photos
+from gsbake.config.load import DEFAULT, LoadedProfile, load_profile
+from gsbake.errors import BadInputError, UsageError
+from gsbake.pipeline.digest import list_files
+from gsbake.pipeline.engine import Engine, Observer, artifacts_by_stage
+from gsbake.pipeline.files import disk_error, ensure_output_folder
+from gsbake.pipeline.machine import default_threads, resolve_device
+from gsbake.pipeline.plan import Request, StageState
+from gsbake.pipeline.project import Project
+from gsbake.publish import publish_results
+from gsbake.stages import REGISTRY
+
+
+@dataclass(frozen=True)
+class RunOptions:
+    """What a run is made from; None and 0 stand for what the output folder remembers, else the default.
+
+    `overrides` are settings as "section.key=value", on top of those remembered; `threads` 0 takes the physical cores.
+    """
+
+    photos: Path | None = None
+    out: Path | None = None
+    profile: str | None = None
+    overrides: Sequence[str] = ()
+    masks: Path | None = None
+    poses: Path | None = None
+    device: str = "auto"
+    threads: int = 0
+    seed: int | None = None
+
+
+@dataclass(frozen=True)
+class Session:
+    """An engine, and the project and profile it was made from."""
+
+    engine: Engine
+    project: Project
+    profile: LoadedProfile
+    out: Path
+
+    def run(self, target: str | None = None) -> Result:
+        """Bring every stage up to `target` (all without one) up to date and publish the results in the output folder.
+
+        Raises what `Engine.run` raises.
+        """
+        try:
+            ensure_output_folder(self.out)
+            self.project.save(self.out)
+            states = self.engine.run(target)
+            digests = self.engine.store.digests
+            files, project = publish_results(self.out, artifacts_by_stage(states), self.project, digests)
+            project.save(self.out)
+            digests.save()
+        except OSError as error:
+            raise disk_error(error, self.out) or BadInputError(
+                f"The output folder '{self.out}' cannot be written ({error.strerror}); choose another with --out."
+            ) from error
+        return Result(self.out, files, tuple(states))
+
+
+@dataclass(frozen=True)
+class Result:
+    """A finished run: the output folder, the published `files` by name ("asset.glb", …), and the state of every stage."""
+
+    out: Path
+    files: Mapping[str, Path]
+    stages: tuple[StageState, ...]
+
+    def results(self, stage: str) -> Mapping[str, Any]:
+        """The figures that a stage reported. Raises KeyError for a stage that was not part of the run."""
+        for state in self.stages:
+            if state.name == stage and state.artifact is not None:
+                found: Mapping[str, Any] = state.artifact.manifest.get("results", {})
+                return found
+        raise KeyError(stage)
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """All warnings, those of cached stages included."""
+        manifests = [state.artifact.manifest for state in self.stages if state.artifact is not None]
+        return tuple(text for manifest in manifests for text in manifest.get("warnings", ()))
+
+
+def run(
+    photos: str | Path | None = None,
+    *,
+    out: str | Path | None = None,
+    profile: str | None = None,
+    settings: Mapping[str, Any] | None = None,
+    masks: str | Path | None = None,
+    poses: str | Path | None = None,
+    target: str | None = None,
+    device: str = "auto",
+    threads: int = 0,
+    seed: int | None = None,
+    observer: Observer | None = None,
+) -> Result:
+    """Bake the asset of a folder of photos, or bring an earlier run in `out` up to date; returns where the results are.
+
+    Parameters
+    ----------
+    photos: folder of photos, or a capture folder with images/, masks/ and poses; needed the first time only.
+    out: output folder; out/<name of photos> without one.
+    profile: name of a profile, or path of a TOML file; "relight" the first time.
+    settings: {"section.key": value} on top of the profile, for example {"mesh.faces": 10000}.
+    masks, poses: where masks and known poses are, when not in the capture folder.
+    target: stage to stop after, for example "mesh"; None runs all.
+    device: "auto", "cpu" or "cuda".
+    threads: 0 takes the physical cores.
+    seed: seed of everything random; 0 the first time.
+    observer: receives progress, decisions and warnings.
+
+    Raises
+    ------
+    UsageError, BadInputError, InterruptedRun (`gsbake.errors`), each with one sentence that says what to do.
+    """
+    overrides = [f"{key}={value if isinstance(value, str) else json.dumps(value)}" for key, value in (settings or {}).items()]
+    options = RunOptions(_path(photos), _path(out), profile, overrides, _path(masks), _path(poses), device, threads, seed)
+    return open_session(options, observer).run(target)
+
+
+def open_session(options: RunOptions, observer: Observer | None = None) -> Session:
+    """Merge the options with the output folder's memory; nothing is written.
+
+    `photos` starts the memory anew; without it the remembered photos, profile and overrides hold, and given ones are added. Raises
+    UsageError when no photos are given or remembered.
+    """
+    out = options.out or _default_out(options.photos)
+    stored = Project.load(out)
+    if options.photos is not None:
+        project = Project(published=stored.published if stored else {})
+        found = discover(options.photos, options.masks, options.poses)
+        project = replace(project, photos=_text(found.photos), masks=_text(found.masks), poses=_text(found.poses))
+    elif stored is None or stored.photos is None:
+        raise UsageError(f"'{out}' holds no run yet: give the folder of photos the first time.")
+    else:
+        project = stored
+        if options.masks is not None or options.poses is not None:
+            found = discover(Path(stored.photos), options.masks or _path(stored.masks), options.poses or _path(stored.poses))
+            project = replace(project, masks=_text(found.masks), poses=_text(found.poses))
+    last = {text.partition("=")[0].strip(): text for text in [*project.overrides, *options.overrides]}
+    name = options.profile or project.profile or DEFAULT
+    profile = load_profile(name, list(last.values()))
+    if Path(name).is_file():
+        name = str(Path(name).resolve())
+    project = replace(project, profile=name, overrides=tuple(last.values()), seed=project.seed if options.seed is None else options.seed)
+    sources = project.sources()
+    request = Request(
+        out=out,
+        sources=sources,
+        profile=profile.profile,
+        seed=project.seed,
+        device=resolve_device(options.device),
+        threads=options.threads or default_threads(),
+        source_names=_source_names(sources),
+    )
+    return Session(Engine(REGISTRY, request, observer), project, profile, out)
+
+
+def _source_names(sources: dict[str, Path]) -> dict[str, list[str]]:
+    """The files that count in the folders of photos and masks."""
+    names = {"photos": [path.relative_to(sources["photos"]).as_posix() for path in list_photos(sources["photos"])]}
+    if "masks" in sources and sources["masks"].is_dir():
+        names["masks"] = list_files(sources["masks"])
+    return names
+
+
+def _default_out(photos: Path | None) -> Path:
+    """out/<name>, or the only run in out/."""
+    if photos is not None:
+        folder = photos.resolve()
+        return Path("out") / (folder.parent.name if folder.name in PHOTO_FOLDERS else folder.name)
+    runs = sorted(path.parent for path in Path("out").glob("*/project.json"))
+    if len(runs) == 1:
+        return runs[0]
+    if not runs:
+        raise UsageError("There is no run in ./out yet: give the folder of photos, or name the run with --out.")
+    raise UsageError(f"There are {len(runs)} runs in ./out ({', '.join(p.name for p in runs[:5])}…): name one with --out.")
+
+
+def _text(path: Path | None) -> str | None:
+    return None if path is None else str(path.resolve())
+
+
+def _path(text: str | Path | None) -> Path | None:
+    return None if text is None else Path(text)
