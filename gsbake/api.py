@@ -21,6 +21,7 @@ from gsbake.pipeline.files import disk_error, ensure_output_folder
 from gsbake.pipeline.machine import default_threads, resolve_device
 from gsbake.pipeline.plan import Request, StageState
 from gsbake.pipeline.project import Project
+from gsbake.pipeline.store import Store
 from gsbake.publish import publish_results
 from gsbake.stages import REGISTRY
 
@@ -59,8 +60,7 @@ class Session:
         """
         try:
             ensure_output_folder(self.out)
-            self.project.save(self.out)
-            states = self.engine.run(target)
+            states = self.engine.run(target, on_accepted=lambda: self.project.save(self.out))
             digests = self.engine.store.digests
             files, project = publish_results(self.out, artifacts_by_stage(states), self.project, digests)
             project.save(self.out)
@@ -169,6 +169,14 @@ def open_session(options: RunOptions, observer: Observer | None = None) -> Sessi
         source_names=_source_names(sources),
     )
     return Session(Engine(REGISTRY, request, observer), project, profile, out)
+
+
+def open_store(out: Path | None) -> tuple[Store, tuple[str, ...]]:
+    """The artifacts of an earlier run in `out` (without it, the only one in ./out), and the names of the stages. Raises UsageError."""
+    out = out or _default_out(None)
+    if not (out / "stages").is_dir():
+        raise UsageError(f"'{out}' holds no run; name its folder with --out.")
+    return Store(out), tuple(REGISTRY.names)
 
 
 def _source_names(sources: dict[str, Path]) -> dict[str, list[str]]:

@@ -22,6 +22,6 @@ class BadInputError(GsbakeError):
 
 
 class InterruptedRun(GsbakeError):
-    """Stopped on request or by a passing fault; the same command goes on from here (exit code 75)."""
+    """Stopped on request or by a fault that may pass (kill, memory, full or failing disk): the same command resumes (exit code 75)."""
 
     exit_code = 75

@@ -33,7 +33,10 @@ from gsbake.cli.options import (
 app = typer.Typer(
     name="gsbake",
     help="Photos in, relightable game-ready asset out.",
-    epilog="Exit codes: 0 done, 2 wrong usage, 42 bad input (do not retry), 75 interrupted (the same command continues), 1 internal error.",
+    epilog=(
+        "Exit codes: 0 done, 2 wrong usage, 42 bad input (do not retry), 75 interrupted, out of memory or disk full (the same command "
+        "resumes), 1 internal error."
+    ),
     no_args_is_help=True,
     rich_markup_mode=None,  # plain help is there in a third of the time
     pretty_exceptions_enable=False,
@@ -156,6 +159,40 @@ def replace_command(
     from gsbake.cli.replace import replace
 
     replace(Options(out=out, dry_run=dry_run, quiet=quiet, as_json=as_json), stage, files or [], undo)
+
+
+cache_app = typer.Typer(
+    help="Check or clean the stored outputs of an output folder.", no_args_is_help=True, rich_markup_mode=None,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)  # fmt: skip
+app.add_typer(cache_app, name="cache")
+
+
+@cache_app.command("verify")
+def cache_verify_command(out: OutOption = None, quiet: QuietOption = False, as_json: JsonOption = False) -> None:
+    """Read every stored file again and compare it with its digest."""
+    from gsbake.cli.cache import verify
+
+    verify(Options(out=out, quiet=quiet, as_json=as_json))
+
+
+@cache_app.command("gc")
+def cache_gc_command(
+    out: OutOption = None,
+    keep: Annotated[
+        str | None, typer.Option("--keep", metavar="SIZE", help="Keep at most this much, such as 20GB.", show_default=False)
+    ] = None,
+    older: Annotated[
+        str | None, typer.Option("--older", metavar="AGE", help="Delete what was unused for longer, such as 30d.", show_default=False)
+    ] = None,
+    dry_run: DryRunOption = False,
+    quiet: QuietOption = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Delete outputs of old settings, checkpoints, and what killed runs left behind; your replacements stay."""
+    from gsbake.cli.cache import collect_garbage
+
+    collect_garbage(Options(out=out, dry_run=dry_run, quiet=quiet, as_json=as_json), keep, older)
 
 
 @app.command("profiles")

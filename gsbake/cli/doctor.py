@@ -20,6 +20,7 @@ from rich.table import Table
 from rich.text import Text
 
 from gsbake.pipeline.machine import cpu_name, cuda_devices, default_threads, resolve_device, torch_cuda_build, versions
+from gsbake.python_process import python_command, python_environment
 from gsbake.text import size
 
 #: Library (as pip calls it) → module that is imported to see whether it works.
@@ -131,7 +132,10 @@ def advice_for(library: str, error: str, *, installed: bool) -> str:
 def _try_import(module: str) -> tuple[float | None, str]:
     """Seconds the import takes, or None and the last line of its error."""
     try:
-        done = subprocess.run([sys.executable, "-c", _TIMED_IMPORT, module], capture_output=True, text=True, timeout=120, check=False)
+        done = subprocess.run(
+            python_command("-c", _TIMED_IMPORT, module), env=python_environment(), stdin=subprocess.DEVNULL, capture_output=True, text=True,
+            timeout=120, check=False,
+        )  # fmt: skip
     except subprocess.TimeoutExpired:
         return None, "importing it takes more than two minutes"
     found = re.search(r"seconds=([\d.]+)", done.stdout)

@@ -38,7 +38,10 @@ def tree_digest(files: Mapping[str, str]) -> str:
 
 
 def list_files(folder: Path, *, recursive: bool = True) -> list[str]:
-    """Sorted relative POSIX names of the files in a folder without hidden ones; `recursive` includes subfolders."""
+    """Sorted relative POSIX names of the files in a folder without hidden ones; `recursive` includes subfolders.
+
+    Links to files count as files; links to folders are not followed, as they may lead anywhere.
+    """
     found: list[str] = []
     with os.scandir(folder) as entries:
         for entry in entries:
@@ -46,9 +49,23 @@ def list_files(folder: Path, *, recursive: bool = True) -> list[str]:
                 continue
             if entry.is_file():
                 found.append(entry.name)
-            elif recursive and entry.is_dir():
+            elif recursive and entry.is_dir(follow_symlinks=False):
                 found += [f"{entry.name}/{name}" for name in list_files(Path(entry.path))]
     return sorted(found)
+
+
+def file_stamps(paths: Iterable[Path]) -> dict[Path, tuple[int, ...] | None]:
+    """{path: device, inode, size, mtime and ctime}; None for a missing file. A file that is written to changes its stamp."""
+    stamps: dict[Path, tuple[int, ...] | None] = {}
+    for path in paths:
+        stamps[path] = None
+        with suppress(OSError):
+            stamps[path] = _stamp(path.stat())
+    return stamps
+
+
+def _stamp(status: os.stat_result) -> tuple[int, ...]:
+    return status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns, status.st_ctime_ns
 
 
 class DigestCache:
@@ -68,18 +85,21 @@ class DigestCache:
         """Content digest of one file; cached while its size, times and inode are unchanged."""
         path = Path(os.path.abspath(path))
         before = path.stat()
-        stamp = [before.st_dev, before.st_ino, before.st_size, before.st_mtime_ns, before.st_ctime_ns]
+        stamp = list(_stamp(before))
         entry = self._entries.get(str(path))
         if isinstance(entry, list) and entry[:-1] == stamp:
             return str(entry[-1])
         now = time.time()
         digest = file_digest(path)
-        after = path.stat()
-        unchanged = [after.st_dev, after.st_ino, after.st_size, after.st_mtime_ns, after.st_ctime_ns] == stamp
+        unchanged = list(_stamp(path.stat())) == stamp
         if unchanged and max(before.st_mtime, before.st_ctime) < now - MIN_FILE_AGE:
             self._entries[str(path)] = [*stamp, digest]
             self._changed = True
         return digest
+
+    def forget(self) -> None:
+        """Drop all entries: every file is read again."""
+        self._entries, self._changed = {}, True
 
     def files(self, root: Path, names: Iterable[str]) -> dict[str, str]:
         """{name: digest} of the files `names` under `root`."""

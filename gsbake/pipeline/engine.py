@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 from gsbake.errors import GsbakeError, InterruptedRun
+from gsbake.pipeline.digest import file_stamps
 from gsbake.pipeline.events import EventLog, now
 from gsbake.pipeline.files import disk_error, ensure_output_folder, remove_tree
 from gsbake.pipeline.key import KEY_FORMAT, KEY_PREFIX_LENGTH, CacheKey
@@ -21,7 +22,7 @@ from gsbake.pipeline.stage import Stage
 from gsbake.pipeline.store import Artifact, Store
 from gsbake.pipeline.supervise import Outcome, StageFailed, StopSignals, supervise
 from gsbake.pipeline.worker import Job
-from gsbake.text import summarise
+from gsbake.text import shortlist, summarise
 
 
 class Observer:
@@ -72,16 +73,17 @@ class Engine:
         self.store.digests.save()
         return states
 
-    def run(self, target: str | None = None) -> list[StageState]:
+    def run(self, target: str | None = None, on_accepted: Callable[[], None] | None = None) -> list[StageState]:
         """Bring all stages up to `target` (all without one) up to date; returns their states with artifacts.
 
+        `on_accepted` is called once the inputs were read and the first stage's state is known, before anything is computed.
         Raises BadInputError, UsageError, InterruptedRun, or StageFailed, which names the file with the traceback.
         """
         stages = self.registry.up_to(target)
         try:
             ensure_output_folder(self.request.out)
             with StopSignals() as stop:
-                return self._run(stages, stop)
+                return self._run(stages, stop, on_accepted or (lambda: None))
         except GsbakeError as error:
             self.events.write("run ended", error=type(error).__name__, message=str(error), exit_code=error.exit_code)
             raise
@@ -93,7 +95,7 @@ class Engine:
         finally:
             self.store.digests.save()
 
-    def _run(self, stages: list[Stage], stop: StopSignals) -> list[StageState]:
+    def _run(self, stages: list[Stage], stop: StopSignals, on_accepted: Callable[[], None]) -> list[StageState]:
         start = time.perf_counter()
         self.events.write("run started", stages=[s.name for s in stages], seed=self.request.seed, device=self.request.device)
         self.observer.run_started(stages)
@@ -101,10 +103,14 @@ class Engine:
         artifacts: dict[str, Artifact] = {}
         for stage in stages:
             stop.check()
+            self._set_aside_unexpected(stage.name)
             state = self.planner.assess(stage, artifacts)
+            if not states:
+                on_accepted()
             if state.artifact is None:
                 state = self._compute(stage, state, artifacts, stop)
             else:
+                self.store.mark_used(state.artifact)
                 self.events.write("stage cached", stage=stage.name, folder=state.artifact.folder, by_hand=state.artifact.by_hand)
                 self.observer.stage_reused(state)
             assert state.artifact is not None
@@ -112,6 +118,14 @@ class Engine:
             states.append(state)
         self.events.write("run ended", exit_code=0, seconds=round(time.perf_counter() - start, 3))
         return states
+
+    def _set_aside_unexpected(self, name: str) -> None:
+        moved = self.store.set_aside_unexpected(name)
+        if moved:
+            names, folder = shortlist([path.name for path in moved]), self.request.out / "unexpected"
+            text = f"{names}: not part of the stage's output; moved to '{folder}'."
+            self.events.write("warning", stage=name, text=text)
+            self.observer.warning(name, text)
 
     def _compute(self, stage: Stage, state: StageState, artifacts: Mapping[str, Artifact], stop: StopSignals) -> StageState:
         """Run a stage under its lease, unless another process has published its artifact meanwhile."""
@@ -134,7 +148,7 @@ class Engine:
                 return current
             self.events.write("stage started", stage=stage.name, key=cache_key.digest, reasons=list(state.reasons))
             self.observer.stage_started(state)
-            artifact = self._execute(stage, state, cache_key, artifacts, stop)
+            artifact = self._execute(stage, state, cache_key, artifacts, stop, lease)
         done = StageState(stage.name, stage.title, "run", state.reasons, cache_key, artifact, state.settings)
         self.events.write(
             "stage finished", stage=stage.name, seconds=artifact.manifest["seconds"], peak_bytes=artifact.manifest["peak_bytes"],
@@ -144,7 +158,7 @@ class Engine:
         return done
 
     def _execute(
-        self, stage: Stage, state: StageState, cache_key: CacheKey, artifacts: Mapping[str, Artifact], stop: StopSignals
+        self, stage: Stage, state: StageState, cache_key: CacheKey, artifacts: Mapping[str, Artifact], stop: StopSignals, lease: Lease
     ) -> Artifact:
         """Run a stage in a worker process and publish its output."""
         request, store = self.request, self.store
@@ -160,11 +174,15 @@ class Engine:
         try:
             log = request.out / "logs" / f"{stage.name}-{cache_key.digest[:KEY_PREFIX_LENGTH]}.log"
             log.parent.mkdir(exist_ok=True)
+            stamps = file_stamps(self.planner.input_paths(stage, artifacts))
             outcome = supervise(job, log, stop, lambda message: self._relay(stage.name, message))
+            self._check_inputs(stage, artifacts, files, stamps)
             manifest = self._manifest(stage, state, cache_key, outcome, started, resumed)
             manifest["inputs"] = {
                 name: {"path": str(inputs[name]), "digest": cache_key.inputs[name], "files": dict(files[name])} for name in sorted(files)
             }
+            if not lease.held():
+                raise InterruptedRun("Another process took over the lease; the same command goes on with its result.")
             artifact = store.publish(temporary, store.folder(stage.name, cache_key.digest), manifest)
         except StageFailed as error:
             raise StageFailed(f"{stage.title} failed: {error}; the traceback is in '{self._save_traceback(stage.name, error)}'.") from error
@@ -177,6 +195,22 @@ class Engine:
                 checkpoint.rmdir()  # succeeds only when empty
         remove_tree(checkpoint)
         return artifact
+
+    def _check_inputs(
+        self, stage: Stage, artifacts: Mapping[str, Artifact], files: Mapping[str, Mapping[str, str]], stamps: Mapping[Path, Any]
+    ) -> None:
+        """Raise InterruptedRun when an input is no longer what the cache key says, or was written to while the stage ran.
+
+        The key's digests were taken before `stamps`, so files whose digest the planner took earlier are read again where their stamps
+        are not those of the digest.
+        """
+        self.planner.forget_sources()
+        now_files = self.planner.input_files(stage, artifacts)
+        changed = sorted(path.name for path, stamp in file_stamps(stamps).items() if stamp != stamps[path])
+        for name, entry in files.items():
+            changed += sorted(file for file, digest in entry.items() if now_files[name].get(file) != digest)
+        if changed:
+            raise InterruptedRun(f"{shortlist(sorted(set(changed)))} changed while the stage ran; run the same command again.")
 
     def _job(self, stage: Stage, out: Path, inputs: Mapping[str, Path], checkpoint: Path) -> Job:
         """The worker's job: run `stage` on `inputs` and write into the folder `out`."""

@@ -10,20 +10,24 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from gsbake.errors import BadInputError, UsageError
+from gsbake.errors import BadInputError, InterruptedRun, UsageError
 
 #: errno values of a full disk or quota.
 DISK_FULL = frozenset({errno.ENOSPC, errno.EDQUOT})
+#: errno values of a file system that does not flush folders; any other failure means that data may be lost.
+CANNOT_SYNC = frozenset({errno.EINVAL, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS, errno.EBADF})
 #: errno values of a location without write access.
 NOT_WRITABLE = frozenset({errno.EROFS, errno.EACCES, errno.EPERM})
 
 
 def sync(path: Path) -> None:
-    """Flush a file or folder to disk; ignored on file systems that cannot flush folders."""
+    """Flush a file or folder to disk. Raises OSError when that fails; file systems that cannot flush folders are accepted."""
     handle = os.open(path, os.O_RDONLY)
     try:
-        with suppress(OSError):
-            os.fsync(handle)
+        os.fsync(handle)
+    except OSError as error:
+        if error.errno not in CANNOT_SYNC or not path.is_dir():
+            raise
     finally:
         os.close(handle)
 
@@ -84,8 +88,9 @@ def ensure_output_folder(out: Path) -> None:
         ) from error
 
 
-def disk_error(error: BaseException, folder: Path) -> BadInputError | None:
-    """The user error for a full disk or an unwritable output `folder`; None for any other `error`.
+def disk_error(error: BaseException, folder: Path) -> BadInputError | InterruptedRun | None:
+    """The user error for a full or failing disk (InterruptedRun: the same command resumes) or an unwritable output `folder`
+    (BadInputError); None for any other `error`.
 
     Native libraries report a full disk in their own words, so free space is checked too.
     """
@@ -93,6 +98,8 @@ def disk_error(error: BaseException, folder: Path) -> BadInputError | None:
     existing = folder if folder.exists() else folder.parent
     if number in DISK_FULL:
         return _disk_full(folder)
+    if number == errno.EIO:
+        return InterruptedRun(f"The disk of '{folder}' failed (input/output error); check the disk, then the same command resumes the run.")
     if number in NOT_WRITABLE and isinstance(error, OSError):
         failed = Path(os.fsdecode(error.filename)) if isinstance(error.filename, str | bytes) else folder
         if _related(failed, folder) or number == errno.EROFS:
@@ -104,8 +111,8 @@ def disk_error(error: BaseException, folder: Path) -> BadInputError | None:
     return None
 
 
-def _disk_full(folder: Path) -> BadInputError:
-    return BadInputError(f"The disk of '{folder}' is full; free some space and run the same command, which resumes the run.")
+def _disk_full(folder: Path) -> InterruptedRun:
+    return InterruptedRun(f"The disk of '{folder}' is full; free some space and run the same command, which resumes the run.")
 
 
 def _related(path: Path, folder: Path) -> bool:

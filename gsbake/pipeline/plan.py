@@ -108,6 +108,19 @@ class Planner:
                 files[name] = self._source(name)
         return files
 
+    def input_paths(self, stage: Stage, artifacts: Mapping[str, Artifact]) -> list[Path]:
+        """The files that the stage reads."""
+        paths = [artifacts[need].folder / name for need in stage.needs for name in artifacts[need].files]
+        for name in stage.sources:
+            if name in self.request.sources:
+                source = self.request.sources[name]
+                paths += [source / file if source.is_dir() else source for file in self._source(name)]
+        return paths
+
+    def forget_sources(self) -> None:
+        """Look at the user's files again at the next question."""
+        self._sources = {}
+
     def _source(self, name: str) -> dict[str, str]:
         if name not in self._sources:
             path = self.request.sources[name]

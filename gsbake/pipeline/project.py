@@ -6,6 +6,8 @@ import json
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
+from pydantic import ConfigDict, TypeAdapter, ValidationError
+
 from gsbake.errors import BadInputError
 from gsbake.pipeline.files import write_atomic
 
@@ -15,6 +17,8 @@ PROJECT = "project.json"
 @dataclass(frozen=True)
 class Project:
     """The user's paths (absolute) and options. `published` holds {file in OUT: content digest} of the published results."""
+
+    __pydantic_config__ = ConfigDict(extra="forbid")
 
     photos: str | None = None
     masks: str | None = None
@@ -29,18 +33,21 @@ class Project:
         """The project of an output folder; None when there is none. Raises BadInputError when it cannot be read."""
         path = out / PROJECT
         try:
-            body = json.loads(path.read_text(encoding="utf-8"))
-            return Project(**{**body, "overrides": tuple(body.get("overrides", ()))})
+            return TypeAdapter(Project).validate_python(json.loads(path.read_bytes()))
         except (FileNotFoundError, NotADirectoryError):
             return None
-        except (OSError, ValueError, TypeError, AttributeError) as error:
+        except ValidationError as error:
+            first = error.errors(include_url=False, include_context=False, include_input=False)[0]
+            where = ".".join(map(str, first["loc"])) or "the file"
+            raise BadInputError(f"'{path}' is damaged ({where}: {first['msg']}); delete it and give the photos again.") from error
+        except (OSError, ValueError, RecursionError) as error:
             raise BadInputError(f"'{path}' cannot be read ({error}); delete it and give the photos again.") from error
 
     def save(self, out: Path) -> None:
         """Write the file if its content changes."""
-        text = json.dumps(asdict(self), indent=1, ensure_ascii=False)
+        text = json.dumps(asdict(self), indent=1)
         path = out / PROJECT
-        if not path.exists() or path.read_text(encoding="utf-8") != text:
+        if not path.exists() or path.read_bytes() != text.encode():
             write_atomic(path, text)
 
     def sources(self) -> dict[str, Path]:

@@ -12,9 +12,7 @@ from gsbake.pipeline.digest import list_files, tree_digest
 from gsbake.pipeline.events import now
 from gsbake.pipeline.files import remove_tree, write_atomic
 from gsbake.pipeline.lease import Lease
-from gsbake.pipeline.store import MANIFEST, REPLACEMENT, Artifact, Store
-
-_PREFIX = "by-hand"
+from gsbake.pipeline.store import MANIFEST, REPLACEMENT, REPLACEMENT_PREFIX, Artifact, Store
 
 
 def replace_output(store: Store, stage: str, files: Mapping[str, Path], base: Artifact | None) -> Artifact:
@@ -24,8 +22,8 @@ def replace_output(store: Store, stage: str, files: Mapping[str, Path], base: Ar
     afterwards.
     """
     with _lease(store, stage):
-        store.remove_leftovers(stage, _PREFIX)
-        temporary = store.temporary(stage, _PREFIX)
+        store.remove_leftovers(stage, REPLACEMENT_PREFIX)
+        temporary = store.temporary(stage, REPLACEMENT_PREFIX)
         try:
             kept = {name: base.folder / name for name in base.files if name not in files} if base is not None else {}
             for name, path in {**kept, **files}.items():
@@ -33,7 +31,7 @@ def replace_output(store: Store, stage: str, files: Mapping[str, Path], base: Ar
                 target.parent.mkdir(parents=True, exist_ok=True)
                 shutil.copyfile(path, target)
             digest = tree_digest(store.digests.files(temporary, list_files(temporary)))
-            final = store.stage_folder(stage) / f"{_PREFIX}-{digest[:8]}"
+            final = store.stage_folder(stage) / f"{REPLACEMENT_PREFIX}-{digest[:8]}"
             manifest = {
                 "stage": stage,
                 "replaced": {name: str(path) for name, path in files.items()},
@@ -59,11 +57,11 @@ def replace_output(store: Store, stage: str, files: Mapping[str, Path], base: Ar
 def undo_replacement(store: Store, stage: str) -> None:
     """Restore the stage's own output. Raises UsageError when it was not replaced."""
     record = store.stage_folder(stage) / REPLACEMENT
-    if not record.exists():
+    if store.replacement(stage) is None:
         raise UsageError(f"The output of stage '{stage}' in '{store.out}' was not replaced; there is nothing to undo.")
     with _lease(store, stage):
+        _remove_other_replacements(store, stage, "")  # before the record: interrupted between the two, the loss is reported
         record.unlink(missing_ok=True)
-        _remove_other_replacements(store, stage, "")
 
 
 def folder_files(folder: Path) -> dict[str, Path]:
@@ -72,12 +70,12 @@ def folder_files(folder: Path) -> dict[str, Path]:
 
 
 def _lease(store: Store, stage: str) -> Lease:
-    lease = Lease(store.stage_folder(stage) / f"{_PREFIX}.lease")
+    lease = Lease(store.stage_folder(stage) / f"{REPLACEMENT_PREFIX}.lease")
     lease.acquire()
     return lease
 
 
 def _remove_other_replacements(store: Store, stage: str, keep: str) -> None:
-    for entry in store.stage_folder(stage).glob(f"{_PREFIX}-*"):
+    for entry in store.stage_folder(stage).glob(f"{REPLACEMENT_PREFIX}-*"):
         if entry.is_dir() and entry.name != keep:
             remove_tree(entry)

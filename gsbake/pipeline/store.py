@@ -1,14 +1,16 @@
 """Artifact store: OUT/stages/<stage>/<key>/, each with a manifest that is written last.
 
 A stage fills a temporary folder beside the final one (same file system), which is flushed to disk and renamed atomically. So a folder with
-a final name is complete even after a crash. The manifest lists the digests of its files; they are checked at every look-up, and a
-modified or damaged file invalidates the artifact.
+a final name is complete even after a crash. The manifest lists the digests of its files; they are checked at every look-up. An artifact is
+exactly the files of its manifest: a modified, damaged, missing or added file invalidates it. The digest cache answers for files whose
+size, times and inode are unchanged; `verify` reads every byte.
 """
 
 from __future__ import annotations
 
 import json
 import os
+import re
 import uuid
 from collections.abc import Mapping
 from contextlib import suppress
@@ -18,12 +20,18 @@ from typing import Any
 
 from blake3 import blake3
 
-from gsbake.pipeline.digest import DigestCache, list_files, tree_digest
+from gsbake.pipeline.digest import DigestCache, tree_digest
 from gsbake.pipeline.files import remove_tree, sync, sync_tree, write_atomic
 from gsbake.pipeline.key import KEY_PREFIX_LENGTH, CacheKey
 
 MANIFEST = "manifest.json"
 REPLACEMENT = "replaced.json"
+#: Start of the folder name of the user's replacement of a stage's output.
+REPLACEMENT_PREFIX = "by-hand"
+_ARTIFACT_FOLDER = re.compile(rf"[0-9a-f]{{{KEY_PREFIX_LENGTH}}}")
+_REPLACEMENT_FOLDER = re.compile(rf"{REPLACEMENT_PREFIX}-[0-9a-f]{{8}}")
+#: Files that file managers leave in folders they show; no stage reads them.
+_FILE_MANAGER_FILES = frozenset({".DS_Store", "Thumbs.db", "desktop.ini", ".directory"})
 
 
 @dataclass(frozen=True)
@@ -91,14 +99,26 @@ class Store:
         """The user's replacement of this stage's output; None when there is none."""
         record = self.stage_folder(stage) / REPLACEMENT
         try:
-            folder = self.stage_folder(stage) / str(json.loads(record.read_text())["folder"])
-        except (OSError, ValueError, KeyError):
-            return None
+            body = json.loads(record.read_text(encoding="utf-8"))
+            name = str(body["folder"])
+        except (FileNotFoundError, NotADirectoryError):
+            left = any(_REPLACEMENT_FOLDER.fullmatch(path.name) for path in self.stage_folder(stage).glob(f"{REPLACEMENT_PREFIX}-*"))
+            return Lookup(None, (f"{REPLACEMENT} is missing",)) if left else None
+        except (OSError, ValueError, KeyError, TypeError):
+            return Lookup(None, (f"{REPLACEMENT} cannot be read",))
+        if not _REPLACEMENT_FOLDER.fullmatch(name):
+            return Lookup(None, (f"{REPLACEMENT} names the folder {name!r}",))
+        folder = self.stage_folder(stage) / name
         manifest = read_manifest(folder)
-        if manifest is None:
-            return Lookup(None, ("its files are missing",))
+        if manifest is None or manifest.get("stage") != stage or not manifest.get("replaced"):
+            return Lookup(None, ("its files are missing or its manifest is damaged",))
         faults = self._file_faults(folder, manifest)
         return Lookup(None, tuple(faults)) if faults else Lookup(self._artifact(folder, manifest))
+
+    def mark_used(self, artifact: Artifact) -> None:
+        """Set the folder's modification time to now, for the garbage collection."""
+        with suppress(OSError):
+            os.utime(artifact.folder)
 
     def manifests(self, stage: str) -> list[tuple[Path, dict[str, Any]]]:
         """(folder, manifest) of all artifacts that the stage computed, newest first."""
@@ -118,7 +138,7 @@ class Store:
     def publish(self, temporary: Path, final: Path, manifest: Mapping[str, Any]) -> Artifact:
         """Publish the folder `temporary` as the artifact `final`; digests and sizes of its files are added to the manifest."""
         sync_tree(temporary)
-        names = [name for name in list_files(temporary) if name != MANIFEST]
+        names = _unexpected(temporary, {})
         files = self.digests.files(temporary, names)
         sizes = {name: (temporary / name).stat().st_size for name in names}
         body = {**manifest, "digest": tree_digest(files), "files": {n: {"digest": files[n], "bytes": sizes[n]} for n in names}}
@@ -144,8 +164,43 @@ class Store:
                 elif entry.name.startswith(f".{key[:KEY_PREFIX_LENGTH]}.") and entry.suffix == ".tmp":  # an incomplete lease file
                     entry.unlink(missing_ok=True)
 
+    def verify(self, stage: str) -> list[tuple[Path, list[str]]]:
+        """(folder, faults) of every artifact and replacement of a stage, from the bytes on the disk."""
+        fresh = Store(self.out)
+        fresh.digests = DigestCache()
+        found = []
+        for folder in sorted(self.artifact_folders(stage)):
+            manifest = read_manifest(folder)
+            faults = ["its manifest is missing or damaged"] if manifest is None else fresh._file_faults(folder, manifest)
+            found.append((folder, faults))
+        return found
+
+    def artifact_folders(self, stage: str) -> list[Path]:
+        """Folders of published artifacts and replacements of a stage, damaged ones included."""
+        with suppress(FileNotFoundError, NotADirectoryError):
+            entries = list(self.stage_folder(stage).iterdir())
+            return [e for e in entries if e.is_dir() and (_ARTIFACT_FOLDER.fullmatch(e.name) or _REPLACEMENT_FOLDER.fullmatch(e.name))]
+        return []
+
+    def set_aside_unexpected(self, stage: str) -> list[Path]:
+        """Move files that no manifest lists from the stage's artifacts to OUT/unexpected/; returns where they went.
+
+        Such a file would be read by later stages although no cache key accounts for it.
+        """
+        moved = []
+        for folder in self.artifact_folders(stage):
+            manifest = read_manifest(folder)
+            for name in [] if manifest is None else _unexpected(folder, manifest):
+                target = self.out / "unexpected" / stage / folder.name / name
+                while target.exists() or target.is_symlink():
+                    target = target.with_name(f"{target.name}~")
+                target.parent.mkdir(parents=True, exist_ok=True)
+                (folder / name).rename(target)
+                moved.append(target)
+        return moved
+
     def _file_faults(self, folder: Path, manifest: Mapping[str, Any]) -> list[str]:
-        faults = []
+        faults = [f"{name} in '{folder}' was added" for name in _unexpected(folder, manifest)]
         for name, entry in manifest.get("files", {}).items():
             path = folder / name
             try:
@@ -163,13 +218,32 @@ class Store:
         return Artifact(folder, files, manifest, by_hand=bool(manifest.get("replaced")))
 
 
+def _unexpected(folder: Path, manifest: Mapping[str, Any]) -> list[str]:
+    """Relative names of the files, and of links to folders, that the manifest does not list."""
+    listed = {MANIFEST, *manifest.get("files", {})}
+    found = []
+    for root, folders, names in os.walk(folder):
+        links = [name for name in folders if os.path.islink(os.path.join(root, name))]
+        found += [os.path.relpath(os.path.join(root, name), folder) for name in [*names, *links] if name not in _FILE_MANAGER_FILES]
+    return sorted(name for name in (n.replace(os.sep, "/") for n in found) if name not in listed)
+
+
 def read_manifest(folder: Path) -> dict[str, Any] | None:
-    """The manifest of a folder; None when it is missing or was modified (its `seal` is a digest of the other fields)."""
+    """The manifest of a folder; None when it is missing, damaged or modified (its `seal` is a digest of the other fields)."""
     try:
         body = json.loads((folder / MANIFEST).read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return None
-    return body if isinstance(body, dict) and body.get("seal") == _seal(body) else None
+    return body if isinstance(body, dict) and body.get("seal") == _seal(body) and _well_formed(body.get("files")) else None
+
+
+def _well_formed(files: object) -> bool:
+    """Whether a manifest's list of files has digests and sizes, and names inside the artifact's folder only."""
+    if not isinstance(files, dict):
+        return False
+    inside = all(not name.startswith("/") and ".." not in name.split("/") for name in files)
+    entries = [entry if isinstance(entry, dict) else {} for entry in files.values()]
+    return inside and all(isinstance(e.get("digest"), str) and isinstance(e.get("bytes"), int) for e in entries)
 
 
 def _seal(manifest: Mapping[str, Any]) -> str:

@@ -7,7 +7,6 @@ import os
 import selectors
 import signal
 import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable
@@ -20,9 +19,10 @@ from typing import Any
 import psutil
 
 from gsbake import errors
-from gsbake.errors import BadInputError, GsbakeError, InterruptedRun
+from gsbake.errors import GsbakeError, InterruptedRun
 from gsbake.pipeline.machine import thread_environment
 from gsbake.pipeline.worker import Job
+from gsbake.python_process import python_command, python_environment
 
 #: Seconds for a stage to acknowledge a stop request, and then to write its checkpoint.
 STOP_TIMEOUT = 5.0
@@ -85,12 +85,10 @@ class Worker:
 
     def __init__(self, job: Job, log: Path) -> None:
         read, write = os.pipe()
-        paths = [os.path.abspath(p) if p in ("", ".") else p for p in sys.path]
-        environment = {**os.environ, **thread_environment(job.threads), "PYTHONPATH": os.pathsep.join(paths), "PYTHONUNBUFFERED": "1"}
         with log.open("wb") as sink:
             self.process = subprocess.Popen(
-                [sys.executable, "-P", "-c", _COMMAND, str(write)],
-                stdin=subprocess.PIPE, stdout=sink, stderr=sink, env=environment,
+                python_command("-c", _COMMAND, str(write)),
+                stdin=subprocess.PIPE, stdout=sink, stderr=sink, env=python_environment(thread_environment(job.threads)),
                 pass_fds=(write,), start_new_session=True,  # Ctrl-C reaches only the supervisor, which passes it on
             )  # fmt: skip
         os.close(write)
@@ -213,16 +211,21 @@ def _reported_error(message: dict[str, Any], peak: int) -> GsbakeError:
     """The exception that a failed worker reported."""
     kind = message["error"]
     if kind == "MemoryError":
-        return BadInputError(
-            f"Out of memory ({message['message']}; {peak / 1e9:.1f} GB in use): use a smaller profile, or reduce ingest.max_size, "
-            "train.max_size or bake.size."
-        )
+        return _out_of_memory(f"{message['message']}; {peak / 1e9:.1f} GB in use")
     if kind == "InterruptedRun":
-        return InterruptedRun(_STOPPED)
+        return InterruptedRun(_STOPPED if message["message"].startswith("Stopped on request") else message["message"])
     if kind == "unexpected":
         return StageFailed(message["message"], message["traceback"])
     error: GsbakeError = getattr(errors, kind)(message["message"])
     return error
+
+
+def _out_of_memory(evidence: str) -> InterruptedRun:
+    """One error for a failed allocation and for a kill by the kernel: both depend on what else runs on the machine."""
+    return InterruptedRun(
+        f"Out of memory ({evidence}): close other programs and run the same command, which resumes; or use a smaller profile, or reduce "
+        "ingest.max_size, train.max_size or bake.size."
+    )
 
 
 def _unexpected_exit(worker: Worker, log: Path, stop: StopSignals) -> GsbakeError:
@@ -234,10 +237,7 @@ def _unexpected_exit(worker: Worker, log: Path, stop: StopSignals) -> GsbakeErro
         tail = log.read_text(errors="replace")[-4000:]
         if code == -signal.SIGKILL:
             total = psutil.virtual_memory().total
-            return InterruptedRun(
-                f"The stage was killed by the system, probably out of memory ({worker.peak / 1e9:.1f} GB of {total / 1e9:.1f} GB used): "
-                "the same command resumes from the last checkpoint; a smaller profile needs less memory."
-            )
+            return _out_of_memory(f"killed by the system at {worker.peak / 1e9:.1f} GB of {total / 1e9:.1f} GB")
         name = signal.Signals(-code).name if code < 0 else f"exit code {code}"
         return StageFailed(f"the stage's process ended with {name}", tail)
     return StageFailed(f"the stage's process ended with code {code}")

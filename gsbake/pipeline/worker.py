@@ -199,7 +199,7 @@ def run_job(job: Job, pipe: MessagePipe) -> None:
     except BaseException as error:
         out_of_memory = isinstance(error, MemoryError) or _OUT_OF_MEMORY.search(str(error)) is not None
         disk = disk_error(error, Path(job.output_folder))
-        name = "MemoryError" if out_of_memory else "BadInputError" if disk else "unexpected"
+        name = "MemoryError" if out_of_memory else _public_name(disk) if disk else "unexpected"
         message = str(disk) if disk and not out_of_memory else one_line(f"{type(error).__name__}: {error}")
         pipe.send("failed", error=name, message=message, traceback=traceback.format_exc())
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from gsbake.errors import BadInputError, UsageError
+from gsbake.errors import BadInputError, InterruptedRun, UsageError
 from gsbake.pipeline.files import disk_error
 from gsbake.pipeline.registry import Registry
 from gsbake.pipeline.supervise import StageFailed
@@ -162,8 +162,8 @@ def test_undeclared_setting_fails_the_stage(tmp_path: Path, photos: Path) -> Non
     ("kind", "error", "text", "code"),
     [
         ("bad", BadInputError, "The toy is broken; buy another.", 42),
-        ("memory", BadInputError, "Out of memory", 42),
-        ("full", BadInputError, "is full; free some space", 42),
+        ("memory", InterruptedRun, "Out of memory", 75),
+        ("full", InterruptedRun, "is full; free some space", 75),
         ("other", StageFailed, "ValueError: unexpected value", 1),
     ],
 )

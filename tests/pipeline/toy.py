@@ -18,6 +18,7 @@ from gsbake.pipeline.engine import Engine, Observer
 from gsbake.pipeline.plan import Request
 from gsbake.pipeline.registry import Registry
 from gsbake.pipeline.stage import Context, Stage
+from gsbake.pipeline.store import MANIFEST
 
 
 class Read(BaseModel):
@@ -150,6 +151,11 @@ class Recorder(Observer):
 
     def progress(self, name: str, done: int, total: int, text: str, live: Mapping[str, float]) -> None:
         self.reports.append((done, total, dict(live)))
+
+
+def artifact(out: Path, stage: str) -> Path:
+    """Folder of an artifact of a stage."""
+    return next(path.parent for path in (out / "stages" / stage).glob(f"*/{MANIFEST}"))
 
 
 def engine(out: Path, photos: Path, profile: BaseModel | None = None, registry: Registry = CHAIN, seed: int = 0) -> tuple[Engine, Recorder]:

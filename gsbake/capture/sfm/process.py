@@ -8,7 +8,6 @@ import re
 import selectors
 import signal
 import subprocess
-import sys
 import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
@@ -17,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from gsbake.errors import GsbakeError
+from gsbake.python_process import python_command, python_environment
 
 _POLL = 0.2  # seconds between looks at stop requests
 
@@ -83,13 +83,10 @@ def run_job(job: Mapping[str, Any], out: Path, watch: Watch, limit: float | None
     log = out / "colmap.log"
     counted = _Log(log)
     deadline = None if limit is None else time.monotonic() + limit
-    command = [sys.executable, "-m", "gsbake.capture.sfm.worker", str(order), str(os.getpid())]
-    environment = dict(os.environ)
-    root = str(Path(__file__).resolve().parents[3])
-    environment["PYTHONPATH"] = os.pathsep.join(p for p in (root, environment.get("PYTHONPATH")) if p)
+    command = python_command("-m", "gsbake.capture.sfm.worker", str(order), str(os.getpid()))
     with log.open("wb") as sink:
         child = subprocess.Popen(
-            command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=sink, env=environment, start_new_session=True
+            command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=sink, env=python_environment(), start_new_session=True
         )
     try:
         assert child.stdout is not None

@@ -1,0 +1,70 @@
+"""`gsbake cache verify` and `gsbake cache gc`: check every stored byte, and delete what is no longer needed."""
+
+from __future__ import annotations
+
+import json
+import re
+
+import typer
+
+from gsbake.cli.options import Options
+from gsbake.errors import BadInputError, UsageError
+from gsbake.text import size
+
+_SIZE_UNITS = {"": 1, "B": 1, "KB": 10**3, "MB": 10**6, "GB": 10**9, "TB": 10**12}
+_AGE_UNITS = {"h": 3600.0, "d": 86_400.0, "w": 604_800.0}
+
+
+def parse_size(text: str) -> int:
+    """Bytes of "20GB", "500 MB" or "0". Raises UsageError."""
+    found = re.fullmatch(r"\s*(\d{1,12}(?:\.\d{1,6})?)\s*([kmgt]?b)?\s*", text, re.IGNORECASE)
+    if not found:
+        raise UsageError(f"--keep takes a size such as 20GB or 500MB, not '{text}'.")
+    return int(float(found.group(1)) * _SIZE_UNITS[(found.group(2) or "").upper()])
+
+
+def parse_age(text: str) -> float:
+    """Seconds of "30d", "12h" or "2w". Raises UsageError."""
+    found = re.fullmatch(r"\s*(\d{1,6}(?:\.\d{1,6})?)\s*([hdw])\s*", text)
+    if not found:
+        raise UsageError(f"--older takes an age such as 12h, 30d or 2w, not '{text}'.")
+    return float(found.group(1)) * _AGE_UNITS[found.group(2)]
+
+
+def verify(options: Options) -> None:
+    """Read every file of every artifact again. Raises BadInputError when one is damaged; the next run computes it again."""
+    from gsbake.api import open_store
+
+    store, stages = open_store(options.out)
+    checked = [(stage, folder, faults) for stage in stages for folder, faults in store.verify(stage)]
+    damaged = [(stage, folder, faults) for stage, folder, faults in checked if faults]
+    if damaged:
+        store.digests.forget()  # the next run must see what this command saw
+        store.digests.save()
+    if options.as_json:
+        rows = [{"stage": stage, "folder": str(folder), "faults": faults} for stage, folder, faults in checked]
+        typer.echo(json.dumps({"out": str(store.out), "artifacts": rows, "damaged": len(damaged)}, ensure_ascii=True))
+    elif not options.quiet:
+        typer.echo(f"{len(checked)} stored outputs in '{store.out}' checked, {len(damaged)} damaged.")
+    if damaged:
+        stage, _, faults = damaged[0]
+        raise BadInputError(f"Stage '{stage}': {faults[0]}. The next run computes it again; files of your own must be replaced again.")
+
+
+def collect_garbage(options: Options, keep: str | None, older: str | None) -> None:
+    """Delete artifacts of old keys, and what killed runs left behind."""
+    from gsbake.api import open_store
+    from gsbake.pipeline.garbage import choose, delete, list_entries
+
+    limits = (None if keep is None else parse_size(keep), None if older is None else parse_age(older))
+    store, stages = open_store(options.out)
+    entries = list_entries(store, stages)
+    chosen = choose(entries, *limits)
+    done = chosen if options.dry_run else delete(chosen)
+    freed, left = sum(e.size for e in done), sum(e.size for e in entries) - sum(e.size for e in done)
+    if options.as_json:
+        rows = [{"path": str(e.path), "kind": e.kind, "bytes": e.size} for e in done]
+        typer.echo(json.dumps({"out": str(store.out), "deleted": rows, "freed_bytes": freed, "left_bytes": left}, ensure_ascii=True))
+    elif not options.quiet:
+        verb = "would be deleted" if options.dry_run else "deleted"
+        typer.echo(f"{len(done)} of {len(entries)} entries {verb}: {size(freed)} freed, {size(left)} left in '{store.out}'.")
