@@ -22,7 +22,7 @@ SCORE_ARGS ?=
 PARTS ?= table timeline growth
 ARGS ?=
 
-.PHONY: help setup node demo test check bench stress score clean
+.PHONY: help setup node demo docs test check bench stress score lock audit sbom clean
 
 help: ## Show this
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 10
@@ -49,6 +49,9 @@ demo: setup ## Bake the built-in capture with the smallest profile
 	$(BIN)/gsbake run $(DEMO_OUT)/capture --profile smoke --out $(DEMO_OUT)
 	@echo "The asset is $(DEMO_OUT)/asset.glb; open $(DEMO_OUT)/report.html in a browser."
 
+docs: setup ## Build the documentation into site/ (open site/index.html)
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet --strict
+
 check: setup ## Lint and types
 	$(BIN)/ruff check .
 	$(BIN)/mypy
@@ -74,6 +77,22 @@ score: .score/.stamp ## Score an asset against its truth: SCORE_GT=capture/gt SC
 $(SCORE_DIR)/requirements.txt:
 	@echo "there is no scorer in $(SCORE_DIR); say where it is: make score SCORE_DIR=…" >&2; exit 1
 
+lock: ## Write requirements.lock, the digests of every pinned package: WHEELS=DIR with PyTorch's CPU builds
+	python3 packaging/lock.py $(if $(WHEELS),--wheels $(WHEELS))
+
+audit: .audit/.stamp ## Look for risky code (bandit) and for known vulnerabilities of the pinned packages (pip-audit, needs the internet)
+	.audit/bin/bandit -q -c pyproject.toml -r gsbake stages
+	.audit/bin/pip-audit --disable-pip --require-hashes -r requirements.lock
+
+sbom: setup .audit/.stamp ## Write out/sbom.json, the list of all installed packages and their licences (CycloneDX)
+	@mkdir -p out
+	.audit/bin/cyclonedx-py environment $(BIN)/python --of JSON -o out/sbom.json
+
+.audit/.stamp: packaging/audit-requirements.txt
+	@test -x .audit/bin/python || "$(PYTHON)" -m venv .audit
+	.audit/bin/python -m pip install --quiet --disable-pip-version-check -r packaging/audit-requirements.txt
+	@touch $@
+
 clean: ## Delete the environments and caches (results in out/ stay)
-	rm -rf $(VENV) .score .mypy_cache .ruff_cache .pytest_cache .hypothesis dist
+	rm -rf $(VENV) .score .audit .mypy_cache .ruff_cache .pytest_cache .hypothesis dist site
 	find gsbake stages profiles tests benchmarks -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -1,8 +1,8 @@
-"""The Triton rasteriser on a GPU: parity with the CPU, a short training on both, and milliseconds beside gsplat's rasterization_2dgs.
+"""Triton rasteriser on a GPU: parity with the CPU, a short training on both, and times beside gsplat's rasterization_2dgs.
 
 python -m benchmarks.device [--check] [--csv results.csv]
 
-gsplat (1.5.3 is the one compared with) gets a column where it is installed.
+gsplat (compared version: 1.5.3) has columns where it is installed.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ def _norm_error(a: torch.Tensor, b: torch.Tensor) -> float:
 
 
 def parity(surfels: int = 20_000, size: int = 400) -> dict[str, float]:
-    """Relative error (Frobenius) of the GPU's planes and gradients against the Numba kernels on the CPU."""
+    """Relative error (Frobenius norm) of planes and gradients on the GPU against the Numba kernels on the CPU."""
     inputs, pinhole, rotation, translation = sphere(surfels, CHANNELS, size)
     results = []
     for device in ("cpu", "cuda"):
@@ -54,7 +54,7 @@ def parity(surfels: int = 20_000, size: int = 400) -> dict[str, float]:
 
 
 def training(steps: int = 200, size: int = 128) -> dict[str, float]:
-    """PSNR after a short training towards renders of a striped ball, on either device from the same start."""
+    """PSNR after a short training on renders of a striped ball, on both devices from the same initialisation."""
     inputs, pinhole, _, _ = sphere(3000, 3, size)
     colours = 0.5 + 0.4 * torch.sin(6 * inputs[0].roll(1, 1))
     views, generator = [], torch.Generator().manual_seed(0)
@@ -82,7 +82,7 @@ def training(steps: int = 200, size: int = 128) -> dict[str, float]:
 
 
 def _milliseconds(call: Callable[[], Any], backward: Callable[[Any], torch.Tensor], repeats: int = 12) -> tuple[float, float]:
-    """Medians of forward and backward by CUDA events, after three rounds of warming up."""
+    """Median milliseconds of forward and backward by CUDA events, after three warm-up rounds."""
     times: list[tuple[float, float]] = []
     for _ in range(repeats + 3):
         a, b, c, d = (torch.cuda.Event(enable_timing=True) for _ in range(4))
@@ -117,7 +117,7 @@ def _gsplat(leaves: list[torch.Tensor], rotation: torch.Tensor, translation: tor
 
 
 def timings(surfels: int, size: int, peer: bool) -> dict[str, float]:
-    """One row of the table: milliseconds forward and backward (projection, sort and reduction inside), peak memory, and gsplat's."""
+    """One row of the table: milliseconds of forward and backward (with projection, sort and reduction), peak memory, gsplat's times."""
     inputs, pinhole, rotation, translation = sphere(surfels, CHANNELS, size)
     leaves = [x.detach().cuda().requires_grad_() for x in inputs]
     rotation, translation = rotation.cuda(), translation.cuda()
@@ -140,7 +140,7 @@ def timings(surfels: int, size: int, peer: bool) -> dict[str, float]:
 
 
 def main() -> int:
-    """Run what was asked for; exit code 2 without a GPU, 1 when a check fails."""
+    """Run checks and timings; exit code 2 without a GPU, 1 when a check fails."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--check", action="store_true", help="parity and training only, no timings")
     parser.add_argument("--csv", help="write the timings to this file too")
@@ -155,7 +155,7 @@ def main() -> int:
     psnr = training()
     print("PSNR after a short training:", "  ".join(f"{k} {v:.2f} dB" for k, v in psnr.items()))
     if max(errors.values()) > 5e-3 or abs(psnr["cpu"] - psnr["cuda"]) > 0.5:
-        sys.stderr.write("the GPU disagrees with the CPU.\n")
+        sys.stderr.write("The results on GPU and CPU differ.\n")
         return 1
     if args.check:
         return 0

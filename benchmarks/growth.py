@@ -1,14 +1,14 @@
-"""How time grows with photos, surfels and resolution: doubling photos or surfels may cost at most 2.2 times the time.
+"""Scaling of time with photos, surfels and resolution: doubling photos or surfels may take at most 2.2 times as long.
 
 python -m benchmarks.growth [--parts photos,surfels,resolution] [--photos 12,24,48,96] [--surfels 10000,20000,…] [--resolutions 200,400,800]
 
-Photos: bakes of the built-in capture with that many photos, the training's steps fixed, up to the asset; every stage and their
-sum. Surfels: the trainer's step on one photo of 512² pixels (`benchmarks.step`), the median of a few. Resolution: that step with
+Photos: bakes of the built-in capture with that many photos and fixed training iterations, up to the asset; every stage and their
+sum. Surfels: a training iteration on one photo of 512² pixels (`benchmarks.step`), the median of several. Resolution: the same with
 20 000 surfels, and the stereo stage on 12 photos of the built-in capture.
-Seconds are wall time (of a step on one thread: CPU time), so the machine should be idle; `--rounds` repeats the bakes and takes the
-quickest. Writes benchmarks/results/growth.csv and docs/benchmarks/growth.svg.
+Seconds are wall time (CPU time for an iteration on one thread), so the machine should be idle; `--rounds` repeats the bakes and takes the
+fastest. Writes benchmarks/results/growth.csv and docs/lab/growth.svg.
 
-`per_doubling` is what doubling costs, computed from a size and the one before it; for resolutions it is a doubling of the pixels.
+`per_doubling` is the factor in time per doubling of the size, computed from a size and the one before it; for resolutions, of the pixels.
 """
 
 from __future__ import annotations
@@ -30,11 +30,12 @@ from gsbake.synth.capture import write_capture
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "benchmarks" / "results" / "growth.csv"
-CHART = ROOT / "docs" / "benchmarks" / "growth.svg"
-BAR = 2.2
-#: Edge of the photos of the bakes, in pixels, and the steps of their training.
-EDGE, STEPS = 400, 100
-#: Photo edge of the steps over surfels; surfels and photos of the curves over resolution.
+CHART = ROOT / "docs" / "lab" / "growth.svg"
+#: Maximum factor in time when photos or surfels double.
+MAX_DOUBLING_COST = 2.2
+#: Edge of the photos of the bakes in pixels, and their training iterations.
+BAKE_EDGE, BAKE_ITERATIONS = 400, 100
+#: Photo edge of the curves over surfels; surfels and photos of the curves over resolution.
 STEP_EDGE, STEP_SURFELS, STEREO_PHOTOS = 512, 20_000, 12
 STAGES = ("ingest", "poses", "stereo", "train", "refine", "mesh", "bake", "export")
 UNITS = {"photos": "photos", "surfels": "surfels", "resolution": "photo edge, pixels"}
@@ -53,12 +54,12 @@ class Cell:
 
 
 def per_doubling(before: tuple[float, float], after: tuple[float, float]) -> float:
-    """What one doubling of the work costs between two (work, seconds), if time is a power of the work between them."""
+    """Factor in time per doubling of the work between two (work, seconds), under a power law."""
     return float((after[1] / before[1]) ** (math.log(2) / math.log(after[0] / before[0])))
 
 
 def with_doublings(cells: Sequence[Cell]) -> list[Cell]:
-    """The cells by curve and size, each with what doubling from the size before it costs."""
+    """The cells by curve and size, each with the factor per doubling from the size before it."""
     out: list[Cell] = []
     for cell in sorted(cells, key=lambda c: (c.axis, c.what, c.size)):
         last = out[-1] if out and (out[-1].axis, out[-1].what) == (cell.axis, cell.what) else None
@@ -69,7 +70,7 @@ def with_doublings(cells: Sequence[Cell]) -> list[Cell]:
 
 
 def bake(photos: int, edge: int, target: str, out: Path, threads: int, rounds: int) -> dict[str, tuple[float, float]]:
-    """Seconds and peak megabytes of every stage up to `target`: the quickest of `rounds` bakes of the built-in capture."""
+    """Seconds and peak megabytes of every stage up to `target`: the fastest of `rounds` bakes of the built-in capture."""
     capture = out / f"capture-{photos}-{edge}"
     if not (capture / "transforms.json").is_file():
         write_capture(capture, photos, edge)
@@ -77,8 +78,8 @@ def bake(photos: int, edge: int, target: str, out: Path, threads: int, rounds: i
         f"ingest.max_size={edge}",
         f"stereo.max_size={edge}",
         "stereo.enabled=always",
-        f"train.iterations={STEPS}",
-        f"refine.iterations={STEPS // 5}",
+        f"train.iterations={BAKE_ITERATIONS}",
+        f"refine.iterations={BAKE_ITERATIONS // 5}",
         "skip.confirmed_steps=never",
         "skip.redundant_photos=never",
         "skip.resolution=never",
@@ -89,7 +90,7 @@ def bake(photos: int, edge: int, target: str, out: Path, threads: int, rounds: i
         folder = out / f"round-{number}" / f"{photos}-{edge}"
         options = RunOptions(photos=capture, out=folder, profile="preview", overrides=overrides, device="cpu", threads=threads)
         for state in open_session(options).engine.run(target):
-            assert state.artifact is not None  # the engine returned, so every stage is there
+            assert state.artifact is not None  # the engine returned, so every stage is finished
             found = float(state.artifact.manifest["seconds"]), state.artifact.manifest["peak_bytes"] / 1e6
             best[state.name] = min(found, best.get(state.name, found))
     return best
@@ -98,21 +99,21 @@ def bake(photos: int, edge: int, target: str, out: Path, threads: int, rounds: i
 def photo_cells(counts: Sequence[int], out: Path, threads: int, rounds: int) -> Iterator[Cell]:
     """Every stage and the whole bake over the number of photos."""
     for count in counts:
-        stages = bake(count, EDGE, STAGES[-1], out, threads, rounds)
+        stages = bake(count, BAKE_EDGE, STAGES[-1], out, threads, rounds)
         for name in STAGES:
             yield Cell("photos", name, count, *stages[name])
         yield Cell("photos", "whole bake", count, sum(s for s, _ in stages.values()), max(p for _, p in stages.values()))
 
 
 def surfel_cells(counts: Sequence[int], repeats: int) -> Iterator[Cell]:
-    """A training step over the number of surfels, colours alone and with materials and light."""
+    """A training iteration over the number of surfels, with colours and with materials and environment map."""
     for materials, what in ((False, "step, colours"), (True, "step, materials")):
         for count in counts:
             yield Cell("surfels", what, count, profile(count, STEP_EDGE, materials, repeats)["step"] / 1e3)
 
 
 def resolution_cells(edges: Sequence[int], out: Path, threads: int, repeats: int, rounds: int) -> Iterator[Cell]:
-    """A training step and the stereo stage over the photos' edge."""
+    """A training iteration and the stereo stage over the photos' edge."""
     for edge in edges:
         yield Cell("resolution", "step, colours", edge, profile(STEP_SURFELS, edge, False, repeats)["step"] / 1e3)
         yield Cell("resolution", "stereo", edge, *bake(STEREO_PHOTOS, edge, "stereo", out, threads, rounds)["stereo"])
@@ -140,7 +141,7 @@ def write_csv(path: Path, cells: Sequence[Cell]) -> None:
 
 
 def panel(axis: str, cells: Sequence[Cell]) -> Panel:
-    """The slowest curves over one axis, as many as there are colours, and from the slowest one's first size what the bar allows."""
+    """The slowest curves over one axis, as many as there are colours, and the allowed time from the first size of the slowest."""
     curves: dict[str, list[Cell]] = {}
     for cell in cells:
         if cell.axis == axis:
@@ -150,13 +151,13 @@ def panel(axis: str, cells: Sequence[Cell]) -> Panel:
     if shown:
         first, last = shown[0][1][0], shown[0][1][-1]
         doublings = math.log2(last.size / first.size) * (2 if axis == "resolution" else 1)
-        allowed = [(first.size, first.seconds), (last.size, first.seconds * BAR**doublings)]
-        series.append(Series(f"{BAR} times a doubling", allowed, len(COLOURS) - 1, "dash"))
+        allowed = [(first.size, first.seconds), (last.size, first.seconds * MAX_DOUBLING_COST**doublings)]
+        series.append(Series(f"{MAX_DOUBLING_COST} times a doubling", allowed, len(COLOURS) - 1, "dash"))
     return Panel(f"Time over {axis}", UNITS[axis], "seconds", series)
 
 
 def summary(cells: Sequence[Cell]) -> str:
-    """The worst doubling of every curve, beside the bar for photos and surfels."""
+    """The largest factor per doubling of every curve, compared with MAX_DOUBLING_COST for photos and surfels."""
     worst: dict[tuple[str, str], float] = {}
     for cell in cells:
         if cell.per_doubling is not None:
@@ -164,13 +165,13 @@ def summary(cells: Sequence[Cell]) -> str:
             worst[key] = max(cell.per_doubling, worst.get(key, 0.0))
     lines = []
     for (axis, what), ratio in worst.items():
-        verdict = "" if axis == "resolution" else f"  {'within' if ratio <= BAR else 'OVER'} {BAR}"
-        lines.append(f"{axis:12} {what:18} doubling costs at most {ratio:5.2f} times{verdict}\n")
+        verdict = "" if axis == "resolution" else f"  {'within' if ratio <= MAX_DOUBLING_COST else 'OVER'} {MAX_DOUBLING_COST}"
+        lines.append(f"{axis:12} {what:18} doubling takes at most {ratio:5.2f} times as long{verdict}\n")
     return "".join(lines)
 
 
 def integers(text: str) -> list[int]:
-    """Comma-separated sizes."""
+    """Parse comma-separated sizes."""
     return [int(v) for v in text.split(",")]
 
 
@@ -181,11 +182,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--photos", type=integers, default=[12, 24, 48, 96])
     parser.add_argument("--surfels", type=integers, default=[10_000, 20_000, 40_000, 80_000, 160_000, 320_000, 400_000])
     parser.add_argument("--resolutions", type=integers, default=[200, 400, 800])
-    parser.add_argument("--repeats", type=int, default=9, help="training steps whose median is taken")
-    parser.add_argument("--rounds", type=int, default=1, help="bakes of which the quickest counts")
+    parser.add_argument("--repeats", type=int, default=9, help="training iterations whose median is taken")
+    parser.add_argument("--rounds", type=int, default=1, help="bakes of which the fastest counts")
     parser.add_argument("--threads", type=int, default=default_threads())
     parser.add_argument(
-        "--out", type=Path, default=ROOT / "out" / "bench" / "growth", help="where the bakes are kept; finished ones count again"
+        "--out", type=Path, default=ROOT / "out" / "bench" / "growth", help="folder of the bakes; finished ones are reused"
     )
     parser.add_argument("--csv", type=Path, default=RESULTS)
     parser.add_argument("--chart", type=Path, default=CHART)
@@ -204,7 +205,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             cells.append(cell)
     cells = with_doublings(cells)
     write_csv(args.csv, cells)
-    write(args.chart, "What doubling costs", [panel(axis, cells) for axis in UNITS], columns=3)
+    write(args.chart, "Cost of doubling", [panel(axis, cells) for axis in UNITS], columns=3)
     sys.stdout.write(summary(cells))
 
 

@@ -1,8 +1,8 @@
-"""Baked textures against those of the true asset, texel by texel: cheap enough for every row of a table, and no renderer in between.
+"""Errors of baked textures against the reference asset, per texel and without a renderer.
 
-Every texel that a photo saw is compared with the nearest point of the true surface: base colour in dB over sRGB values after one gain per
-channel (nobody knows how bright the light was), roughness and metallic as root mean squares. The independent scorer compares renders of
-the same textures; it weighs what its views show, this every texel alike.
+Every observed texel is compared with the nearest point of the reference surface: base colour as PSNR in dB of sRGB values after one gain
+per channel (the light's intensity is not observable), roughness and metallic as root mean squares. The independent scorer compares renders
+of the same textures and so weighs texels by their visibility; here all texels weigh the same.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ from gsbake.texturing.texels import rasterise
 
 Floats = NDArray[np.float64]
 
-#: Texels compared.
-COMPARED = 100_000
-#: Logarithms of the gains that are tried.
-GAINS = (-1.5, 1.5)
+#: Texels compared, about.
+MAX_TEXELS = 100_000
+#: Bounds of the logarithm of the gain.
+LOG_GAIN = (-1.5, 1.5)
 
 
 @dataclass(frozen=True)
@@ -39,24 +39,24 @@ class MapErrors:
 
 
 def measure_maps(bake: Path, mesh: Path, poses: Path, capture: Path) -> MapErrors:
-    """The errors of a bake stage's textures, with the stage folders of its mesh and poses and the `capture` whose `gt/` holds the truth."""
+    """The errors of a bake stage's textures, from the stage folders of its mesh and poses and the `capture` with the reference in `gt/`."""
     from safetensors.numpy import load_file
 
-    cut = load_file(bake / "mesh.safetensors")
+    unwrapped = load_file(bake / "mesh.safetensors")
     base, orm, coverage = (read_exr(bake / f"{name}.exr") for name in ("base_color", "orm", "coverage"))
-    texels = rasterise(cut["uv"], cut["faces"], len(base))
-    seen = np.flatnonzero(coverage.reshape(-1, 3)[texels.index, 1] > 0.5)
-    chosen = seen[:: max(1, len(seen) // COMPARED)]
-    mine = np.concatenate([base, orm[..., 1:]], 2).reshape(-1, 5)[texels.index[chosen]].astype(np.float64)
+    texels = rasterise(unwrapped["uv"], unwrapped["faces"], len(base))
+    observed = np.flatnonzero(coverage.reshape(-1, 3)[texels.index, 1] > 0.5)
+    chosen = observed[:: max(1, len(observed) // MAX_TEXELS)]
+    baked = np.concatenate([base, orm[..., 1:]], 2).reshape(-1, 5)[texels.index[chosen]].astype(np.float64)
     truth, cameras = read_truth(capture), CameraSet.load(poses / "cameras.json")
-    points = cameras.to_world.apply(texels.interpolate(cut["position"], cut["faces"])[chosen].astype(np.float64))
+    points = cameras.to_world.apply(texels.interpolate(unwrapped["position"], unwrapped["faces"])[chosen].astype(np.float64))
     if cameras.poses != "given":
         points = align(read_mesh(mesh / "mesh.ply").moved(cameras.to_world), read_centres(poses / "cameras.json"), truth).apply(points)
     face = nearest(points, truth.surface, 3)[1]
     corners = truth.surface.corners[face]
-    theirs = _true_values(capture / "gt" / "asset.glb", face, nearest_on_faces(points, corners), corners)
-    decibels = -10 * np.log10(np.mean([_least_error(mine[:, k], theirs[:, k]) for k in range(3)]))
-    roughness, metallic = np.sqrt(((mine[:, 3:] - theirs[:, 3:]) ** 2).mean(0))
+    reference = _true_values(capture / "gt" / "asset.glb", face, nearest_on_faces(points, corners), corners)
+    decibels = -10 * np.log10(np.mean([_min_error(baked[:, k], reference[:, k]) for k in range(3)]))
+    roughness, metallic = np.sqrt(((baked[:, 3:] - reference[:, 3:]) ** 2).mean(0))
     return MapErrors(float(decibels), float(roughness), float(metallic))
 
 
@@ -75,7 +75,7 @@ def _true_values(asset: Path, face: NDArray[np.int64], points: Floats, corners: 
             return np.ones((len(uv), 3))
         pixels = np.asarray(image.convert("RGB"))
         height, width = pixels.shape[:2]
-        # trimesh turns v round: its origin is at the bottom.
+        # trimesh flips v: its origin is at the bottom.
         row, column = ((1 - uv[:, 1]) % 1 * height).astype(np.int64), (uv[:, 0] % 1 * width).astype(np.int64)
         return pixels[np.minimum(row, height - 1), np.minimum(column, width - 1)] / 255.0
 
@@ -84,7 +84,7 @@ def _true_values(asset: Path, face: NDArray[np.int64], points: Floats, corners: 
     return np.column_stack([decode(read(material.baseColorTexture)), packed[:, 1:] * factors])
 
 
-def _least_error(mine: Floats, theirs: Floats) -> float:
-    """Mean square of the differences of sRGB values (0..1) of two linear channels (n,), at the gain that makes it least."""
-    shown = encode(theirs)
-    return float(minimize_scalar(lambda gain: ((encode(mine * np.exp(gain)) - shown) ** 2).mean(), bounds=GAINS, method="bounded").fun)
+def _min_error(baked: Floats, reference: Floats) -> float:
+    """Mean square of the differences of sRGB values (0..1) of two linear channels (n,), at the best gain on the first."""
+    target = encode(reference)
+    return float(minimize_scalar(lambda gain: ((encode(baked * np.exp(gain)) - target) ** 2).mean(), bounds=LOG_GAIN, method="bounded").fun)

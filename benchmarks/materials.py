@@ -1,18 +1,18 @@
-"""What each part of the materials brings: from the surfels' own, projected, to the fit in texture space with everything it knows.
+"""Ablation of the material fit: from projected surfel materials to the full fit in texture space.
 
 python -m benchmarks.materials [CAPTURE ...] [--profile relight] [--reuse RUN ...] [--rows projected,fit] [--set section.key=value ...]
     [--scorer DIR] [--views 0] [--out DIR] [--csv FILE]
 
-CAPTURE is a folder with its truth in `gt/`; without any, boombox and avocado where they are ($GSBAKE_CAPTURES, else ../shared/captures).
-The rows are cumulative: each keeps the settings of the one before and adds its own (`STEPS`). Rows of the texture fit share one run up to
-the mesh; the first trains surfels that carry materials themselves, so its mesh is its own. `--reuse` takes everything up to the mesh from
-a finished run of the same photos and profile, one per capture; RUN itself is only read. `--set` holds for all rows.
+CAPTURE is a folder with its reference in `gt/`; default: boombox and avocado in $GSBAKE_CAPTURES, else ../shared/captures. The rows
+(`ROW_SETTINGS`) are cumulative. Rows of the texture fit share one run up to the mesh; the first trains surfels with materials and has its
+own mesh. `--reuse` takes the stages up to the mesh from a finished run of the same photos and profile, one per capture; RUN itself is only
+read. `--set` applies to all rows.
 
-`psnr` compares the asset, drawn under the light found with it, with the held-out photos, as the report does; `texel_…` compare its
-textures with the true ones (`benchmarks.maps`). The rest comes from the independent scorer, where it is installed (`make score` once, or
-`--scorer`): looks under lights that lit no photo, base colour, roughness and metallic against the truth. `--views` scores on that many of
-the truth's views, evenly chosen, instead of all. CPU seconds are those of the processes of the stages that made materials: of the surfels
-(train, refine) where they carry them, and the bake.
+`psnr` compares renders of the asset under the fitted light with the held-out photos, as the report does; `texel_…` compare its textures
+with the reference (`benchmarks.maps`). The rest comes from the independent scorer, where it is installed (`make score` once, or
+`--scorer`): relighting under other environments, base colour, roughness and metallic against the reference. `--views` scores on that many
+of the reference's views, evenly chosen, instead of all. CPU seconds are those of the stages that make materials: the bake, and train and
+refine where surfels carry materials.
 """
 
 from __future__ import annotations
@@ -37,24 +37,25 @@ from gsbake.errors import GsbakeError, UsageError
 RESULTS = ROOT / "benchmarks" / "results" / "materials.csv"
 #: The scorer's folder and interpreter, where `make score` has them.
 SCORER, PYTHON = ROOT.parent / "shared" / "score", ROOT / ".score" / "bin" / "python"
-#: What the stages up to the mesh are called.
+#: Names of the stages up to the mesh.
 TO_MESH = ("ingest", "poses", "stereo", "train", "refine", "mesh")
-#: Rows and what each sets beside the profile.
-NO_PRIORS = tuple(f"bake.{prior}_prior=0" for prior in ("smooth", "dark", "metal", "white", "parsimony"))
-STEPS: dict[str, tuple[str, ...]] = {
+#: Overrides that turn all priors off.
+NO_PRIORS = tuple(f"bake.{prior}=0" for prior in ("smoothness", "base_color_l1", "metallic_l1", "neutral_light", "sparsity"))
+#: Overrides of each row.
+ROW_SETTINGS: dict[str, tuple[str, ...]] = {
     "projected": ("surfels.shading=pbr", "bake.materials=surfels"),
     "fit": ("bake.materials=fit", "bake.visibility=none", *NO_PRIORS),
     "visibility": ("bake.materials=fit", "bake.visibility=directional", *NO_PRIORS),
     "bounce": ("bake.materials=fit", "bake.visibility=bounce", *NO_PRIORS),
     "reflections": ("bake.materials=fit", "bake.visibility=reflections", *NO_PRIORS),
     "priors": ("bake.materials=fit", "bake.visibility=reflections", "bake.sparsity=0"),
-    "parsimony": ("bake.materials=fit", "bake.visibility=reflections"),
+    "sparsity": ("bake.materials=fit", "bake.visibility=reflections"),
 }
 
 
 @dataclass(frozen=True)
 class Row:
-    """One asset: which row of which capture, what was set for all rows, its cost and its errors; None where there is no such figure."""
+    """One asset: capture, profile, row, overrides for all rows, cost and errors; None where not measured."""
 
     capture: str
     profile: str
@@ -72,7 +73,7 @@ class Row:
     metallic_rmse: float | None = None
 
 
-def thinned(truth: Path, views: int, folder: Path) -> Path:
+def truth_subset(truth: Path, views: int, folder: Path) -> Path:
     """A copy of `truth` in `folder` with `views` of its views, evenly chosen; `truth` itself for 0."""
     if views == 0:
         return truth
@@ -89,12 +90,12 @@ def thinned(truth: Path, views: int, folder: Path) -> Path:
 
 
 def score(asset: Path, solved: bool, truth: Path, scorer: Path, python: Path) -> dict[str, float]:
-    """The scorer's figures of an asset, laid on the truth by its cameras where they were `solved`; none where there is no scorer.
+    """The scorer's figures of an asset, aligned with the reference by its cameras where these were `solved`; none without a scorer.
 
     Raises UsageError when the scorer fails.
     """
     if not (scorer / "score.py").is_file() or not python.is_file():
-        sys.stderr.write(f"not scored: {scorer}/score.py or {python} is not here; `make score` installs it\n")
+        sys.stderr.write(f"not scored: {scorer}/score.py or {python} is missing; `make score` installs it\n")
         return {}
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "score.json"
@@ -110,9 +111,9 @@ def score(asset: Path, solved: bool, truth: Path, scorer: Path, python: Path) ->
 
 
 def measure(folder: Path, profile: str, row: str, overrides: Sequence[str], out: Path, threads: int) -> tuple[Row, Path, bool]:
-    """Make the asset of one row, or take what is cached: its row without the scorer's figures, its GLB, and whether poses were solved."""
+    """Make the asset of one row, cached where possible: its row without the scorer's figures, its GLB, and whether poses were solved."""
     clock = CpuClock(out / "cpu.json")
-    options = RunOptions(photos=folder, out=out, profile=profile, overrides=[*STEPS[row], *overrides], device="cpu", threads=threads)
+    options = RunOptions(photos=folder, out=out, profile=profile, overrides=[*ROW_SETTINGS[row], *overrides], device="cpu", threads=threads)
     states = open_session(options, clock).engine.run("report")
     done = manifests(states)
     folders = {s.name: s.artifact.folder for s in states if s.artifact is not None}
@@ -125,7 +126,7 @@ def measure(folder: Path, profile: str, row: str, overrides: Sequence[str], out:
 
 
 def markdown(rows: Sequence[Row]) -> str:
-    """The rows as the table of docs/materials.md."""
+    """The rows as the table of docs/lab/materials.md."""
 
     def text(value: float | None, form: str) -> str:
         return "–" if value is None else format(value, form)
@@ -141,23 +142,23 @@ def markdown(rows: Sequence[Row]) -> str:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Make, score and write one row after the other; then print them all as a table."""
+    """Make, score and write the rows, then print them as a table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("captures", type=Path, nargs="*")
     parser.add_argument("--profile", default="relight")
     parser.add_argument("--reuse", type=Path, action="append", default=[], help="a finished run, one per capture and in their order")
-    parser.add_argument("--rows", type=names, default=list(STEPS))
-    parser.add_argument("--set", dest="overrides", action="append", default=[], metavar="KEY=VALUE", help="for all rows")
+    parser.add_argument("--rows", type=names, default=list(ROW_SETTINGS))
+    parser.add_argument("--set", dest="overrides", action="append", default=[], metavar="KEY=VALUE", help="override for all rows")
     parser.add_argument("--scorer", type=Path, default=SCORER, help="folder of score.py")
     parser.add_argument("--scorer-python", type=Path, default=PYTHON, help="interpreter that has Blender's module")
-    parser.add_argument("--views", type=int, default=0, help="views of the truth to score on; 0: all")
-    parser.add_argument("--threads", type=int, default=0, help="0: the physical cores")
+    parser.add_argument("--views", type=int, default=0, help="reference views to score on; 0: all")
+    parser.add_argument("--threads", type=int, default=0, help="0: number of physical cores")
     parser.add_argument("--out", type=Path, default=ROOT / "out" / "bench" / "materials", help="where the runs are kept")
     parser.add_argument("--csv", type=Path, default=RESULTS)
     args = parser.parse_args(arguments)
     captures = args.captures or [CAPTURES / name for name in ("boombox", "avocado")]
-    if unknown := set(args.rows) - set(STEPS):
-        parser.error(f"there is no row {', '.join(sorted(unknown))}; there are {', '.join(STEPS)}")
+    if unknown := set(args.rows) - set(ROW_SETTINGS):
+        parser.error(f"there is no row {', '.join(sorted(unknown))}; rows: {', '.join(ROW_SETTINGS)}")
     if args.reuse and len(args.reuse) != len(captures):
         parser.error(f"{len(args.reuse)} finished runs for {len(captures)} captures; give one for each")
     rows: list[Row] = []
@@ -169,7 +170,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             if args.reuse:
                 reuse(args.reuse[k], out, TO_MESH)
             with tempfile.TemporaryDirectory() as folder:
-                truth = thinned(capture / "gt", args.views, Path(folder) / "gt")
+                truth = truth_subset(capture / "gt", args.views, Path(folder) / "gt")
                 for name in args.rows:
                     row, asset, solved = measure(capture, args.profile, name, args.overrides, out, args.threads)
                     rows.append(Row(**asdict(row) | score(asset, solved, truth, args.scorer, args.scorer_python)))

@@ -1,6 +1,6 @@
-"""How far the float32 kernels are from the float64 twin, over scales and fields of view; writes the table into docs/numerics.md.
+"""Error of the float32 kernels against the float64 reference over scales and fields of view; writes the table of docs/lab/numerics.md.
 
-python -m benchmarks.numerics [--doc docs/numerics.md]
+python -m benchmarks.numerics [--doc docs/lab/numerics.md]
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ BEGIN, END = "<!-- table: begin -->", "<!-- table: end -->"
 
 
 def scene(scale: float, field: float, seed: int) -> tuple[list[Tensor], Pinhole]:
-    """Surfels that fill the frame whatever the field of view, float64; scale is against a unit frame at distance 3."""
+    """Surfels that fill the frame at any `field` of view (degrees), float64; `scale` is relative to the unit frame at distance 3."""
     g = torch.Generator().manual_seed(seed)
     depth = 2.5 + torch.rand(SURFELS, generator=g, dtype=torch.float64)
     half = math.tan(math.radians(field) / 2)
@@ -37,7 +37,7 @@ def scene(scale: float, field: float, seed: int) -> tuple[list[Tensor], Pinhole]
     features = torch.rand(SURFELS, 3, generator=g, dtype=torch.float64)
     focal = WIDTH / 2 / half
     inputs = [position, quaternion, log_scale, opacity, features, torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64)]
-    # what float32 can say is the scene: its rounding is not the kernels' error
+    # the scene is rounded to float32: input rounding is not an error of the kernels
     return [x.float().double() for x in inputs], Pinhole(WIDTH, HEIGHT, focal, 1.1 * focal, 0.45 * WIDTH, 0.6 * HEIGHT)
 
 
@@ -75,14 +75,14 @@ def table() -> str:
 def main() -> None:
     """Measure and write the table between its markers."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--doc", type=Path, default=Path(__file__).parent.parent / "docs" / "numerics.md")
+    parser.add_argument("--doc", type=Path, default=Path(__file__).parent.parent / "docs" / "lab" / "numerics.md")
     args = parser.parse_args()
     made = table()
     sys.stdout.write(made + "\n")
     text = args.doc.read_text(encoding="utf-8")
     head, _, rest = text.partition(BEGIN)
     tail = rest.partition(END)[2]
-    args.doc.write_text(f"{head}{BEGIN}\n{made}\n{END}{tail}", encoding="utf-8")
+    args.doc.write_text(f"{head}{BEGIN}\n\n{made}\n\n{END}{tail}", encoding="utf-8")
 
 
 if __name__ == "__main__":

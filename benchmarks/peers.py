@@ -1,12 +1,12 @@
-"""Other photogrammetry tools on the same captures: run where they are installed, quoted from a published table where that says so.
+"""Other photogrammetry tools on the same captures: run where they are installed, or quoted from a published table.
 
-pyarchinit-photogrammetry runs through the scorer's `peer_ppg.py` in a virtual environment of its own, $GSBAKE_PEER or ./.peer:
+pyarchinit-photogrammetry runs through the scorer's `peer_ppg.py` in a separate virtual environment, $GSBAKE_PEER or ./.peer:
 
     python3.11 -m venv .peer && .peer/bin/pip install "pyarchinit-photogrammetry[mesh,fast]"
 
-OpenMVS (2.2 or later) runs where its five programs are on the PATH. It takes the cameras and sparse points that gsbake's poses stage solved
-with pycolmap, undistorted, and the same masks; the seconds of that count. A tool that is not installed has no row; one that is and makes no
-mesh has a row without figures.
+OpenMVS (2.2 or later) runs where its five programs are on the PATH. It receives the undistorted cameras and tie points of gsbake's poses
+stage (pycolmap) and the same masks; their seconds count. A tool that is not installed has no row; one that produces no mesh has a row
+without figures.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ PEER = Path(os.environ.get("GSBAKE_PEER", ROOT / ".peer"))
 SCRIPT = Path(os.environ.get("GSBAKE_SCORE", ROOT.parent / "shared" / "score")) / "peer_ppg.py"
 PYARCHINIT = "pyarchinit-photogrammetry"
 OPENMVS = ("InterfaceCOLMAP", "DensifyPointCloud", "ReconstructMesh", "RefineMesh", "TextureMesh")
-#: A tool that takes longer than this is taken to hang.
-LIMIT_SECONDS = 3600
+#: Time limit of a program in seconds.
+TIMEOUT_SECONDS = 3600
 
-#: From the scorer's README: two quiet cores, the same photos and true masks, structure from motion and texture included. Boombox made
-#: neither tool give a mesh.
+#: From the scorer's README: two idle cores, the same photos and true masks, structure from motion and texturing included. Neither tool
+#: produced a mesh of boombox.
 QUOTED = (
     Row("avocado", "OpenMVS 2.3", "", "", None, 132.0, 0.119, 0.986, 6.8, source="quoted"),
     Row("avocado", "OpenMVS 2.3", "", "", None, 83.0, 0.14, None, 6.5, source="quoted"),
@@ -43,7 +43,7 @@ QUOTED = (
 
 
 def run_program(command: Sequence[str | Path], folder: Path, **environment: str) -> tuple[bool, float]:
-    """Run a program in `folder`, its words in `<program>.log` there; whether it succeeded, and its wall seconds."""
+    """Run a program in `folder` with its output in `<program>.log` there; returns success and wall seconds."""
     start = time.perf_counter()
     with (folder / f"{Path(command[0]).name}.log").open("wb") as log:
         try:
@@ -53,7 +53,7 @@ def run_program(command: Sequence[str | Path], folder: Path, **environment: str)
                 stdout=log,
                 stderr=subprocess.STDOUT,
                 env=os.environ | environment,
-                timeout=LIMIT_SECONDS,
+                timeout=TIMEOUT_SECONDS,
                 check=False,
             )
         except subprocess.TimeoutExpired:
@@ -62,7 +62,7 @@ def run_program(command: Sequence[str | Path], folder: Path, **environment: str)
 
 
 def fresh(folder: Path) -> Path:
-    """The folder, empty."""
+    """Create the folder, or empty it; returns its absolute path."""
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
     return folder.resolve()
@@ -71,13 +71,13 @@ def fresh(folder: Path) -> Path:
 def run_pyarchinit(name: str, capture: Path, out: Path) -> list[Row]:
     """Bake a capture with pyarchinit-photogrammetry into `out`; no row where it or its script is missing.
 
-    Its seconds are those it gives for its steps up to the mesh, its texture left out.
+    Seconds are those it reports for its steps up to the mesh, without texturing.
     """
     python = PEER.resolve() / "bin" / "python"
     if not (python.is_file() and SCRIPT.is_file()):
         return []
-    asked = f"import importlib.metadata as m; print(m.version({PYARCHINIT!r}))"
-    version = subprocess.run([python, "-c", asked], capture_output=True, text=True, check=False)
+    code = f"import importlib.metadata as m; print(m.version({PYARCHINIT!r}))"
+    version = subprocess.run([python, "-c", code], capture_output=True, text=True, check=False)
     if version.returncode:
         return []
     folder = fresh(out)
@@ -91,7 +91,7 @@ def run_pyarchinit(name: str, capture: Path, out: Path) -> list[Row]:
 
 
 def with_figures(row: Row, measured: Callable[[], Figures]) -> Row:
-    """The row with the figures of its mesh, or as it is, with a sentence, when there is no mesh to measure."""
+    """The row with the figures of its mesh, or unchanged, with a message, without a mesh."""
     try:
         return row.with_figures(measured())
     except UsageError as error:
@@ -100,14 +100,14 @@ def with_figures(row: Row, measured: Callable[[], Figures]) -> Row:
 
 
 def has_openmvs() -> bool:
-    """Whether all its programs are on the PATH."""
+    """Whether all programs of OpenMVS are on the PATH."""
     return all(shutil.which(program) for program in OPENMVS)
 
 
 def prepare_openmvs(stages: Mapping[str, Path], folder: Path) -> dict[str, Array]:
     """Undistorted photos, masks and the sparse model as text below `folder`; returns the camera centres (3,) by photo name.
 
-    `stages` holds the folders of ingest (photos, masks) and poses (sparse model).
+    `stages` has the folders of ingest (photos, masks) and poses (sparse model).
     """
     import pycolmap
 
@@ -130,10 +130,9 @@ def prepare_openmvs(stages: Mapping[str, Path], folder: Path) -> dict[str, Array
 
 
 def run_openmvs(name: str, capture: Path, stages: Mapping[str, Path], before: float, out: Path, threads: int) -> list[Row]:
-    """Dense points, mesh, refined mesh and texture with OpenMVS; a row after every program that leaves a mesh.
+    """Dense points, mesh, refined mesh and texture with OpenMVS; a row after every program that writes a mesh.
 
-    `stages` as for `prepare_openmvs`; `before` are the seconds that these took. When a program fails or its mesh is empty, the last row is
-    one without figures.
+    `stages` as for `prepare_openmvs`; `before`: their seconds. When a program fails or its mesh is empty, the last row has no figures.
     """
     folder, truth = fresh(out), read_truth(capture)
     start = time.perf_counter()
@@ -149,7 +148,7 @@ def run_openmvs(name: str, capture: Path, stages: Mapping[str, Path], before: fl
         (["TextureMesh", "dense.mvs", "-m", "refined.ply", "-o", "textured.mvs"], "textured.ply"),
     ]
 
-    def left(mesh: str) -> Figures:
+    def measure_mesh(mesh: str) -> Figures:
         return measure_aligned(read_mesh(folder / mesh), centres, truth)
 
     rows: list[Row] = []
@@ -161,7 +160,7 @@ def run_openmvs(name: str, capture: Path, stages: Mapping[str, Path], before: fl
             return [*rows, row]
         if mesh is None:
             continue
-        rows.append(with_figures(row, partial(left, mesh)))
+        rows.append(with_figures(row, partial(measure_mesh, mesh)))
         if rows[-1].chamfer_pct is None:  # the next program would start from that mesh
             break
     return rows

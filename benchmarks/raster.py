@@ -1,4 +1,4 @@
-"""Milliseconds of the rasteriser on a sphere of surfels that fills 56 % of the frame.
+"""Time of the rasteriser in milliseconds, on a sphere of surfels that covers 56 % of the frame.
 
 python -m benchmarks.raster --surfels 50000 --size 512 --channels 10 --json
 """
@@ -19,13 +19,13 @@ from gsbake.surfels.raster.rasterise import render
 
 
 def sphere(surfels: int, channels: int, size: int) -> tuple[list[torch.Tensor], Pinhole, torch.Tensor, torch.Tensor]:
-    """Surfels spread evenly over a unit sphere, opaque, with overlap, and a camera that sees it fill 56 % of the frame."""
+    """Opaque, overlapping surfels evenly spread over the unit sphere, and a camera in which it covers 56 % of the frame."""
     generator = torch.Generator().manual_seed(0)
     i = torch.arange(surfels) + 0.5
     phi, z = i * math.pi * (3 - math.sqrt(5)), 1 - 2 * i / surfels
     r = (1 - z * z).sqrt()
     position = torch.stack([r * phi.cos(), r * phi.sin(), z], 1)
-    # quaternion that turns +z to the normal
+    # quaternion that rotates +z to the normal
     quaternion = torch.stack([1 + z, -position[:, 1], position[:, 0], torch.zeros_like(z)], 1)
     quaternion = quaternion / quaternion.norm(dim=1, keepdim=True).clamp_min(1e-6)
     spacing = math.sqrt(4 * math.pi / surfels)
@@ -40,7 +40,7 @@ def sphere(surfels: int, channels: int, size: int) -> tuple[list[torch.Tensor], 
 
 
 def measure(surfels: int, size: int, channels: int, repeats: int = 9) -> dict[str, float]:
-    """Median milliseconds of forward (projection, sort and binning inside) and backward (gradient reduction inside)."""
+    """Median milliseconds of the forward pass (with projection, sort and binning) and the backward pass (with gradient reduction)."""
     inputs, pinhole, rotation, translation = sphere(surfels, channels, size)
     inputs = [x.requires_grad_() for x in inputs]
     forward, backward = [], []

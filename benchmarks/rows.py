@@ -1,6 +1,6 @@
-"""The table of error against time: one row per measured (or quoted) mesh, its CSV file, its charts, and its Pareto front as Markdown.
+"""Table of error against time: one row per measured or quoted mesh, its CSV file, charts, and Pareto front as Markdown.
 
-Seconds are wall time of everything from the photos to that mesh, reading them and finding the cameras included.
+Seconds are wall time from the photos to the mesh, ingest and structure from motion included.
 """
 
 from __future__ import annotations
@@ -14,17 +14,18 @@ from typing import Literal
 from benchmarks.charts import Panel, Point, Series, pareto, write
 from benchmarks.truth import Figures
 
-#: The hue of each start, and of each other tool's marks.
-STARTS = {"stereo": 0, "hull": 1, "points": 2, "sphere": 3}
+#: {initialisation: colour index}, and colour indices of other tools.
+INIT_COLOURS = {"stereo": 0, "hull": 1, "points": 2, "sphere": 3}
 PEER_COLOURS = (4, 5, 6)
 
 
 @dataclass(frozen=True)
 class Row:
-    """One mesh: how it was made, what that took, and how far it is from the truth; None where there is no such figure.
+    """One mesh: tool, settings, time, and error against the ground truth; None where there is no such figure.
 
-    `chamfer_pct` (% of the true diagonal), `fscore` (at 1 % of it, 0..1) and `normal_deg` are None when no mesh came out. `psnr` (dB) is
-    the surfels' on held-out photos at the profile's training size, so it compares within one profile only.
+    `start` is the initialisation of the surfels. `chamfer_pct` (% of the true diagonal), `fscore` (at 1 % of it, 0..1) and `normal_deg` are
+    None without a mesh. `psnr` (dB) is that of the surfels on held-out photos at the profile's training size: comparable within one profile
+    only.
     """
 
     capture: str
@@ -46,7 +47,7 @@ class Row:
 
     @property
     def series(self) -> tuple[str, str, str, str, str]:
-        """Rows that are measured together and replace each other in the CSV."""
+        """Key of rows that are measured together and replace each other in the CSV."""
         return self.capture, self.source, self.tool, self.profile, self.start
 
     @property
@@ -57,8 +58,8 @@ class Row:
     @property
     def name(self) -> str:
         """The row's label in charts and tables."""
-        made = f"{self.profile}, from {self.start}" if self.profile else self.tool
-        return f"{made} (quoted)" if self.source == "quoted" else made
+        label = f"{self.profile}, from {self.start}" if self.profile else self.tool
+        return f"{label} (quoted)" if self.source == "quoted" else label
 
 
 def read_csv(path: Path) -> list[Row]:
@@ -91,7 +92,7 @@ def merged(old: Iterable[Row], new: Sequence[Row]) -> list[Row]:
 
 
 def front(rows: Iterable[Row]) -> list[Row]:
-    """The rows of one capture that no other beats in both seconds and Chamfer distance, by rising seconds."""
+    """Pareto front of one capture in seconds and Chamfer distance, by rising seconds."""
     points: list[Point] = []
     meshed = []
     for row in rows:
@@ -126,7 +127,7 @@ def _series(rows: Sequence[Row], figure: str) -> list[Series]:
         points = [(r.seconds, value) for r in chosen if (value := getattr(r, figure)) is not None]
         if first.profile:
             style: Literal["line", "dash"] = "dash" if profiles.index(first.profile) % 2 else "line"
-            out.append(Series(first.name, points, STARTS.get(first.start, 6), style))
+            out.append(Series(first.name, points, INIT_COLOURS.get(first.start, 6), style))
         else:
             colour = PEER_COLOURS[peers.index(first.family) % len(PEER_COLOURS)]
             out.append(Series(first.name, points, colour, "markers", first.source == "quoted"))

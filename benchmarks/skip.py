@@ -1,16 +1,15 @@
-"""Time and error with each rule of `[skip]` on and off.
+"""Ablation of the rules of `[skip]`: time and error with each rule on and off.
 
-python -m benchmarks.skip CAPTURE [--profile preview] [--rules photos,converged] [--modes auto,never] [--reuse RUN] [--out DIR] [--csv FILE]
+python -m benchmarks.skip CAPTURE [--profile preview] [--rules resolution,specular] [--modes never] [--reuse RUN] [--out DIR] [--csv FILE]
 
-CAPTURE is a folder of photos, or `built-in` for `gsbake synth`'s own. The first run leaves every rule at auto; then one rule after the
-other is set to each of the other modes, in the same output folder, so that stages it does not touch come from the cache. `--reuse` puts
-the early stages (up to stereo) of a finished run of the same photos and profile there first; RUN itself is only read.
+CAPTURE is a folder of photos, or `built-in` for the capture of `gsbake synth`. The first run has every rule at auto; then each rule is set
+to each of the other modes, in the same output folder, so that unaffected stages are cached. `--reuse` copies the stages up to stereo of a
+finished run of the same photos and profile there first.
 
-Seconds are wall time, those of the stages' manifests, cached ones included: what the run would take from nothing. CPU seconds are of the
-processes of the stages, and of those only that ran here: what `--reuse` brought is in no row, so rows of one output folder compare.
-Where the capture has its truth the mesh is measured against it (`benchmarks.truth`); PSNR and bytes are those of the finished asset,
-as the report says. A mode that cannot be had (poses that are not there, photos without masks) is a line with the reason.
-Rows in the CSV of runs that are not made again stay.
+Seconds are wall time from the stages' manifests, cached stages included: the time of a run without cache. CPU seconds are those of the
+stages' processes that ran here; reused stages are in no row, so rows of one output folder are comparable. If the capture has ground truth,
+the mesh is compared with it (`benchmarks.truth`); PSNR and bytes are those of the asset, from the report. A mode that fails is a row with
+the reason. Rows of other runs in the CSV are kept.
 """
 
 from __future__ import annotations
@@ -36,15 +35,15 @@ from gsbake.pipeline.engine import Observer
 from gsbake.pipeline.plan import StageState
 
 RESULTS = ROOT / "benchmarks" / "results" / "skip.csv"
-#: Stages that `--reuse` takes from another run.
-EARLY = ("ingest", "poses", "stereo")
+#: Stages that `--reuse` copies from another run.
+REUSED_STAGES = ("ingest", "poses", "stereo")
 
 
 @dataclass(frozen=True)
 class Row:
-    """One run: the rule that was set, what was decided and why, whole time and quality; None where there is no such figure.
+    """One run: rule, decision and evidence, total time and quality; None where there is no such figure.
 
-    `said_s` is the time that the run itself claims to have saved by this rule.
+    `said_s` is the saved time in seconds that the run reports for this rule.
     """
 
     capture: str
@@ -63,7 +62,7 @@ class Row:
 
 
 class CpuClock(Observer):
-    """CPU seconds of each stage's process, by stage and key, kept in `file` for runs that find the stage in the cache."""
+    """CPU seconds of each stage's process, by stage and key, stored in `file` for runs in which the stage is cached."""
 
     def __init__(self, file: Path) -> None:
         self.file = file
@@ -71,17 +70,17 @@ class CpuClock(Observer):
         self._begun = 0.0
 
     def stage_started(self, state: StageState) -> None:
-        """Note what ended processes have taken so far."""
+        """Store the CPU time of ended processes."""
         self._begun = _children()
 
     def stage_finished(self, state: StageState) -> None:
-        """The difference is this stage's."""
+        """Store the difference as that of the stage."""
         self.spent[_stage_key(state)] = _children() - self._begun
         self.file.parent.mkdir(parents=True, exist_ok=True)
         self.file.write_text(json.dumps(self.spent, indent=1))
 
     def total(self, states: Sequence[StageState]) -> float:
-        """CPU seconds of those of the stages that ran under this clock."""
+        """CPU seconds of the stages that ran under this clock."""
         return sum(self.spent.get(_stage_key(state), 0.0) for state in states)
 
 
@@ -95,10 +94,8 @@ def _stage_key(state: StageState) -> str:
     return f"{state.name}/{state.artifact.folder.name}"
 
 
-def reuse(run: Path, out: Path, stages: Sequence[str] = EARLY) -> None:
-    """Copy `stages` of the finished `run` to the output folder `out`, those that it lacks.
-
-    Raises UsageError where `run` has none.
+def reuse(run: Path, out: Path, stages: Sequence[str] = REUSED_STAGES) -> None:
+    """Copy finished `stages` of `run` to the output folder `out` where missing. Raises UsageError when `run` has none.
     """
     found = [folder for stage in stages for folder in (run / "stages" / stage).glob("*") if (folder / "manifest.json").is_file()]
     if not found:
@@ -110,24 +107,24 @@ def reuse(run: Path, out: Path, stages: Sequence[str] = EARLY) -> None:
 
 
 def measure_run(folder: Path, profile: str, rule: str, mode: str, out: Path, threads: int) -> Row:
-    """Run everything with one rule set, or take what is cached, and measure it."""
+    """Run all stages (or use cached ones) with one rule set, and measure the result."""
     overrides = [f"{SKIP_PREFIX}{rule}={mode}"] if rule else []
     options = RunOptions(photos=folder, out=out, profile=profile, overrides=overrides, device="cpu", threads=threads)
     clock = CpuClock(out / "cpu.json")
     try:
         states = open_session(options, clock).engine.run("report")
     except BadInputError as error:
-        return Row(folder.name, profile, rule, mode, "cannot be had", str(error))
+        return Row(folder.name, profile, rule, mode, "failed", str(error))
     done = manifests(states)
     folders = {s.name: s.artifact.folder for s in states if s.artifact is not None}
     mine = [d for m in done.values() for d in m["decisions"] if d["what"] == SKIP_PREFIX + rule]
-    said = [d["saved_s"] for d in mine if "saved_s" in d]
+    saved = [d["saved_s"] for d in mine if "saved_s" in d]
     figures = None
     try:
         read_truth(folder)
         figures = measure_stage(folders["mesh"] / "mesh.ply", folders["poses"], folder)
     except UsageError as error:
-        sys.stderr.write(f"{folder.name}: not measured against a truth: {error}\n")
+        sys.stderr.write(f"{folder.name}: not compared with ground truth: {error}\n")
     return Row(
         capture=folder.name,
         profile=profile,
@@ -135,7 +132,7 @@ def measure_run(folder: Path, profile: str, rule: str, mode: str, out: Path, thr
         mode=mode,
         choice="; ".join(d["choice"] for d in mine),
         evidence="; ".join(d["evidence"] for d in mine),
-        said_s=sum(said) if said else None,
+        said_s=sum(saved) if saved else None,
         seconds=sum(m["seconds"] for m in done.values()),
         cpu_s=clock.total(states),
         chamfer_pct=figures.chamfer_pct if figures else None,
@@ -146,7 +143,7 @@ def measure_run(folder: Path, profile: str, rule: str, mode: str, out: Path, thr
 
 
 def show(row: Row) -> None:
-    """One line on the screen."""
+    """Print a row."""
 
     def text(value: float | None, form: str) -> str:
         return "–" if value is None else format(value, form)
@@ -158,7 +155,7 @@ def show(row: Row) -> None:
 
 
 def write(path: Path, rows: Sequence[Any], digits: int = 4) -> None:
-    """Write dataclass rows of one kind, whose first four columns say which run each is; others that the file holds stay before them."""
+    """Write dataclass rows; the first four columns are their key. Other rows of the file are kept before them."""
     table = [{k: round(v, digits) if isinstance(v, float) else v for k, v in asdict(row).items()} for row in rows]
     columns = list(table[0])
     again = {tuple(line[column] for column in columns[:4]) for line in table}
@@ -174,15 +171,15 @@ def write(path: Path, rows: Sequence[Any], digits: int = 4) -> None:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run, print as it goes, and write the CSV after every row."""
+    """Run, print every row, and write the CSV after each."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("capture")
     parser.add_argument("--profile", default="preview")
     parser.add_argument("--rules", type=names, default=list(Skip.model_fields))
     parser.add_argument("--modes", type=names, default=["never"], help="besides auto: never, always")
     parser.add_argument("--threads", type=int, default=0, help="0: the physical cores")
-    parser.add_argument("--reuse", type=Path, help="a finished run of the same photos and profile, whose early stages are taken")
-    parser.add_argument("--out", type=Path, default=ROOT / "out" / "bench" / "skip", help="where the runs are kept")
+    parser.add_argument("--reuse", type=Path, help="finished run of the same photos and profile, whose early stages are copied")
+    parser.add_argument("--out", type=Path, default=ROOT / "out" / "bench" / "skip", help="folder of the runs")
     parser.add_argument("--csv", type=Path, default=RESULTS)
     args = parser.parse_args(arguments)
     if unknown := set(args.rules) - set(Skip.model_fields):

@@ -1,9 +1,9 @@
-"""What a training step is made of: milliseconds of the rasteriser's kernels, of the shading, and of the rest, part by part.
+"""Time of a training step by part: the rasteriser's kernels, the shading and the rest, in milliseconds.
 
 python -m benchmarks.step [--materials] [--surfels 50000] [--size 512] [--threads 1]
 
-The step is the trainer's own in the middle of a run (full resolution, all losses on), on one photo of noise with a full mask, of the sphere
-of `benchmarks.raster`. Parts are timed where they are called: CPU time with one thread, wall time with more. Given are medians; `kernels`
+The step is that of `Trainer` in the middle of a run (full resolution, all losses), on one photo of noise with a full mask and the sphere of
+`benchmarks.raster`. Parts are timed where they are called: CPU time with one thread, wall time with more. Results are medians; `kernels`
 is blending forward and backward with binning and the sum over slots, `rest` is the step without kernels and shading.
 """
 
@@ -41,7 +41,7 @@ from gsbake.surfels.training import adam
 from gsbake.surfels.training.trainer import Plan, Trainer
 from gsbake.surfels.training.views import TrainView
 
-#: Name in the table, where it is looked up, under which name.
+#: Name in the table, owner and attribute of the timed function.
 KERNELS = (("blend forward", raster._Blend, "forward"), ("blend backward", raster._Blend, "backward"))
 SHADING = (("shading forward", light_kernels, "forward"), ("shading backward", light_kernels, "backward"))
 REST = (
@@ -86,8 +86,8 @@ def trainer(surfels: int, size: int, materials: bool) -> Trainer:
 
 @contextmanager
 def timed(clock: Callable[[], float], spent: dict[str, float]) -> Iterator[None]:
-    """Add up in `spent` the seconds of every part while the context lasts."""
-    kept: list[tuple[Any, str, Any]] = []
+    """Add up in `spent` the seconds of every part inside the context."""
+    originals: list[tuple[Any, str, Any]] = []
     for name, owner, attribute in (*KERNELS, *SHADING, *REST):
         inner = getattr(owner, attribute)
 
@@ -98,14 +98,14 @@ def timed(clock: Callable[[], float], spent: dict[str, float]) -> Iterator[None]
             finally:
                 spent[_name] = spent.get(_name, 0.0) + clock() - start
 
-        kept.append((owner, attribute, owner.__dict__[attribute]))
-        static = isinstance(kept[-1][2], staticmethod)
+        originals.append((owner, attribute, owner.__dict__[attribute]))
+        static = isinstance(originals[-1][2], staticmethod)
         setattr(owner, attribute, staticmethod(call) if static else call)
     try:
         yield
     finally:
-        for owner, attribute, was in kept:
-            setattr(owner, attribute, was)
+        for owner, attribute, original in originals:
+            setattr(owner, attribute, original)
 
 
 def profile(surfels: int, size: int, materials: bool, repeats: int) -> dict[str, float]:
@@ -133,7 +133,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--surfels", type=int, default=50_000)
     parser.add_argument("--size", type=int, default=512)
-    parser.add_argument("--materials", action="store_true", help="materials under a light instead of colours")
+    parser.add_argument("--materials", action="store_true", help="PBR shading instead of colours")
     parser.add_argument("--repeats", type=int, default=11)
     parser.add_argument("--threads", type=int, default=thread_count())
     args = parser.parse_args()

@@ -1,15 +1,15 @@
-"""One table of what a training step costs: forward, backward and the whole step over sizes, and ratios that carry over between machines.
+"""Table of kernel times: forward, backward and a training iteration over sizes, and machine-independent ratios.
 
 python -m benchmarks.table [--surfels 10000,50000,200000] [--sizes 256,512,800] [--channels 3,10] [--csv benchmarks/results/raster.csv]
 
 Every time is the median of a few rounds, in milliseconds: CPU time with one thread, wall time with more. `x copy` is its ratio to a plain
-numpy copy of the bytes that the pass reads and writes at the least (surfels, planes, gradients; the optimiser's state in a step). The
-PyTorch twin blends one surfel after the other over whole images, so it is only asked for a small scene of its own, the first rows
-(`x twin`: the twin's time over ours).
+numpy copy of the minimum bytes that the pass reads and writes (surfels, planes, gradients; the optimiser's state in a step). The PyTorch
+reference blends one surfel after the other over whole images, so it is timed on a small scene only, the first rows (`x twin`: its time over
+that of the kernels).
 
-The step is the trainer's own on one photo, in the middle of a run (full resolution, all losses on; see `benchmarks.step`): with the
-smallest channel count it trains colours (3 channels and the normal), with a larger one materials under an environment light (5 and the
-normal). `rest` is what of it is neither blending nor shading.
+The step is a training iteration on one photo, in the middle of a run (full resolution, all losses; see `benchmarks.step`): with the
+smallest channel count it trains colours (3 channels and the normal), with a larger one materials under an environment map (5 and the
+normal). `rest` is the time of neither rasterisation nor shading.
 """
 
 from __future__ import annotations
@@ -36,17 +36,17 @@ SMALL = (500, 64, 3)
 
 
 def now() -> float:
-    """Seconds: of this process with one thread (others may share the processor), of the wall with more."""
+    """Seconds: CPU time with one thread (the processor may be shared), wall time with more."""
     return time.process_time() if thread_count() == 1 else time.perf_counter()
 
 
 def median_ms(call: Callable[[], float], repeats: int) -> float:
-    """Median of what `call` measured, in milliseconds, after two rounds to warm up."""
+    """Median in milliseconds of the seconds that `call` returns, after two warm-up rounds."""
     return statistics.median([1e3 * call() for _ in range(repeats + 2)][2:])
 
 
 def copy_ms(size: int, repeats: int) -> float:
-    """Milliseconds of a numpy copy of this many bytes."""
+    """Milliseconds of a numpy copy of `size` bytes."""
     source, target = np.ones(size // 4, np.float32), np.zeros(size // 4, np.float32)
 
     def once() -> float:
@@ -57,14 +57,14 @@ def copy_ms(size: int, repeats: int) -> float:
     return median_ms(once, max(9, repeats))
 
 
-def passes(surfels: int, size: int, channels: int, repeats: int, twin: bool = False) -> tuple[float, float]:
-    """Milliseconds of forward and of backward on the sphere of `benchmarks.raster`, of the kernels or of the twin."""
+def passes(surfels: int, size: int, channels: int, repeats: int, reference: bool = False) -> tuple[float, float]:
+    """Milliseconds of forward and backward on the sphere of `benchmarks.raster`, of the kernels or the PyTorch reference."""
     inputs, pinhole, rotation, translation = sphere(surfels, channels, size)
     inputs = [x.requires_grad_() for x in inputs]
     forward, backward = [], []
     for _ in range(repeats + 1):
         start = now()
-        if twin:
+        if reference:
             planes = render_reference(*inputs, rotation, translation, pinhole)
         else:
             out = render(*inputs, rotation, translation, pinhole, normals_as_features=False)
@@ -80,21 +80,21 @@ def passes(surfels: int, size: int, channels: int, repeats: int, twin: bool = Fa
 
 
 def state_floats(surfels: int, materials: bool) -> int:
-    """Floats that a training step optimises: position, quaternion, two scales, SDF, and 4 harmonics of 3 colours or 5 of a material."""
+    """Optimised floats: position, quaternion, two scales, SDF sample, and 4 spherical harmonics of 3 colours or 5 material channels."""
     return surfels * (10 + (5 if materials else 12)) + 1
 
 
-def least_bytes(surfels: int, size: int, channels: int) -> tuple[int, int]:
-    """Bytes that forward and backward read or write at the least: surfels, output planes, their gradients."""
+def min_bytes(surfels: int, size: int, channels: int) -> tuple[int, int]:
+    """Minimum bytes that forward and backward read or write: surfels, output planes, their gradients."""
     surfel, pixels = 4 * surfels * (10 + channels), 4 * size * size
     return surfel + pixels * (channels + 6), 2 * surfel + pixels * (2 * channels + 9)
 
 
 def rows(surfels: int, size: int, channels: int, materials: bool, repeats: int) -> list[dict[str, object]]:
-    """The rows of one cell of the table."""
+    """The rows of one combination of sizes."""
     forward, backward = passes(surfels, size, channels, repeats)
     step = profile(surfels, size, materials, repeats)
-    read, back = least_bytes(surfels, size, channels)
+    read, back = min_bytes(surfels, size, channels)
     cell = {"surfels": surfels, "size": size, "channels": channels, "x_twin": "", "threads": thread_count()}
     all_ = read + back + 16 * state_floats(surfels, materials)
     figures = (("forward", forward, read), ("backward", backward, back), ("step", step["step"], all_))
@@ -103,11 +103,11 @@ def rows(surfels: int, size: int, channels: int, materials: bool, repeats: int) 
 
 
 def small_rows() -> list[dict[str, object]]:
-    """The small scene with the twin's time beside ours."""
-    ours, twin = passes(*SMALL, repeats=9), passes(*SMALL, repeats=2, twin=True)
+    """Rows of the small scene, with the ratio to the PyTorch reference."""
+    ours, reference = passes(*SMALL, repeats=9), passes(*SMALL, repeats=2, reference=True)
     cell = {"surfels": SMALL[0], "size": SMALL[1], "channels": SMALL[2], "threads": thread_count()}
     made = []
-    for name, ms, slow, size in zip(("forward", "backward"), ours, twin, least_bytes(*SMALL), strict=True):
+    for name, ms, slow, size in zip(("forward", "backward"), ours, reference, min_bytes(*SMALL), strict=True):
         made.append(cell | {"pass": name, "ms": round(ms, 2), "x_copy": round(ms / copy_ms(size, 9), 1), "x_twin": round(slow / ms, 1)})
     return made
 
@@ -118,7 +118,7 @@ def line(row: dict[str, object]) -> str:
 
 
 def main() -> None:
-    """Measure, print as it goes, write the CSV."""
+    """Measure, print every row, write the CSV."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     for name, values in (("surfels", "10000,50000,200000"), ("sizes", "256,512,800"), ("channels", "3,10")):
         parser.add_argument(f"--{name}", type=lambda s: [int(v) for v in s.split(",")], default=[int(v) for v in values.split(",")])

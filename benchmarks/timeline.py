@@ -1,17 +1,17 @@
-"""Error against time: how near to the truth the mesh is after how many seconds, by capture, profile and start of the surfels.
+"""Error against time: error of the mesh over seconds, by capture, profile and initialisation of the surfels.
 
 python -m benchmarks.timeline [--captures boombox,avocado] [--profiles preview,relight] [--starts stereo,hull,points,sphere]
     [--shares 0,0.05,0.15,0.5,1] [--no-peers] [--threads 2]
 
-A checkpoint is a bake of its own up to the mesh with a share of the profile's training and refining steps, because the schedule scales
-with them. All share the stages they have in common (photos, cameras, stereo), whose recorded seconds count in every checkpoint. Starts
-other than stereo leave the stereo stage out (`stereo.enabled = never`), its seconds and its depths with it: what the start itself costs
-and gives. Where a start cannot be had (no masks, too few points) it is left out, with a sentence.
+A checkpoint is a separate bake up to the mesh with a share of the profile's training and refinement iterations, because the schedules scale
+with them. Checkpoints share common stages (ingest, poses, stereo), whose recorded seconds count in each. Initialisations other than stereo
+skip the stereo stage (`stereo.enabled = never`) with its seconds and depths. An initialisation that is not available (no masks, too few
+points) is skipped with a message.
 
-Captures with a truth are looked for in $GSBAKE_CAPTURES, else in ../shared/captures; `built-in` is `gsbake synth`'s own. Other tools run
-beside gsbake where they are installed (`benchmarks.peers`); what is only quoted from a published table says so. Writes
-benchmarks/results/timeline.csv and docs/benchmarks/error-time-<capture>.svg, and prints the Pareto front. Finished checkpoints are kept
-in --out and not run again.
+Captures with ground truth are in $GSBAKE_CAPTURES, else in ../shared/captures; `built-in` is that of `gsbake synth`. Other tools run where
+they are installed (`benchmarks.peers`); figures of published tables are marked as quoted. Writes
+benchmarks/results/timeline.csv and docs/lab/error-time-<capture>.svg, and prints the Pareto front. Finished checkpoints
+in --out are reused.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks import peers
-from benchmarks.rows import STARTS, Row, draw, markdown, merged, read_csv, text, write_csv
+from benchmarks.rows import INIT_COLOURS, Row, draw, markdown, merged, read_csv, text, write_csv
 from benchmarks.truth import measure_stage, read_truth
 from gsbake.api import RunOptions, Session, open_session
 from gsbake.config.load import load_profile
@@ -35,13 +35,13 @@ from gsbake.pipeline.plan import StageState
 ROOT = Path(__file__).resolve().parents[1]
 CAPTURES = Path(os.environ.get("GSBAKE_CAPTURES", ROOT.parent / "shared" / "captures"))
 RESULTS = ROOT / "benchmarks" / "results" / "timeline.csv"
-CHARTS = ROOT / "docs" / "benchmarks"
+CHARTS = ROOT / "docs" / "lab"
 BUILT_IN = "built-in"
 
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """One bake up to the mesh: a capture's name and folder, a profile, a start, and the share of the profile's steps."""
+    """One bake up to the mesh: capture, profile, initialisation (`start`), and the share of the profile's iterations."""
 
     capture: str
     folder: Path
@@ -50,7 +50,7 @@ class Checkpoint:
     share: float
 
     def open(self, out: Path, threads: int) -> Session:
-        """The engine for it, on the store of its capture."""
+        """Session of the bake, in the output folder of its capture."""
         settings = load_profile(self.profile).profile
         overrides = [
             f"train.iterations={round(self.share * settings.train.iterations)}",
@@ -65,7 +65,7 @@ class Checkpoint:
 
 
 def find_capture(name: str, out: Path) -> Path:
-    """The folder of a capture; the built-in one is written where it is missing. Raises UsageError where there is none or no truth."""
+    """Folder of a capture; the built-in one is created if missing. Raises UsageError without the capture or its ground truth."""
     folder = CAPTURES / name
     if name == BUILT_IN:
         folder = out / "built-in-capture"
@@ -74,33 +74,33 @@ def find_capture(name: str, out: Path) -> Path:
 
             write_capture(folder)
     elif not folder.is_dir():
-        raise UsageError(f"{folder} is not here; say with GSBAKE_CAPTURES where the captures are.")
+        raise UsageError(f"{folder} does not exist; set GSBAKE_CAPTURES to the folder of the captures.")
     read_truth(folder)
     return folder
 
 
 def manifests(states: Sequence[StageState]) -> dict[str, dict[str, Any]]:
-    """The manifests of the stages that are finished, by name."""
+    """{stage: manifest} of the finished stages."""
     return {s.name: dict(s.artifact.manifest) for s in states if s.artifact is not None}
 
 
 def run_checkpoint(point: Checkpoint, out: Path, threads: int) -> Row:
-    """Bake up to the mesh, or take what is there, and measure it; a row without figures when no surface came out.
+    """Bake up to the mesh (or use cached stages) and measure it; a row without figures when meshing failed.
 
-    Raises UsageError when the surfels could not start as asked, or not be trained.
+    Raises UsageError when the initialisation is not available, or training failed.
     """
     engine = point.open(out, threads).engine
     try:
         states = engine.run("mesh")
     except BadInputError as error:
         states = engine.plan("mesh")
-        if states[-2].artifact is None:  # it failed before the mesh
+        if states[-2].artifact is None:  # a stage before the mesh failed
             raise UsageError(str(error)) from error
     folders = {s.name: s.artifact.folder for s in states if s.artifact is not None}
     done = manifests(states)
-    started = next(d for d in done["train"]["decisions"] if d["what"] == "surfels start from")
-    if started["choice"] != point.start:
-        raise UsageError(f"they start from {started['choice']} instead ({started['evidence']}).")
+    chosen = next(d for d in done["train"]["decisions"] if d["what"] == "initialisation")
+    if chosen["choice"] != point.start:
+        raise UsageError(f"the initialisation was {chosen['choice']} ({chosen['evidence']}).")
     row = Row(
         capture=point.capture,
         tool="gsbake",
@@ -117,13 +117,13 @@ def run_checkpoint(point: Checkpoint, out: Path, threads: int) -> Row:
 
 
 def run_series(capture: str, folder: Path, profile: str, start: str, shares: Sequence[float], out: Path, threads: int) -> list[Row]:
-    """The checkpoints of one line of the chart; none, with a sentence, when the surfels cannot start that way."""
+    """Checkpoints of one curve; none, with a message, when the initialisation is not available."""
     rows: list[Row] = []
     for share in shares:
         try:
             row = run_checkpoint(Checkpoint(capture, folder, profile, start, share), out, threads)
         except UsageError as error:
-            sys.stdout.write(f"{capture}, {profile}, from {start}: left out; {error}\n")
+            sys.stdout.write(f"{capture}, {profile}, from {start}: skipped; {error}\n")
             return []
         rows.append(row)
         report(row)
@@ -131,7 +131,7 @@ def run_series(capture: str, folder: Path, profile: str, start: str, shares: Seq
 
 
 def report(row: Row) -> None:
-    """One line on the screen for a finished row."""
+    """Print a finished row."""
     figures = f"Chamfer {text(row.chamfer_pct, '.3f')} %  F {text(row.fscore, '.3f')}  normal {text(row.normal_deg, '.1f')}°"
     spent = f"{text(row.steps, 'd'):>6} steps {row.seconds:8.1f} s"
     sys.stdout.write(f"{row.capture:10} {row.name:32} {spent}  {figures}  PSNR {text(row.psnr, '.2f')} dB\n")
@@ -139,7 +139,7 @@ def report(row: Row) -> None:
 
 
 def run_peers(name: str, folder: Path, out: Path, threads: int) -> list[Row]:
-    """What other tools make of the capture: measured where they are installed, and what is quoted."""
+    """Rows of other tools: measured where they are installed, and quoted ones."""
     rows = [row for row in peers.QUOTED if row.capture == name]
     rows += peers.run_pyarchinit(name, folder, out / name / "pyarchinit")
     if peers.has_openmvs():
@@ -154,25 +154,25 @@ def run_peers(name: str, folder: Path, out: Path, threads: int) -> list[Row]:
 
 
 def numbers(text: str) -> list[float]:
-    """Comma-separated shares."""
+    """Parse comma-separated shares."""
     return [float(v) for v in text.split(",")]
 
 
 def names(text: str) -> list[str]:
-    """Comma-separated names."""
+    """Parse comma-separated names."""
     return [v for v in text.split(",") if v]
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Measure, print as it goes, write CSV and charts after every line, and print the Pareto front."""
+    """Measure, print every row, write CSV and charts, and print the Pareto front."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--captures", type=names, default=["boombox", "avocado"])
     parser.add_argument("--profiles", type=names, default=["preview", "relight"])
-    parser.add_argument("--starts", type=names, default=list(STARTS))
+    parser.add_argument("--starts", type=names, default=list(INIT_COLOURS))
     parser.add_argument("--shares", type=numbers, default=[0.0, 0.05, 0.15, 0.5, 1.0])
-    parser.add_argument("--no-peers", action="store_true", help="leave the other tools out")
+    parser.add_argument("--no-peers", action="store_true", help="skip the other tools")
     parser.add_argument("--threads", type=int, default=0, help="0: the physical cores")
-    parser.add_argument("--out", type=Path, default=ROOT / "out" / "bench" / "timeline", help="where the checkpoints are kept")
+    parser.add_argument("--out", type=Path, default=ROOT / "out" / "bench" / "timeline", help="folder of the checkpoints")
     parser.add_argument("--csv", type=Path, default=RESULTS)
     parser.add_argument("--charts", type=Path, default=CHARTS, help="folder of the charts")
     args = parser.parse_args(arguments)
@@ -187,7 +187,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         try:
             folder = find_capture(name, args.out)
         except UsageError as error:
-            sys.stdout.write(f"{name}: left out; {error}\n")
+            sys.stdout.write(f"{name}: skipped; {error}\n")
             continue
         for profile in args.profiles:
             for start in args.starts:

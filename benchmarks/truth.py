@@ -1,16 +1,15 @@
-"""How far a mesh is from the true one: Chamfer distance, F-score and normal error on what the cameras saw.
+"""Error of a mesh against ground truth: Chamfer distance, F-score and normal error on the visible surface.
 
 python -m benchmarks.truth CAPTURE MESH [--cameras cameras.json] [--json]
 
-CAPTURE holds the truth in `gt/` (`asset.glb`, and `train.json` with the true cameras) or, written by `gsbake synth`, in
-`truth/`. MESH is a GLB in the asset's frame or a PLY in the Z-up world frame. With `--cameras` (the `cameras.json` beside the
-asset) the mesh is first laid on the truth by its cameras and then by iterated closest points, as it has to be when the photos
-came without poses.
+CAPTURE has the ground truth in `gt/` (`asset.glb`, and `train.json` with the true cameras) or, written by `gsbake synth`, in `truth/`. MESH
+is a GLB in the asset's frame or a PLY in the Z-up world frame. With `--cameras` (the `cameras.json` beside the asset) the mesh is aligned
+with the ground truth by its cameras and then by iterative closest points, which is necessary for photos without poses.
 
-The measures are those of point-sampled surface benchmarks (Seitz et al. 2006; Knapitsch et al. 2017): points spread evenly over
-the part of either surface that two cameras see unobstructed, each measured to the nearest point of the other surface, all of it,
-in % of the diagonal of the true bounding box. Chamfer is the mean of the two mean distances, the F-score counts distances below
-1 %, and the normal error is the mean angle between a point's face and the face nearest to it, both ways.
+The measures are those of point-sampled surface benchmarks (Seitz et al. 2006; Knapitsch et al. 2017): points spread evenly over the part of
+either surface that two cameras see unobstructed, with their distances to the whole other surface, in % of the diagonal of the true bounding
+box. Chamfer is the mean of the two mean distances, the F-score counts distances below 1 %, and the normal error is the mean angle between
+the face of a point and the nearest face, in both directions.
 """
 
 from __future__ import annotations
@@ -34,27 +33,27 @@ from gsbake.geometry.raycast import RayCaster
 
 Array = NDArray[np.float64]
 
-#: Points measured from, before those that no two cameras see are dropped.
-QUERIES = 60_000
-#: Points that find the candidates for the nearest face, and how many candidates are tried.
-ANCHORS, CANDIDATES = 300_000, 6
-#: Points of the mesh, and of the truth, by which the one is laid on the other.
-LAID = (20_000, 100_000)
-#: Triples of cameras that are tried to find the frame.
-TRIPLES = 200
-#: A camera sees a point only if the angle between the normal and the ray is below acos of this.
+#: Points per surface, before those visible in fewer than two cameras are dropped.
+SAMPLE_COUNT = 60_000
+#: Points whose faces are candidates for the nearest face, and candidates per query.
+ANCHOR_COUNT, CANDIDATE_COUNT = 300_000, 6
+#: Points of the mesh and of the ground truth for the alignment.
+ALIGNMENT_POINTS = (20_000, 100_000)
+#: Random triples of cameras for the least median of squares fit.
+TRIPLE_COUNT = 200
+#: Minimum cosine between the normal and the direction to the camera of a visible point.
 MIN_FACING = 0.15
-#: Distances below this share of the true diagonal count for the F-score.
-CLOSE = 0.01
-#: Rays start this share of the diagonal off the surface, so that they do not hit the face they leave.
-LIFT = 1e-3
+#: Threshold of the F-score as a share of the true diagonal.
+FSCORE_THRESHOLD = 0.01
+#: Offset of ray origins from the surface as a share of the diagonal, against self-intersection.
+RAY_OFFSET = 1e-3
 #: Rotation from glTF's +Y up to the Z-up world.
 Z_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 
 
 @dataclass(frozen=True)
 class Figures:
-    """A mesh against the truth: distances in % of the true diagonal, the F-score at 1 % of it (0..1), the angle in degrees."""
+    """Error of a mesh: distances in % of the true diagonal, F-score at 1 % of it (0..1), angle in degrees."""
 
     accuracy_pct: float
     completeness_pct: float
@@ -76,8 +75,8 @@ class Surface:
         return self.vertices[self.faces]
 
     @cached_property
-    def crossed(self) -> Array:
-        """Normals of the faces (f, 3) whose length is twice the area."""
+    def area_normals(self) -> Array:
+        """Face normals (f, 3) with twice the area as length."""
         a, b, c = self.corners.transpose(1, 0, 2)
         return np.cross(b - a, c - a)
 
@@ -94,30 +93,30 @@ class Surface:
     def sample(self, count: int, seed: int) -> tuple[Array, NDArray[np.int64]]:
         """`count` points (n, 3) spread evenly over the area, and the face that each lies on (n,)."""
         draw = np.random.default_rng(seed)
-        area = np.linalg.norm(self.crossed, axis=1)
+        area = np.linalg.norm(self.area_normals, axis=1)
         face = draw.choice(len(self.faces), count, p=area / area.sum())
         u, v = np.sqrt(draw.random(count)), draw.random(count)
         weights = np.stack([1 - u, u * (1 - v), u * v], 1)
         return np.einsum("nk,nkc->nc", weights, self.corners[face]), face
 
     def normals(self, face: NDArray[np.int64]) -> Array:
-        """Unit normals (n, 3) of the named faces (n,)."""
-        crossed = self.crossed[face]
-        return crossed / np.maximum(np.linalg.norm(crossed, axis=1, keepdims=True), 1e-300)
+        """Unit normals (n, 3) of the faces with indices `face` (n,)."""
+        area_normals = self.area_normals[face]
+        return area_normals / np.maximum(np.linalg.norm(area_normals, axis=1, keepdims=True), 1e-300)
 
 
 @dataclass(frozen=True)
 class Truth:
-    """The true surface and the true centres of the photos' cameras by name (the file's stem), in the world frame."""
+    """Ground truth in the world frame: surface, and camera centres (3,) by photo name (the file's stem)."""
 
     surface: Surface
     centres: Mapping[str, Array]
 
 
 def read_mesh(path: Path) -> Surface:
-    """A GLB (turned from glTF's frame) or PLY (taken as it is) as one surface in the Z-up frame.
+    """A GLB (rotated from glTF's frame) or PLY (unchanged) as one surface in the Z-up frame.
 
-    Raises UsageError when there is no such file or it holds no triangle.
+    Raises UsageError without the file or without triangles in it.
     """
     import trimesh
 
@@ -125,13 +124,13 @@ def read_mesh(path: Path) -> Surface:
         raise UsageError(f"There is no mesh {path}.")
     mesh = trimesh.load(path, force="mesh", process=False)
     if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
-        raise UsageError(f"{path} holds no triangles; give a GLB or PLY mesh.")
+        raise UsageError(f"{path} has no triangles; give a GLB or PLY mesh.")
     vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
     return Surface(vertices @ Z_UP.T if path.suffix.lower() in (".glb", ".gltf") else vertices, faces)
 
 
 def read_truth(capture: Path) -> Truth:
-    """The truth of a capture; raises UsageError where there is none."""
+    """Ground truth of a capture. Raises UsageError without it."""
     shared, built_in = capture / "gt", capture / "truth"
     if (shared / "asset.glb").is_file() and (shared / "train.json").is_file():
         body = json.loads((shared / "train.json").read_text())
@@ -140,11 +139,11 @@ def read_truth(capture: Path) -> Truth:
     if (built_in / "mesh.ply").is_file():
         cameras = CameraSet.load(built_in / "cameras.json").cameras
         return Truth(read_mesh(built_in / "mesh.ply"), {c.name: c.centre for c in cameras})
-    raise UsageError(f"{capture} has no truth to measure against: neither gt/asset.glb with gt/train.json nor truth/mesh.ply.")
+    raise UsageError(f"{capture} has no ground truth: neither gt/asset.glb with gt/train.json nor truth/mesh.ply.")
 
 
 def read_centres(path: Path) -> dict[str, Array]:
-    """Camera centres (3,) by name from a `cameras.json`: of the asset (turned to Z-up) or a `CameraSet` (taken to the world)."""
+    """Camera centres (3,) by name from a `cameras.json`: of the asset (rotated to Z-up) or of a `CameraSet` (in the world frame)."""
     body = json.loads(path.read_text())
     if "frames" in body:
         return {Path(f["file_path"]).stem: Z_UP @ np.array(f["transform_matrix"], float)[:3, 3] for f in body["frames"]}
@@ -153,7 +152,7 @@ def read_centres(path: Path) -> dict[str, Array]:
 
 
 def fit_similarity(source: Array, target: Array) -> Similarity:
-    """The similarity that takes `source` (n, 3) nearest to `target` (n, 3) in least squares (Umeyama 1991)."""
+    """Least-squares similarity from `source` (n, 3) to `target` (n, 3) (Umeyama 1991)."""
     mean_s, mean_t = source.mean(0), target.mean(0)
     left, spread, right = np.linalg.svd((target - mean_t).T @ (source - mean_s))
     handed = np.array([1.0, 1.0, np.sign(np.linalg.det(left @ right))])
@@ -163,35 +162,35 @@ def fit_similarity(source: Array, target: Array) -> Similarity:
 
 
 def fit_robustly(source: Array, target: Array) -> Similarity:
-    """The similarity of matched points (n, 3), n ≥ 3, of which some are far off: cameras that were solved wrongly.
+    """Similarity between matched points (n, 3), n ≥ 3, with outliers (wrong camera poses).
 
-    Of fits to random triples, the one with the least median error (Rousseeuw 1984); then fits to the points that it explains.
+    Least median of squares over random triples (Rousseeuw 1984), then least squares over the inliers.
     """
 
-    def off(frame: Similarity) -> Array:
+    def residuals(frame: Similarity) -> Array:
         return np.asarray(np.linalg.norm(frame.apply(source) - target, axis=1))
 
     draw = np.random.default_rng(0)
-    triples = [draw.choice(len(source), 3, replace=False) for _ in range(TRIPLES)]
-    frame = min((fit_similarity(source[t], target[t]) for t in triples), key=lambda f: float(np.median(off(f))))
+    triples = [draw.choice(len(source), 3, replace=False) for _ in range(TRIPLE_COUNT)]
+    frame = min((fit_similarity(source[t], target[t]) for t in triples), key=lambda f: float(np.median(residuals(f))))
     for _ in range(3):
-        good = off(frame) <= max(3 * float(np.median(off(frame))), 1e-9)
+        good = residuals(frame) <= max(3 * float(np.median(residuals(frame))), 1e-9)
         frame = fit_similarity(source[good], target[good])
     return frame
 
 
 def align(surface: Surface, centres: Mapping[str, Array], truth: Truth) -> Similarity:
-    """The map of a reconstruction onto the truth: by its cameras' `centres`, then similarity ICP on ever fewer far points.
+    """Similarity from a reconstruction to the ground truth: from camera `centres`, then ICP with a shrinking distance threshold.
 
     Raises UsageError when fewer than three cameras match by name.
     """
     names = sorted(centres.keys() & truth.centres.keys())
     if len(names) < 3:
-        raise UsageError(f"{len(names)} of the {len(truth.centres)} true cameras were found by name; laying the mesh on the truth takes 3.")
+        raise UsageError(f"{len(names)} of the {len(truth.centres)} true cameras were found by name; the alignment takes 3.")
     frame = fit_robustly(np.array([centres[n] for n in names]), np.array([truth.centres[n] for n in names]))
     reach = 0.05 * truth.surface.diagonal
-    points = surface.sample(LAID[0], 5)[0]
-    anchors = truth.surface.sample(LAID[1], 6)[0]
+    points = surface.sample(ALIGNMENT_POINTS[0], 5)[0]
+    anchors = truth.surface.sample(ALIGNMENT_POINTS[1], 6)[0]
     tree = cKDTree(anchors)
     for _ in range(30):
         far, nearest = tree.query(frame.apply(points))
@@ -201,8 +200,8 @@ def align(surface: Surface, centres: Mapping[str, Array], truth: Truth) -> Simil
     return frame
 
 
-def seen(surface: Surface, points: Array, normals: Array, centres: Array, lift: float) -> NDArray[np.bool_]:
-    """Which points (n,) on the surface at least two camera centres (m, 3) face with nothing of the surface in between."""
+def visible(surface: Surface, points: Array, normals: Array, centres: Array, lift: float) -> NDArray[np.bool_]:
+    """Which points (n,) on the surface are visible from at least two camera centres (m, 3)."""
     caster = RayCaster(surface.vertices, surface.faces)
     count = np.zeros(len(points), int)
     for centre in centres:
@@ -217,8 +216,8 @@ def seen(surface: Surface, points: Array, normals: Array, centres: Array, lift: 
 def nearest_on_faces(points: Array, corners: Array) -> Array:
     """The nearest point (n, 3) of each triangle (n, 3, 3) to its point (n, 3).
 
-    The foot of the perpendicular where it falls inside the triangle (barycentric coordinates all positive), else the nearest of the feet on
-    the three edges.
+    The orthogonal projection where it lies inside the triangle (barycentric coordinates all positive), else the nearest projection to the
+    three edges.
     """
     a, b, c = corners.transpose(1, 0, 2)
     ab, ac, ap = b - a, c - a, points - a
@@ -241,36 +240,36 @@ def nearest_on_faces(points: Array, corners: Array) -> Array:
 
 
 def nearest(points: Array, surface: Surface, seed: int) -> tuple[Array, NDArray[np.int64]]:
-    """Distance (n,) of points (n, 3) to the surface and the nearest face (n,), among the faces under the nearest anchor points."""
-    anchors, faces = surface.sample(ANCHORS, seed)
-    candidates = faces[cKDTree(anchors).query(points, k=CANDIDATES)[1]]
+    """Distance (n,) of points (n, 3) to the surface and the nearest face (n,), among the faces of the nearest anchor points."""
+    anchors, faces = surface.sample(ANCHOR_COUNT, seed)
+    candidates = faces[cKDTree(anchors).query(points, k=CANDIDATE_COUNT)[1]]
     distance = np.full(len(points), np.inf)
     face = candidates[:, 0].copy()
-    for k in range(CANDIDATES):
+    for k in range(CANDIDATE_COUNT):
         far = np.linalg.norm(points - nearest_on_faces(points, surface.corners[candidates[:, k]]), axis=1)
         better = far < distance
         distance[better], face[better] = far[better], candidates[better, k]
     return distance, face
 
 
-def one_way(source: Surface, target: Surface, centres: Array, diagonal: float, seed: int) -> tuple[Array, Array]:
-    """Distances (n,) and angles in degrees (n,) from the seen part of one surface to all of the other."""
-    points, faces = source.sample(QUERIES, seed)
+def directed_distances(source: Surface, target: Surface, centres: Array, diagonal: float, seed: int) -> tuple[Array, Array]:
+    """Distances (n,) and angles in degrees (n,) from the visible part of one surface to the other surface."""
+    points, faces = source.sample(SAMPLE_COUNT, seed)
     normals = source.normals(faces)
-    keep = seen(source, points, normals, centres, LIFT * diagonal)
+    keep = visible(source, points, normals, centres, RAY_OFFSET * diagonal)
     distance, matched = nearest(points[keep], target, seed + 1)
     cosine = (normals[keep] * target.normals(matched)).sum(1)
     return distance, np.degrees(np.arccos(np.clip(cosine, -1, 1)))
 
 
 def measure(mesh: Surface, truth: Truth) -> Figures:
-    """The figures of a mesh in the frame of the truth; raises UsageError when the cameras see nothing of it."""
+    """Figures of a mesh in the frame of the ground truth. Raises UsageError when the cameras see nothing of it."""
     centres, diagonal = np.array(list(truth.centres.values())), truth.surface.diagonal
-    there, there_deg = one_way(mesh, truth.surface, centres, diagonal, 1)
-    back, back_deg = one_way(truth.surface, mesh, centres, diagonal, 3)
+    there, there_deg = directed_distances(mesh, truth.surface, centres, diagonal, 1)
+    back, back_deg = directed_distances(truth.surface, mesh, centres, diagonal, 3)
     if not len(there) or not len(back):
         raise UsageError("The cameras see nothing of the mesh; is it in another frame (--cameras)?")
-    precision, recall = float((there < CLOSE * diagonal).mean()), float((back < CLOSE * diagonal).mean())
+    precision, recall = float((there < FSCORE_THRESHOLD * diagonal).mean()), float((back < FSCORE_THRESHOLD * diagonal).mean())
     accuracy, completeness = (100 * float(d.mean()) / diagonal for d in (there, back))
     return Figures(
         accuracy_pct=accuracy,
@@ -282,18 +281,18 @@ def measure(mesh: Surface, truth: Truth) -> Figures:
 
 
 def measure_aligned(mesh: Surface, centres: Mapping[str, Array], truth: Truth) -> Figures:
-    """The figures of a mesh in any frame, laid on the truth by its camera centres (3,) by name in that frame."""
+    """Figures of a mesh in any frame, aligned by its camera centres (3,) by name in that frame."""
     return measure(mesh.moved(align(mesh, centres, truth)), truth)
 
 
 def measure_file(mesh: Path, capture: Path, cameras: Path | None = None) -> Figures:
-    """The figures of an asset, laid on the truth by its `cameras.json` when that is given."""
+    """Figures of an asset, aligned by its `cameras.json` if given."""
     truth, surface = read_truth(capture), read_mesh(mesh)
     return measure_aligned(surface, read_centres(cameras), truth) if cameras else measure(surface, truth)
 
 
 def measure_stage(mesh: Path, poses: Path, capture: Path) -> Figures:
-    """The figures of a mesh stage's PLY (unit frame) with its poses stage's `cameras.json`; aligned where the poses were solved."""
+    """Figures of a mesh stage's PLY (unit frame) with its poses stage's `cameras.json`; aligned unless the poses were given."""
     truth, cameras = read_truth(capture), CameraSet.load(poses / "cameras.json")
     world = read_mesh(mesh).moved(cameras.to_world)
     return measure(world, truth) if cameras.poses == "given" else measure_aligned(world, read_centres(poses / "cameras.json"), truth)

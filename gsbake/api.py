@@ -1,6 +1,6 @@
-"""gsbake from Python: `gsbake.run("photos", profile="relight")` brings an output folder up to date, as the command of that name does.
+"""Python API: `gsbake.run("photos", profile="relight")` brings an output folder up to date, as `gsbake run` does.
 
-The folder remembers photos, profile and settings, so that later calls may name it alone. Single steps are functions of plain paths too:
+The output folder stores photos, profile and settings; later calls may give the folder alone. Each step is a function of plain paths too:
 `gsbake.capture.ingest.ingest`, `gsbake.mvs.stereo.run_stereo`, `gsbake.meshing.extract.extract_mesh` and so on, one per stage.
 """
 
@@ -24,13 +24,17 @@ from gsbake.pipeline.project import Project
 from gsbake.pipeline.store import Store
 from gsbake.publish import publish_results
 from gsbake.stages import REGISTRY
+from gsbake.text import number
+
+#: Largest seed that all libraries accept (32-bit signed integer).
+MAX_SEED = 2**31 - 1
 
 
 @dataclass(frozen=True)
 class RunOptions:
-    """What a run is made from; None and 0 stand for what the output folder remembers, else the default.
+    """Options of a run; None stands for the value stored in the output folder, else the default.
 
-    `overrides` are settings as "section.key=value", on top of those remembered; `threads` 0 takes the physical cores.
+    `overrides` are settings as "section.key=value", added to the stored ones; `threads` = 0 uses the physical cores.
     """
 
     photos: Path | None = None
@@ -46,7 +50,7 @@ class RunOptions:
 
 @dataclass(frozen=True)
 class Session:
-    """An engine, and the project and profile it was made from."""
+    """A run ready to start: the engine, the stored options (`project`), the profile and the output folder."""
 
     engine: Engine
     project: Project
@@ -54,7 +58,7 @@ class Session:
     out: Path
 
     def run(self, target: str | None = None) -> Result:
-        """Bring every stage up to `target` (all without one) up to date and publish the results in the output folder.
+        """Bring the stages up to `target` (None: all) up to date and publish the results in the output folder.
 
         Raises what `Engine.run` raises.
         """
@@ -74,14 +78,14 @@ class Session:
 
 @dataclass(frozen=True)
 class Result:
-    """A finished run: the output folder, the published `files` by name ("asset.glb", …), and the state of every stage."""
+    """A finished run: output folder, published `files` by name ("asset.glb", …) and the state of every stage."""
 
     out: Path
     files: Mapping[str, Path]
     stages: tuple[StageState, ...]
 
     def results(self, stage: str) -> Mapping[str, Any]:
-        """The figures that a stage reported. Raises KeyError for a stage that was not part of the run."""
+        """Results that a stage reported. Raises KeyError for a stage that was not part of the run."""
         for state in self.stages:
             if state.name == stage and state.artifact is not None:
                 found: Mapping[str, Any] = state.artifact.manifest.get("results", {})
@@ -90,7 +94,7 @@ class Result:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """All warnings, those of cached stages included."""
+        """Warnings of all stages, cached ones included."""
         manifests = [state.artifact.manifest for state in self.stages if state.artifact is not None]
         return tuple(text for manifest in manifests for text in manifest.get("warnings", ()))
 
@@ -109,24 +113,24 @@ def run(
     seed: int | None = None,
     observer: Observer | None = None,
 ) -> Result:
-    """Bake the asset of a folder of photos, or bring an earlier run in `out` up to date; returns where the results are.
+    """Bake an asset from a folder of photos, or bring an earlier run in `out` up to date; returns the results.
 
     Parameters
     ----------
-    photos: folder of photos, or a capture folder with images/, masks/ and poses; needed the first time only.
-    out: output folder; out/<name of photos> without one.
-    profile: name of a profile, or path of a TOML file; "relight" the first time.
-    settings: {"section.key": value} on top of the profile, for example {"mesh.faces": 10000}.
-    masks, poses: where masks and known poses are, when not in the capture folder.
-    target: stage to stop after, for example "mesh"; None runs all.
+    photos: folder of photos, or a capture folder with images/, masks/ and poses; needed in the first call only.
+    out: output folder; default out/<name of photos>.
+    profile: name of a profile, or path of a TOML file; default "relight".
+    settings: {"section.key": value} that override the profile, for example {"mesh.faces": 10000}.
+    masks, poses: paths of masks and known poses outside the capture folder.
+    target: last stage to run, for example "mesh"; None runs all.
     device: "auto", "cpu" or "cuda".
-    threads: 0 takes the physical cores.
-    seed: seed of everything random; 0 the first time.
+    threads: number of threads; 0 uses the physical cores.
+    seed: seed of all random numbers, 0 to 2**31 − 1; default 0.
     observer: receives progress, decisions and warnings.
 
     Raises
     ------
-    UsageError, BadInputError, InterruptedRun (`gsbake.errors`), each with one sentence that says what to do.
+    UsageError, BadInputError or InterruptedRun (`gsbake.errors`), each with one sentence that says what to do.
     """
     overrides = [f"{key}={value if isinstance(value, str) else json.dumps(value)}" for key, value in (settings or {}).items()]
     options = RunOptions(_path(photos), _path(out), profile, overrides, _path(masks), _path(poses), device, threads, seed)
@@ -134,10 +138,10 @@ def run(
 
 
 def open_session(options: RunOptions, observer: Observer | None = None) -> Session:
-    """Merge the options with the output folder's memory; nothing is written.
+    """Merge the options with those stored in the output folder; nothing is written.
 
-    `photos` starts the memory anew; without it the remembered photos, profile and overrides hold, and given ones are added. Raises
-    UsageError when no photos are given or remembered.
+    With `photos` the stored options are discarded; without it they hold and the given ones are added. Raises UsageError when photos are
+    neither given nor stored, and for a seed out of range.
     """
     out = options.out or _default_out(options.photos)
     stored = Project.load(out)
@@ -157,7 +161,10 @@ def open_session(options: RunOptions, observer: Observer | None = None) -> Sessi
     profile = load_profile(name, list(last.values()))
     if Path(name).is_file():
         name = str(Path(name).resolve())
-    project = replace(project, profile=name, overrides=tuple(last.values()), seed=project.seed if options.seed is None else options.seed)
+    seed = project.seed if options.seed is None else options.seed
+    if not 0 <= seed <= MAX_SEED:
+        raise UsageError(f"The seed must be a whole number from 0 to {number(MAX_SEED)}, not {seed}.")
+    project = replace(project, profile=name, overrides=tuple(last.values()), seed=seed)
     sources = project.sources()
     request = Request(
         out=out,
@@ -172,7 +179,7 @@ def open_session(options: RunOptions, observer: Observer | None = None) -> Sessi
 
 
 def open_store(out: Path | None) -> tuple[Store, tuple[str, ...]]:
-    """The artifacts of an earlier run in `out` (without it, the only one in ./out), and the names of the stages. Raises UsageError."""
+    """Artifacts of the run in `out` (None: the only run in ./out), and the names of the stages. Raises UsageError."""
     out = out or _default_out(None)
     if not (out / "stages").is_dir():
         raise UsageError(f"'{out}' holds no run; name its folder with --out.")
@@ -180,7 +187,7 @@ def open_store(out: Path | None) -> tuple[Store, tuple[str, ...]]:
 
 
 def _source_names(sources: dict[str, Path]) -> dict[str, list[str]]:
-    """The files that count in the folders of photos and masks."""
+    """Names of the input files in the folders of photos and masks."""
     names = {"photos": [path.relative_to(sources["photos"]).as_posix() for path in list_photos(sources["photos"])]}
     if "masks" in sources and sources["masks"].is_dir():
         names["masks"] = list_files(sources["masks"])
@@ -188,7 +195,7 @@ def _source_names(sources: dict[str, Path]) -> dict[str, list[str]]:
 
 
 def _default_out(photos: Path | None) -> Path:
-    """out/<name>, or the only run in out/."""
+    """out/<name of photos>, or the only run in out/. Raises UsageError."""
     if photos is not None:
         folder = photos.resolve()
         return Path("out") / (folder.parent.name if folder.name in PHOTO_FOLDERS else folder.name)

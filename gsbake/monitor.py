@@ -1,7 +1,7 @@
-"""How a step talks to whoever runs it: progress, timed parts, decisions, warnings and stop requests.
+"""Interface through which a step reports progress, timed parts, decisions and warnings, and receives stop requests.
 
 Every step of the pipeline is a function of plain paths and options that takes a `Monitor`. The engine passes one that reports to the
-terminal and the manifest; without one, `SILENT` ignores everything.
+terminal and the manifest; the default, `SILENT`, ignores all reports.
 """
 
 from __future__ import annotations
@@ -10,36 +10,36 @@ from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
 from typing import Literal, Protocol
 
-#: Whether work that a scene may not need is skipped: by evidence, in any case, or not at all.
+#: Whether work is skipped: where measurements allow it, always, or never.
 Rule = Literal["auto", "always", "never"]
-#: Decisions about skipped work are named after their setting: "skip." and the rule.
+#: Prefix of decisions about skipped work; the rest is the rule, as in the setting's name.
 SKIP_PREFIX = "skip."
 
 
 class Monitor(Protocol):
-    """Receives what a running step reports."""
+    """Receives the reports of a running step."""
 
     def part(self, name: str) -> AbstractContextManager[None]:
-        """Time a part of the step; parts of one name add up."""
+        """Time a part of the step; times of parts with the same name are added."""
 
     def progress(self, done: int, total: int, text: str = "", **live: float) -> None:
-        """Report progress and live figures (psnr=…); cheap enough to call in every iteration."""
+        """Report progress and live figures (psnr=…); fast enough for every iteration."""
 
     def stop_requested(self) -> bool:
-        """Whether the step should write a checkpoint and stop; `check_stop` then raises."""
+        """Whether the step must write a checkpoint and stop; `check_stop` then raises."""
 
     def check_stop(self) -> None:
         """Raise InterruptedRun if a stop was requested."""
 
     def decide(self, what: str, choice: str, evidence: str, saved: float | None = None) -> None:
-        """Record a decision and its evidence; `saved` is the time in seconds that it saves, where that was measured."""
+        """Record a decision and its evidence; `saved` is the time in seconds that it saves, None where unknown."""
 
     def warn(self, text: str) -> None:
         """Record a warning for the user."""
 
 
 class SilentMonitor:
-    """A monitor that ignores all reports and never asks to stop."""
+    """A monitor that ignores all reports and never requests a stop."""
 
     @contextmanager
     def part(self, name: str) -> Iterator[None]:
@@ -67,17 +67,17 @@ SILENT = SilentMonitor()
 
 
 def skips(rule: Rule, holds: bool) -> bool:
-    """Whether work is skipped: as the evidence says (`holds`), unless the setting says always or never."""
+    """Whether work is skipped: where measurements allow it (`holds`), unless the setting is always or never."""
     return holds if rule == "auto" else rule == "always"
 
 
 def decide_skip(
     monitor: Monitor, name: str, rule: Rule, holds: bool, evidence: str, skipped: str, done: str, saved: float | None = None
 ) -> bool:
-    """Decide whether to skip the work of the setting skip.`name`, and report it; returns whether it is skipped.
+    """Decide whether to skip the work of the setting skip.`name`, and report the decision; returns whether it is skipped.
 
-    `holds` and `evidence` say whether the measurements allow it and why; `skipped` and `done` name either outcome. `saved` is the time in
-    seconds that skipping saves, None where it is unknown.
+    `holds`: the measurements allow skipping, `evidence`: these measurements; `skipped` and `done` name the two outcomes. `saved`: time in
+    seconds that skipping saves, None where unknown.
     """
     skip = skips(rule, holds)
     if rule != "auto":

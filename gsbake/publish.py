@@ -1,4 +1,4 @@
-"""Publishing the results of a run in its output folder: asset.glb, cameras.json, light.hdr and report.html."""
+"""Publication of a run's results in its output folder: asset.glb, cameras.json, light.hdr and report.html."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from gsbake.pipeline.files import copy_atomic
 from gsbake.pipeline.project import Project
 from gsbake.pipeline.store import Artifact
 
-#: Which files of which stage are put into OUT.
+#: {stage: files that are copied to the output folder}.
 RESULTS = {"export": ("asset.glb", "cameras.json", "light.hdr"), "report": ("report.html",)}
 
 
 def publish_results(
     out: Path, artifacts: Mapping[str, Artifact], project: Project, digests: DigestCache
 ) -> tuple[dict[str, Path], Project]:
-    """Copy the results that the artifacts hold; returns {file: path in OUT} and the project with what was published.
+    """Copy the results of the artifacts; returns {file: path in `out`} and the project with the digests of the published files.
 
-    Copies, not links: an asset opened and saved in another program must not change the artifact. A result that this run no longer has
-    (the light, without materials) is deleted if it is still what an earlier run put there.
+    Copies, not links: saving the asset in another program must not change the artifact. A file that this run no longer has (light.hdr
+    without materials) is deleted if it is unchanged since an earlier run published it.
     """
     placed: dict[str, Path] = {}
     published = dict(project.published)

@@ -1,4 +1,4 @@
-"""Numbers and lists as people read them: durations, sizes, counts, the first few names of many."""
+"""Formatting of durations, file sizes, numbers, results and lists of names for messages."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-#: Figures on a stage's line; the manifest holds all of them.
+#: Maximum number of results on a stage's line; the manifest has all.
 MAX_FIGURES = 4
-#: Names that a message lists before it counts the rest.
+#: Maximum number of names in a message; the rest are counted.
 MAX_NAMES = 4
 
 
@@ -34,7 +34,7 @@ def size(count: float) -> str:
 
 
 def number(value: float) -> str:
-    """15 000, 0.0821, 24.6: integers in groups of three, other numbers to four significant digits, without exponents where readable."""
+    """15 000, 0.0821, 24.6: integers in groups of three digits, other numbers with four significant digits; "yes" or "no" for bools."""
     if isinstance(value, bool):
         return "yes" if value else "no"
     if isinstance(value, int) or (abs(value) >= 1e4 and abs(value) < 1e15):
@@ -43,7 +43,7 @@ def number(value: float) -> str:
 
 
 def figures(results: Mapping[str, Any], limit: int = MAX_FIGURES) -> str:
-    """The first few plain numbers and words among a stage's results."""
+    """The first `limit` numbers and short texts among a stage's results."""
     shown = []
     for name, value in results.items():
         if isinstance(value, bool | int | float):
@@ -56,9 +56,9 @@ def figures(results: Mapping[str, Any], limit: int = MAX_FIGURES) -> str:
 
 
 def summarise(template: str, results: Mapping[str, Any]) -> str:
-    """The template with results in its braces, as in "{photos} photos, {psnr:dB}"; clauses between commas that lack a result are dropped.
+    """The template with results in its braces, as in "{photos} photos, {psnr:dB}"; comma-separated clauses without a result are dropped.
 
-    A format after the colon is a unit: "dB" one decimal, "%" a share as a percentage, "MB", "px" two decimals.
+    The format after the colon is a unit: "dB" one decimal, "%" a share as a percentage, "MB" and "px" two decimals.
     """
     clauses = []
     for clause in filter(None, (part.strip() for part in template.split(","))):
@@ -84,5 +84,5 @@ def _with_unit(value: Any, unit: str) -> str:
 
 
 def shortlist(names: Sequence[str]) -> str:
-    """The first few names, and how many more there are."""
+    """The first MAX_NAMES names and the number of the others."""
     return ", ".join(names[:MAX_NAMES]) + (f" and {len(names) - MAX_NAMES} more" if len(names) > MAX_NAMES else "")

@@ -1,4 +1,4 @@
-"""Stage report: the finished run → one HTML page and its figures."""
+"""Stage report: finished run → HTML page and its figures."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`gsbake.run` from Python, over the toy stages of the command line's tests."""
+"""`gsbake.run` on the toy stages of the command line's tests."""
 
 from __future__ import annotations
 
@@ -25,28 +25,30 @@ def photos(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return folder
 
 
-def test_run_bakes_and_then_serves(photos: Path) -> None:
+def test_run_bakes_and_caches(photos: Path) -> None:
     first = gsbake.run(photos, profile="relight", settings={"mesh.faces": 700, "ingest.invert_masks": True})
     assert first.out == Path("out/tankard") and first.files["asset.glb"].read_text() == "glb ply 700"
     assert [state.status for state in first.stages] == ["run"] * 4
     assert first.results("mesh") == {"faces": 700} and first.warnings == ("photo 3 is blurred",)
-    again = gsbake.run(out=first.out)  # photos, profile and settings are remembered
+    again = gsbake.run(out=first.out)  # photos, profile and settings are stored
     assert [state.status for state in again.stages] == ["cached"] * 4
     with pytest.raises(KeyError):
         first.results("train")
 
 
-def test_a_target_stops_early(photos: Path) -> None:
+def test_run_stops_after_the_target(photos: Path) -> None:
     assert [state.name for state in gsbake.run(photos, out="o", target="mesh").stages] == ["ingest", "mesh"]
 
 
-def test_errors_are_sentences(photos: Path) -> None:
+def test_errors_are_single_sentences(photos: Path) -> None:
     with pytest.raises(UsageError, match="holds no run yet"):
         gsbake.run(out="none")
     with pytest.raises(BadInputError, match="nearest is 'mesh.faces'"):
         gsbake.run(photos, settings={"mesh.face": 3})
+    with pytest.raises(UsageError, match="The seed must be a whole number from 0"):
+        gsbake.run(photos, seed=2**31)
 
 
-def test_importing_gsbake_is_quick() -> None:
+def test_importing_gsbake_imports_no_large_library() -> None:
     code = "import gsbake, sys; sys.exit(len({'torch', 'numpy', 'pydantic', 'gsbake.api'} & set(sys.modules)))"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

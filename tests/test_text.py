@@ -1,4 +1,4 @@
-"""Numbers and lists as people read them."""
+"""Formatting of durations, sizes, numbers and lists."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""Photos, masks, cameras and structure from motion."""
+"""Capture: photos, masks, camera poses, structure from motion."""

@@ -1,4 +1,4 @@
-"""Cameras of a capture (solved, or checked when given), undistorted photos, and the unit frame around the object."""
+"""Pose estimation: cameras from structure from motion or from given poses, undistorted photos, and the unit frame of the object."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ import cv2
 import numpy as np
 
 from gsbake.capture.hull.visual_hull import visual_hull
-from gsbake.capture.masks.completion import mend
-from gsbake.capture.photos.redundancy import spare_photos
-from gsbake.capture.photos.undistortion import lens_key, pinhole_of, remap_tables, resample
+from gsbake.capture.masks.completion import complete_masks
+from gsbake.capture.photos.redundancy import find_redundant_photos
+from gsbake.capture.photos.undistortion import intrinsics_key, pinhole_camera, remap_tables, resample
 from gsbake.capture.posed_photos import PosedPhotos
-from gsbake.capture.poses.normalisation import Extent, extent_from_masks, extent_from_view
-from gsbake.capture.sfm.solve import Solver
+from gsbake.capture.poses.normalisation import BoundingSphere, bounding_sphere_from_masks, bounding_sphere_from_views
+from gsbake.capture.sfm.solve import PoseSolver
 from gsbake.config.schema import Poses
 from gsbake.errors import BadInputError
 from gsbake.geometry.cameras import Camera, CameraSet
@@ -29,17 +29,17 @@ from gsbake.imaging.png import write_png
 from gsbake.monitor import SILENT, Monitor, Rule, decide_skip
 from gsbake.text import shortlist
 
-#: Fewer points than this say nothing about the shape.
+#: Smallest number of tie points that is written: fewer do not describe the shape.
 MIN_POINTS = 30
-#: Surface points at which photos are compared for redundancy.
+#: Surface points at which the coverage of photos is measured.
 SURFACE_POINTS = 1000
-#: Longer side in pixels of the masks that the hull is made from.
-HULL_SIZE = 512
+#: Longer side in pixels of the masks that visual hulls are carved from.
+HULL_MASK_SIZE = 512
 
 
 @dataclass(frozen=True)
 class PoseOptions:
-    """Settings of pose estimation; `redundant_photos` is the rule of [skip]."""
+    """Settings of pose estimation; `redundant_photos` is the rule for skipping redundant photos."""
 
     poses: Poses = Poses()
     redundant_photos: Rule = "auto"
@@ -55,11 +55,11 @@ def estimate_poses(
     scratch: Path | None = None,
     monitor: Monitor = SILENT,
 ) -> dict[str, Any]:
-    """Find the cameras of the folder that `ingest` wrote, write the posed capture into the folder `out`; return the figures.
+    """Estimate the cameras of the photos in the artifact folder `ingest`, write the posed capture into `out`; return the figures.
 
     Written: `cameras.json` (`CameraSet`, unit frame), `photos/`, `masks/` (pinhole), `points.ply` (tie points, unit frame; may be absent),
-    `sparse/` (COLMAP binary model, input frame). `scratch` keeps COLMAP's database for a run that is interrupted. Raises BadInputError when
-    too few photos register, or required poses are missing.
+    `sparse/` (COLMAP binary model, input frame). `scratch` holds COLMAP's database, from which an interrupted run resumes. Raises
+    BadInputError when too few photos register, or required poses are missing.
     """
     if scratch is None:
         with tempfile.TemporaryDirectory(prefix="gsbake-poses-") as folder:
@@ -81,41 +81,41 @@ class _Estimation:
     monitor: Monitor
 
     def run(self) -> dict[str, Any]:
-        """The recipe."""
+        """Execute all steps; returns the figures."""
         monitor = self.monitor
         entries: list[dict[str, Any]] = json.loads((self.ingest / "photos.json").read_text())["photos"]
-        solver = Solver(self.ingest, entries, self.scratch, self.options.poses, self.seed, self.threads, monitor)
+        solver = PoseSolver(self.ingest, entries, self.scratch, self.options.poses, self.seed, self.threads, monitor)
         given = self._use_given(len(entries))
         solved = solver.triangulate() if given else solver.solve()
         points, colours = read_cloud(solved.cloud) if solved.cloud.exists() else (None, None)
         with monitor.part("undistortion"):
             pinholes = self._undistort(solved.cameras)
         with monitor.part("normalisation"):
-            masks = self._small_masks(pinholes)
-            extent = self._extent(pinholes, masks, points)
-        to_world = extent.similarity()
+            masks = self._hull_masks(pinholes)
+            sphere = self._bounding_sphere(pinholes, masks, points)
+        to_world = sphere.similarity()
         to_unit = to_world.inverse()
         origin = "given" if given else "solved"
-        unit = [c.moved(to_unit) for c in pinholes]
+        cameras = [c.moved(to_unit) for c in pinholes]
         cloud = None if points is None or len(points) < MIN_POINTS else to_unit.apply(points)
         if cloud is not None:
             write_cloud(self.out / "points.ply", cloud, colours if colours is not None else cloud * 0)
         with monitor.part("masks"):
             self._complete_masks([(camera.moved(to_unit), mask) for camera, mask in masks], cloud)
         with monitor.part("redundant photos"):
-            unit, dropped = self._drop_redundant(entries, unit, cloud)
-        CameraSet(tuple(unit), to_world, origin).save(self.out / "cameras.json")
+            cameras, dropped = self._drop_redundant(entries, cameras, cloud)
+        CameraSet(tuple(cameras), to_world, origin).save(self.out / "cameras.json")
         if (solver.folder / "sparse").exists():
             shutil.copytree(solver.folder / "sparse", self.out / "sparse")
-        monitor.decide("unit frame", f"radius {extent.radius:.4g} in world units", extent.evidence)
-        centre = extent.centre.tolist()
-        return {"poses": origin, **solved.figures, "dropped_photos": dropped, "centre": centre, "radius": extent.radius}
+        monitor.decide("unit frame", f"radius {sphere.radius:.4g} in world units", sphere.evidence)
+        centre = sphere.centre.tolist()
+        return {"poses": origin, **solved.figures, "dropped_photos": dropped, "centre": centre, "radius": sphere.radius}
 
     def _use_given(self, photos: int) -> bool:
         """Whether given poses are used. Raises BadInputError when they are required but missing."""
         source, known = self.options.poses.source, self.ingest / "poses" / "cameras.json"
         if not known.exists() and source == "given":
-            raise BadInputError("No poses were given, but poses.source is given; give poses with the photos or set it to auto.")
+            raise BadInputError("No poses were given, but poses.source is given; provide poses with the photos or set it to auto.")
         use = known.exists() and source != "solve"
         count = f"given for {len(CameraSet.load(known).cameras)} of {photos} photos" if known.exists() else "none were given"
         evidence = f"{count}; set by the profile" if source != "auto" else count
@@ -123,83 +123,83 @@ class _Estimation:
         return use
 
     def _undistort(self, cameras: Sequence[Camera]) -> list[Camera]:
-        """Write photos and masks as a pinhole camera images them; photos without distortion are copied as they are."""
+        """Write photos and masks undistorted, and return their pinhole cameras; photos without distortion are copied."""
         groups: dict[tuple[float, ...], list[Camera]] = {}
         for camera in cameras:
-            groups.setdefault(lens_key(camera), []).append(camera)
+            groups.setdefault(intrinsics_key(camera), []).append(camera)
         (self.out / "photos").mkdir()
         if any((self.ingest / "masks" / f"{c.name}.png").exists() for c in cameras):
             (self.out / "masks").mkdir()
         cv2.setNumThreads(1)
         done = 0
-        flat: dict[str, Camera] = {}
+        pinholes: dict[str, Camera] = {}
         with ThreadPoolExecutor(max(1, min(self.threads, 8))) as pool:
             for members in groups.values():
-                target = pinhole_of(members[0])
+                target = pinhole_camera(members[0])
                 tables = remap_tables(members[0], target) if members[0].distortion else None
 
-                def one(camera: Camera, tables: Any = tables, target: Camera = target) -> Camera:
+                def undistort(camera: Camera, tables: Any = tables, target: Camera = target) -> Camera:
                     for sub in ("photos", "masks"):
                         self._resample(sub, camera.name, tables)
                     return replace(target, name=camera.name, R=camera.R, t=camera.t)
 
-                for result in pool.map(one, members):
-                    flat[result.name] = result
+                for result in pool.map(undistort, members):
+                    pinholes[result.name] = result
                     done += 1
                     self.monitor.progress(done, len(cameras), "undistortion")
-        return [flat[c.name] for c in cameras]
+        return [pinholes[c.name] for c in cameras]
 
     def _resample(self, sub: str, name: str, tables: Any) -> None:
-        """Write one photo or mask (the folder `sub`) through the tables of `remap_tables`, or copy it where there are none."""
-        source, goal = self.ingest / sub / f"{name}.png", self.out / sub / f"{name}.png"
+        """Resample one photo or mask (the folder `sub`) through `tables` of `remap_tables`, or copy it when they are None."""
+        source, target = self.ingest / sub / f"{name}.png", self.out / sub / f"{name}.png"
         mask = sub == "masks"
         if mask and not source.exists():
             return
         if tables is None:
-            shutil.copyfile(source, goal)
+            shutil.copyfile(source, target)
             return
         image: Any = cv2.imread(str(source), cv2.IMREAD_GRAYSCALE if mask else cv2.IMREAD_COLOR)
         if image is None:
             raise FileNotFoundError(source)
         result = resample(np.asarray(image, np.uint8), tables, mask)
-        write_png(goal, result if mask else np.ascontiguousarray(result[..., ::-1]))
+        write_png(target, result if mask else np.ascontiguousarray(result[..., ::-1]))
 
-    def _small_masks(self, cameras: Sequence[Camera]) -> list[tuple[Camera, Any]]:
-        """Each photo's camera and mask at the size that hulls are made from; None where it has none."""
+    def _hull_masks(self, cameras: Sequence[Camera]) -> list[tuple[Camera, Any]]:
+        """Camera and mask (None where there is none) of each photo at HULL_MASK_SIZE."""
         posed = PosedPhotos(self.out, CameraSet(tuple(cameras)))
         cv2.setNumThreads(self.threads)
-        return [posed.mask(i, HULL_SIZE) for i in range(len(cameras))]
+        return [posed.mask(i, HULL_MASK_SIZE) for i in range(len(cameras))]
 
-    def _extent(self, cameras: Sequence[Camera], masks: Sequence[tuple[Camera, Any]], points: Any) -> Extent:
-        """The ball around the object: from the visual hull when half of the photos have masks, else from what the cameras look at."""
+    def _bounding_sphere(self, cameras: Sequence[Camera], masks: Sequence[tuple[Camera, Any]], points: Any) -> BoundingSphere:
+        """Bounding sphere of the object: from the visual hull when half of the photos have masks, else from the cameras' views."""
         masked = [(camera, mask) for camera, mask in masks if mask is not None]
         if len(masked) >= max(3, 0.5 * len(cameras)):
-            extent = extent_from_masks([c for c, _ in masked], [m for _, m in masked])
-            if extent is not None:
-                return extent
-            self.monitor.warn("The masks share no common object; check that white is the object (else set ingest.invert_masks).")
-        return extent_from_view(cameras, points)
+            sphere = bounding_sphere_from_masks([c for c, _ in masked], [m for _, m in masked])
+            if sphere is not None:
+                return sphere
+            self.monitor.warn("The visual hull of the masks is empty; check that white is the object (else set ingest.invert_masks).")
+        return bounding_sphere_from_views(cameras, points)
 
     def _complete_masks(self, masks: Sequence[tuple[Camera, Any]], cloud: Any) -> None:
-        """Add to mask files the parts that tie points prove missing; `masks` are small, cameras and cloud in the unit frame."""
+        """Add to mask files the regions that tie points show to be missing; `masks` as in `_hull_masks`, all in the unit frame."""
         if cloud is None or any(mask is None for _, mask in masks):
             return
-        mended = mend([camera for camera, _ in masks], [mask for _, mask in masks], cloud)
-        names = [masks[one.index][0].name for one in mended]
-        for one, name in zip(mended, names, strict=True):
+        completions = complete_masks([camera for camera, _ in masks], [mask for _, mask in masks], cloud)
+        names = [masks[completion.index][0].name for completion in completions]
+        for completion, name in zip(completions, names, strict=True):
             path = self.out / "masks" / f"{name}.png"
             mask = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
             if mask is None:
                 raise FileNotFoundError(path)
-            missing = cv2.resize(255 * one.missing.astype(np.uint8), mask.shape[::-1], interpolation=cv2.INTER_LINEAR)
+            missing = cv2.resize(255 * completion.missing.astype(np.uint8), mask.shape[::-1], interpolation=cv2.INTER_LINEAR)
             write_png(path, np.where(missing > 127, 255, mask).astype(np.uint8))
-        if mended:
-            points = sum(one.points for one in mended)
+        if completions:
+            points = sum(completion.points for completion in completions)
             evidence = f"they excluded {points} tie points that nearly all others include: {shortlist(names)}"
-            self.monitor.decide("mask completion", f"{len(mended)} of {len(masks)} masks", evidence)
+            self.monitor.decide("mask completion", f"{len(completions)} of {len(masks)} masks", evidence)
 
     def _drop_redundant(self, entries: Sequence[dict[str, Any]], cameras: list[Camera], cloud: Any) -> tuple[list[Camera], list[str]]:
-        """The cameras (unit frame) without redundant photos, whose files are deleted, and the names of those."""
+        """Delete the files of redundant photos; returns the remaining cameras (unit frame) and the names of the redundant photos."""
         posed = PosedPhotos(self.out, CameraSet(tuple(cameras)))
 
         def surface() -> tuple[Any, Any]:
@@ -209,9 +209,12 @@ class _Estimation:
             return points[:: max(1, len(points) // SURFACE_POINTS)], None
 
         rule = self.options.redundant_photos
-        alike = {e["name"]: e["duplicate_of"] for e in entries if e["duplicate_of"]}
-        spare, evidence = ([], "not searched") if rule == "never" else spare_photos(cameras, alike, surface, rule == "always")
-        names = [cameras[i].name for i in spare]
+        duplicates = {e["name"]: e["duplicate_of"] for e in entries if e["duplicate_of"]}
+        indices: list[int] = []
+        evidence = "not searched"
+        if rule != "never":
+            indices, evidence = find_redundant_photos(cameras, duplicates, surface, rule == "always")
+        names = [cameras[i].name for i in indices]
         skipped = f"{len(names)} of {len(cameras)} photos skipped ({shortlist(names)})" if names else "no photo is redundant"
         if not decide_skip(self.monitor, "redundant_photos", rule, bool(names), evidence, skipped, f"all {len(cameras)} photos used"):
             return cameras, []

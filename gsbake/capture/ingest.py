@@ -1,8 +1,9 @@
-"""Reading a capture: the user's photos, masks and poses become upright 8-bit working photos, measured, with poses at their size."""
+"""Ingestion of a capture: photos, masks and known poses are converted to upright 8-bit working photos with quality measures."""
 
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
@@ -13,12 +14,13 @@ import cv2
 import numpy as np
 from blake3 import blake3
 
-from gsbake.capture.masks.matching import mask_of, match_masks
-from gsbake.capture.photos.decode import RawPhoto, UnreadablePhotoError, read_photo, to_working
+from gsbake.capture.masks.matching import match_masks, read_photo_mask
+from gsbake.capture.photos.decode import RawPhoto, UnreadablePhotoError, read_header, read_photo, to_working_size
 from gsbake.capture.photos.exif import camera_key, focal_pixels
-from gsbake.capture.photos.quality import Quality, blurred, measure, near_duplicates
-from gsbake.capture.photos.sharpness import finer_than_sharp
-from gsbake.capture.poses.frames import Given, PhotoSize
+from gsbake.capture.photos.memory_budget import BYTES_PER_DECODED_BYTE, MemoryBudget
+from gsbake.capture.photos.quality import Quality, find_blurred, find_near_duplicates, measure_quality
+from gsbake.capture.photos.sharpness import detect_oversampling
+from gsbake.capture.poses.frames import GivenPoses, PhotoSize
 from gsbake.capture.poses.given import read_poses
 from gsbake.capture.sources import list_photos
 from gsbake.config.schema import Ingest
@@ -29,10 +31,13 @@ from gsbake.imaging.png import write_png
 from gsbake.monitor import SILENT, Monitor, Rule, decide_skip
 from gsbake.text import shortlist
 
+#: Longest name of a photo in bytes; file systems allow 255, and suffixes are added.
+MAX_NAME_BYTES = 200
+
 
 @dataclass(frozen=True)
 class IngestOptions:
-    """Settings of reading; `resolution` is the rule of [skip]."""
+    """Settings of ingestion; `resolution` is the rule for skipping redundant resolution."""
 
     ingest: Ingest = Ingest()
     resolution: Rule = "auto"
@@ -40,7 +45,7 @@ class IngestOptions:
 
 @dataclass(frozen=True)
 class _Photo:
-    """What is kept of a photo once its working files are written."""
+    """Metadata of a photo whose working files are written."""
 
     entry: dict[str, Any]
     size: PhotoSize
@@ -49,7 +54,7 @@ class _Photo:
 
 @dataclass(frozen=True)
 class _MaskSource:
-    """Where a photo's mask comes from: its mask file, or its alpha channel when there is none."""
+    """Source of a photo's mask: its mask file, or its alpha channel when there is none."""
 
     file: Path | None
     invert: bool
@@ -65,11 +70,11 @@ def ingest(
     threads: int = 2,
     monitor: Monitor = SILENT,
 ) -> dict[str, Any]:
-    """Read, check and reduce all photos of the folder `photos`; write the working files into the folder `out` and return the figures.
+    """Decode, check and downsample all photos of the folder `photos`; write the working files into the folder `out` and return the figures.
 
-    Written: `photos/<name>.png` and `masks/<name>.png` (8-bit), `photos.json` (what is known of each, and what was skipped), and with known
-    `poses` (a file or folder that `read_poses` takes) `poses/cameras.json` and `poses/points.ply`. Raises BadInputError when too few photos
-    are usable, or masks that the options require are missing.
+    Written: `photos/<name>.png` and `masks/<name>.png` (8-bit), `photos.json` (metadata of each photo, and the skipped files), and with
+    known `poses` (a file or folder that `read_poses` reads) `poses/cameras.json` and `poses/points.ply`. Raises BadInputError when too few
+    photos are usable, or required masks are missing.
     """
     run = _Ingestion(photos, out, options or IngestOptions(), masks, poses, threads, monitor)
     return run.run()
@@ -77,7 +82,7 @@ def ingest(
 
 @dataclass
 class _Ingestion:
-    """One run; `read` maps the path of each usable photo, relative to the folder, to what is kept of it."""
+    """One run; `read` maps the path of each usable photo, relative to the folder, to its metadata."""
 
     folder: Path
     out: Path
@@ -90,22 +95,22 @@ class _Ingestion:
     read: dict[str, _Photo] = field(default_factory=dict)
 
     def run(self) -> dict[str, Any]:
-        """The recipe."""
+        """Execute all steps; returns the figures."""
         settings = self.options.ingest
         paths = {path.relative_to(self.folder).as_posix(): path for path in list_photos(self.folder)}
         names = photo_names(paths)
         use_masks = settings.masks != "ignore"
         masks = match_masks(self.mask_folder, paths) if use_masks and self.mask_folder is not None else {}
         with self.monitor.part("duplicates"):
-            self._drop_copies(paths)
+            self._skip_identical_files(paths)
         with self.monitor.part("photos"):
             self._read_all(paths, names, masks)
         if len(self.read) < settings.min_photos:
             first = self.skipped[0] if self.skipped else None
-            lost = f" ({len(self.skipped)} of {len(names)} were skipped: {first['source']}: {first['why']})" if first else ""
+            skipped = f" ({len(self.skipped)} of {len(names)} were skipped: {first['source']}: {first['why']})" if first else ""
             raise BadInputError(
-                f"{self.folder} has {len(self.read)} usable photos{lost}, but at least {settings.min_photos} are needed; "
-                "take more around the object."
+                f"{self.folder} has {len(self.read)} usable photos{skipped}, but at least {settings.min_photos} are needed; "
+                "take more photos from all sides of the object."
             )
         self._report_quality()
         self._report_masks(masks)
@@ -129,8 +134,8 @@ class _Ingestion:
     def _entries(self) -> list[dict[str, Any]]:
         return [photo.entry for photo in self.read.values()]
 
-    def _drop_copies(self, paths: dict[str, Path]) -> None:
-        """Remove photos whose file is byte for byte that of an earlier one from `paths`."""
+    def _skip_identical_files(self, paths: dict[str, Path]) -> None:
+        """Remove from `paths` files that cannot be read or are identical to an earlier one."""
         known: dict[tuple[int, str], str] = {}
         for relative, path in list(paths.items()):
             try:
@@ -148,19 +153,19 @@ class _Ingestion:
                 known[key] = relative
 
     def _read_all(self, paths: dict[str, Path], names: dict[str, str], masks: dict[str, Path]) -> None:
-        """Decode, reduce, measure and write all photos, a few at once; unreadable ones are skipped with a warning."""
+        """Decode, downsample, measure and write all photos in a thread pool; unreadable ones are skipped with a warning."""
         for sub in ("photos", "masks"):
             (self.out / sub).mkdir(exist_ok=True)
-        cv2.setNumThreads(1)  # the pool below is the parallelism
-        settings = self.options.ingest
+        cv2.setNumThreads(1)  # the pool runs in parallel instead
+        settings, budget = self.options.ingest, MemoryBudget()
         with ThreadPoolExecutor(max(1, min(self.threads, 8))) as pool:
 
             def submit(relative: str) -> Future[_Photo]:
                 source = _MaskSource(masks.get(relative), settings.invert_masks) if settings.masks != "ignore" else None
-                return pool.submit(_read_one, paths[relative], relative, names[relative], source, self.out, settings.max_size)
+                return pool.submit(_read_one, paths[relative], relative, names[relative], source, self.out, settings, budget)
 
             try:
-                for done, (relative, future) in enumerate(_in_order(submit, list(paths), 2 * max(1, self.threads))):
+                for done, (relative, future) in enumerate(_submit_bounded(submit, list(paths), 2 * max(1, self.threads))):
                     self.monitor.progress(done, len(paths), relative)
                     try:
                         self.read[relative] = future.result()
@@ -175,22 +180,22 @@ class _Ingestion:
             (self.out / "masks").rmdir()
 
     def _report_quality(self) -> None:
-        """Mark near-duplicates, and warn of them and of blurred photos."""
+        """Mark near-duplicates; warn about them and about blurred photos."""
         entries = self._entries
-        alike = near_duplicates([photo.quality.thumbnail for photo in self.read.values()])
-        for entry, earlier in zip(entries, alike, strict=True):
+        duplicates = find_near_duplicates([photo.quality.thumbnail for photo in self.read.values()])
+        for entry, earlier in zip(entries, duplicates, strict=True):
             if earlier is not None:
                 entry["duplicate_of"] = entries[earlier]["name"]
         pairs = [f"{e['name']} = {e['duplicate_of']}" for e in entries if e["duplicate_of"]]
         if pairs:
-            self.monitor.warn(f"{len(pairs)} photos show the same as another one ({shortlist(pairs)}); they are kept but add nothing.")
-        soft = blurred([e["blur"] for e in entries])
-        if soft:
-            names = shortlist([entries[i]["name"] for i in soft])
-            self.monitor.warn(f"{len(soft)} photos are much more blurred than the rest ({names}).")
+            self.monitor.warn(f"{len(pairs)} photos are near-duplicates of others ({shortlist(pairs)}).")
+        outliers = find_blurred([e["blur"] for e in entries])
+        if outliers:
+            names = shortlist([entries[i]["name"] for i in outliers])
+            self.monitor.warn(f"{len(outliers)} photos are much more blurred than the rest ({names}).")
 
     def _report_masks(self, masks: dict[str, Path]) -> None:
-        """Say how many photos have masks and where these come from. Raises BadInputError where masks are required but missing."""
+        """Report how many photos have masks, and their sources. Raises BadInputError when required masks are missing."""
         setting, total = self.options.ingest.masks, len(self.read)
         without = [entry["name"] for entry in self._entries if entry["mask"] is None]
         count = total - len(without)
@@ -206,19 +211,19 @@ class _Ingestion:
             self.monitor.warn(f"{len(without)} of {total} photos have no mask ({shortlist(without)}); give every photo one.")
 
     def _reduce_resolution(self) -> None:
-        """Halve the working photos and masks where the photos hold no finer detail."""
+        """Halve the working photos and masks when the photos are oversampled."""
         entries = self._entries
         longer = max(max(e["width"], e["height"]) for e in entries)
-        holds, evidence = finer_than_sharp([photo.quality.loss_at_half for photo in self.read.values()], longer)
+        oversampled, evidence = detect_oversampling([photo.quality.halving_loss for photo in self.read.values()], longer)
         rule, half, full = self.options.resolution, f"photos kept at {longer // 2} pixels", f"photos kept at {longer} pixels"
-        if decide_skip(self.monitor, "resolution", rule, holds, evidence, half, full):
+        if decide_skip(self.monitor, "resolution", rule, oversampled, evidence, half, full):
             for entry in entries:
                 _halve(self.out, entry)
 
     def _read_poses(self, path: Path, listing: list[str]) -> dict[str, Any]:
-        """Read the given poses at the size of the working photos, and write them."""
+        """Read the given poses, scale them to the working photos and write them."""
         with self.monitor.part("poses"):
-            given: Given = read_poses(path, listing, {relative: photo.size for relative, photo in self.read.items()})
+            given: GivenPoses = read_poses(path, listing, {relative: photo.size for relative, photo in self.read.items()})
             cameras = []
             for relative, photo in self.read.items():
                 if relative in given.cameras:
@@ -239,11 +244,14 @@ class _Ingestion:
 
 
 def photo_names(paths: dict[str, Path]) -> dict[str, str]:
-    """Name of each photo by its relative path: the path without suffix, folders joined by "_". Raises BadInputError when two collide."""
+    """Name of each photo by its relative path: the path without suffix, folders joined by "_". Raises BadInputError when two collide.
+
+    Names that are too long for a file, or hold control characters or bytes that are no text, are shortened and end with a digest.
+    """
     names: dict[str, str] = {}
     taken: dict[str, str] = {}
     for relative in paths:
-        name = relative.rsplit(".", 1)[0].replace("/", "_")
+        name = _file_name(relative.rsplit(".", 1)[0].replace("/", "_"))
         if name in taken:
             raise BadInputError(f"The photos {taken[name]} and {relative} would both be called {name}; rename or remove one.")
         taken[name] = relative
@@ -251,23 +259,35 @@ def photo_names(paths: dict[str, Path]) -> dict[str, str]:
     return names
 
 
-def _in_order(submit: Callable[[str], Future[_Photo]], items: list[str], ahead: int) -> Iterator[tuple[str, Future[_Photo]]]:
-    """Submit at most `ahead` items before the first of them is taken: memory stays bounded for any number of photos."""
-    waiting: list[tuple[str, Future[_Photo]]] = []
+def _file_name(name: str) -> str:
+    """`name` itself where it can be a file's name everywhere, else a shorter one with a digest."""
+    data = os.fsencode(name)
+    if name.isprintable() and len(data) <= MAX_NAME_BYTES:
+        return name
+    safe = "".join(c if c.isprintable() else "_" for c in name)[:40]
+    return f"{safe}_{blake3(data).hexdigest()[:12]}"
+
+
+def _submit_bounded(submit: Callable[[str], Future[_Photo]], items: list[str], limit: int) -> Iterator[tuple[str, Future[_Photo]]]:
+    """Submit items in order with at most `limit` pending, which bounds memory; yields them in order."""
+    pending: list[tuple[str, Future[_Photo]]] = []
     for item in items:
-        waiting.append((item, submit(item)))
-        if len(waiting) >= ahead:
-            yield waiting.pop(0)
-    yield from waiting
+        pending.append((item, submit(item)))
+        if len(pending) >= limit:
+            yield pending.pop(0)
+    yield from pending
 
 
-def _read_one(path: Path, relative: str, name: str, source: _MaskSource | None, out: Path, max_size: int) -> _Photo:
-    """One photo and its mask (none without a `source`) to working files; runs in a thread."""
-    photo = read_photo(path)
-    mask = None if source is None else mask_of(photo, relative, source.file, source.invert)
-    rgb, mask = to_working(photo, mask, max_size)
+def _read_one(
+    path: Path, relative: str, name: str, source: _MaskSource | None, out: Path, settings: Ingest, budget: MemoryBudget
+) -> _Photo:
+    """Convert one photo and its mask (none without a `source`) to working files; runs in a thread."""
+    with budget.reserve(BYTES_PER_DECODED_BYTE * read_header(path).decoded_bytes):
+        photo = read_photo(path, settings.max_megapixels)
+        mask = None if source is None else read_photo_mask(photo, relative, source.file, source.invert, settings.max_megapixels)
+        rgb, mask = to_working_size(photo, mask, settings.max_size)
     height, width = rgb.shape[:2]
-    quality = measure(rgb, mask)
+    quality = measure_quality(rgb, mask)
     write_png(out / "photos" / f"{name}.png", rgb)
     if mask is not None:
         write_png(out / "masks" / f"{name}.png", mask)
@@ -291,12 +311,12 @@ def _read_one(path: Path, relative: str, name: str, source: _MaskSource | None, 
 
 
 def _halve(out: Path, entry: dict[str, Any]) -> None:
-    """Write a working photo and its mask again at half the size, and correct the size in `entry`."""
+    """Rewrite a working photo and its mask at half the size, and update `entry`."""
     bgr: Any = cv2.imread(str(out / entry["file"]), cv2.IMREAD_COLOR)
     full = np.ascontiguousarray(bgr[..., ::-1])
     mask: Any = None if entry["mask"] is None else cv2.imread(str(out / entry["mask"]), cv2.IMREAD_GRAYSCALE)
     before = max(entry["width"], entry["height"])
-    rgb, mask = to_working(RawPhoto(full, None, 1, {}), mask, before // 2)
+    rgb, mask = to_working_size(RawPhoto(full, None, 1, {}), mask, before // 2)
     write_png(out / entry["file"], rgb)
     if mask is not None:
         write_png(out / entry["mask"], mask)

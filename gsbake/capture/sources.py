@@ -1,7 +1,7 @@
-"""Finding the photos, masks and poses that belong to one capture.
+"""Discovery of the photos, masks and poses of a capture by conventional file names.
 
-The person names one folder; what lies in it by the usual names is taken along. Only names listed here are ever looked at, so that
-reference data kept beside a capture (a `gt/` folder, say) is never read.
+The user names one folder. Only the file names listed here are read, so that reference data beside a capture (such as a `gt/` folder)
+stays unused.
 """
 
 from __future__ import annotations
@@ -11,19 +11,19 @@ from pathlib import Path
 
 from gsbake.errors import BadInputError
 
-#: What counts as a photo, by the end of the file name.
+#: File name suffixes of photos.
 PHOTO_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".exr", ".webp"})
-#: Sub-folders that hold the photos of a capture folder, in the order they are tried.
+#: Sub-folders of a capture folder that hold its photos, in order of precedence.
 PHOTO_FOLDERS = ("images", "photos")
-#: Never taken for photos when a photo folder is read with its sub-folders.
-NOT_PHOTOS = frozenset({"masks", "gt", "sparse", "depths", "depth"})
+#: Sub-folders of a photo folder that are skipped.
+SKIPPED_FOLDERS = frozenset({"masks", "gt", "sparse", "depths", "depth"})
 _MODEL_FILES = ("cameras.bin", "cameras.txt")
 _MODEL_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse")
 
 
 @dataclass(frozen=True)
 class Sources:
-    """Where a capture's photos lie, and its masks and poses where there are any."""
+    """Paths of a capture: the photo folder, the mask folder or None, and the pose file or folder or None."""
 
     photos: Path
     masks: Path | None = None
@@ -31,7 +31,7 @@ class Sources:
 
 
 def list_photos(folder: Path) -> list[Path]:
-    """Photos of a folder, sorted by path; the sub-folders too when the folder is called `images` or `photos`.
+    """Photos of a folder, sorted by path; including sub-folders when the folder is called `images` or `photos`.
 
     Raises BadInputError when the folder does not exist or holds no photo.
     """
@@ -44,7 +44,7 @@ def list_photos(folder: Path) -> list[Path]:
         for path in folder.glob(pattern)
         if path.suffix.lower() in PHOTO_SUFFIXES
         and not path.name.startswith(".")
-        and not NOT_PHOTOS.intersection(path.relative_to(folder).parts[:-1])
+        and not SKIPPED_FOLDERS.intersection(path.relative_to(folder).parts[:-1])
         and path.is_file()
     ]
     if not found:
@@ -71,7 +71,7 @@ def find_poses(folder: Path) -> Path | None:
 
 
 def _given_poses(path: Path) -> Path:
-    """The pose file a person named, which may be the folder around it."""
+    """The pose file of a path given by the user, which may be the folder that holds it."""
     if not path.exists():
         raise BadInputError(f"The poses {path} do not exist; give a transforms.json, a COLMAP model folder or a poses_bounds.npy.")
     if path.is_dir():
@@ -80,28 +80,28 @@ def _given_poses(path: Path) -> Path:
             raise BadInputError(f"The folder {path} holds no poses (transforms.json, a COLMAP model or poses_bounds.npy).")
         return found
     if path.suffix.lower() not in (".json", ".npy"):
-        raise BadInputError(f"The poses {path} are of no known format; give a transforms.json, a COLMAP model or a poses_bounds.npy.")
+        raise BadInputError(f"The poses {path} have an unknown format; give a transforms.json, a COLMAP model or a poses_bounds.npy.")
     return path
 
 
 def discover(photos: Path, masks: Path | None = None, poses: Path | None = None) -> Sources:
-    """Find what belongs to a capture.
+    """Find the paths of a capture.
 
-    `photos` is a capture folder (photos in `images/` or `photos/`, beside them `masks/` and poses) or the photo folder itself; then its own
-    `masks/` and poses are taken, else those of its parent. `masks` and `poses` override what is found.
-    Raises BadInputError when a folder named does not exist or there is no photo.
+    `photos` is a capture folder (photos in `images/` or `photos/`, beside them `masks/` and poses) or the photo folder itself. Masks and
+    poses are looked for in the photo folder, then in its parent; `masks` and `poses` override what is found. Raises BadInputError when a
+    given path does not exist or there is no photo.
     """
-    photos, holders = Path(photos), []
+    photos, folders = Path(photos), []
     if photos.is_dir():
         inner = next((photos / name for name in PHOTO_FOLDERS if (photos / name).is_dir()), None)
         if inner is not None:
-            photos, holders = inner, [inner, photos]
+            photos, folders = inner, [inner, photos]
         else:
-            holders = [photos, photos.resolve().parent]
+            folders = [photos, photos.resolve().parent]
     list_photos(photos)
     if masks is None:
-        masks = next((h / "masks" for h in holders if (h / "masks").is_dir()), None)
+        masks = next((f / "masks" for f in folders if (f / "masks").is_dir()), None)
     elif not Path(masks).is_dir():
         raise BadInputError(f"The mask folder {masks} does not exist.")
-    beside = next((found for h in holders if (found := find_poses(h)) is not None), None) if poses is None else _given_poses(Path(poses))
-    return Sources(photos, None if masks is None else Path(masks), beside)
+    found = next((p for f in folders if (p := find_poses(f)) is not None), None) if poses is None else _given_poses(Path(poses))
+    return Sources(photos, None if masks is None else Path(masks), found)

@@ -1,4 +1,4 @@
-"""The command line. Nothing heavy is imported until a command needs it."""
+"""Command line. Large libraries are imported only by the commands that need them."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from types import FrameType
 
 
 def main() -> None:
-    """Entry point of `gsbake`: every end has a documented exit code (0, 2, 42, 75; 1 for an internal error) and one sentence on stderr."""
+    """Entry point of `gsbake`: exits with a documented code (0, 2, 42, 75; 1 for an internal error) and one sentence on stderr."""
     from gsbake.errors import GsbakeError, InterruptedRun
 
     def interrupted(number: int, frame: FrameType | None) -> None:
-        raise InterruptedRun("Stopped on request; the same command goes on from here.")
+        raise InterruptedRun("Stopped on request; the same command resumes.")
 
     signal.signal(signal.SIGINT, interrupted)
     signal.signal(signal.SIGTERM, interrupted)
@@ -21,16 +21,16 @@ def main() -> None:
 
         app()
     except GsbakeError as error:
-        _end(str(error), error.exit_code)
+        _exit_with_error(str(error), error.exit_code)
     except BrokenPipeError:
-        sys.stderr.close()  # the reader of our output went away: nothing is left to say, nor anyone to say it to
+        sys.stderr.close()  # the reader of stdout closed the pipe: suppress Python's own message
         raise SystemExit(1) from None
     except Exception as error:
-        _end(_save_traceback(error), 1)
+        _exit_with_error(_save_traceback(error), 1)
 
 
-def _end(message: str, code: int) -> None:
-    """Say how it ended, as JSON too when that was asked for, and leave."""
+def _exit_with_error(message: str, code: int) -> None:
+    """Print the error, with --json as JSON too, and exit."""
     from rich.console import Console
 
     if "--json" in sys.argv[1:]:

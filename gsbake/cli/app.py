@@ -1,4 +1,4 @@
-"""The commands and their options; each body is imported when its command runs, which keeps `--help` quick."""
+"""Commands and their options; the body of a command is imported when it runs, which keeps `--help` fast."""
 
 from __future__ import annotations
 
@@ -38,29 +38,29 @@ app = typer.Typer(
         "resumes), 1 internal error."
     ),
     no_args_is_help=True,
-    rich_markup_mode=None,  # plain help is there in a third of the time
+    rich_markup_mode=None,  # plain help takes a third of the time
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 
-#: What `--invert-masks` stands for.
+#: Setting of `--invert-masks`.
 INVERTED = ("ingest.invert_masks=true",)
-#: Commands that bring the pipeline up to one stage, and their help.
+#: {stage command: help}.
 STAGE_HELP = {
     "ingest": "Read photos, masks and known poses.",
-    "poses": "Find the cameras, and the object in front of them.",
-    "stereo": "Match the photos, for points on the surface to start from.",
+    "poses": "Estimate camera poses and the unit frame.",
+    "stereo": "Compute depth maps and surface points by multi-view stereo.",
     "train": "Train the surfels.",
     "refine": "Prune and densify the surfels, then fine-tune them.",
-    "mesh": "Turn the surfels into a clean mesh.",
+    "mesh": "Extract a mesh from the surfels and decimate it.",
     "bake": "Unwrap the mesh and bake its textures.",
-    "export": "Write asset.glb, its cameras and its light, and audit them.",
-    "report": "Write the report that shows photo beside asset.",
+    "export": "Write asset.glb, cameras.json and light.hdr, and audit the asset.",
+    "report": "Write report.html, which compares photos and renders.",
 }
 
 
-def _version(asked: bool) -> None:
-    if asked:
+def _version(show: bool) -> None:
+    if show:
         typer.echo(f"gsbake {__version__}")
         raise typer.Exit
 
@@ -73,7 +73,7 @@ def top(
 
 
 def _pipeline_command(target: str | None) -> Callable[..., None]:
-    """The command that brings the pipeline up to `target`; all take the same options."""
+    """The command that brings the stages up to `target` up to date; all have the same options."""
 
     def command(
         photos: PhotosArgument = None,
@@ -103,9 +103,9 @@ def _pipeline_command(target: str | None) -> Callable[..., None]:
     return command
 
 
-app.command("run", help="Everything: from PHOTOS to asset.glb and report.html.")(_pipeline_command(None))
+app.command("run", help="Run all stages: PHOTOS to asset.glb and report.html.")(_pipeline_command(None))
 for _name, _help in STAGE_HELP.items():
-    app.command(_name, help=f"{_help} Runs what it needs first.")(_pipeline_command(_name))
+    app.command(_name, help=f"{_help} Runs the stages before it first.")(_pipeline_command(_name))
 
 
 @app.command("status")
@@ -119,7 +119,7 @@ def status_command(
     quiet: QuietOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Which stages are cached, which would run, and why."""
+    """Show which stages are cached, which would run, and why."""
     from gsbake.cli.inspect import status
 
     status(
@@ -131,7 +131,7 @@ def status_command(
 
 @app.command("explain")
 def explain_command(
-    stage: Annotated[str | None, typer.Argument(help="Stage; all without one.", autocompletion=complete_stage, show_default=False)] = None,
+    stage: Annotated[str | None, typer.Argument(help="Stage; default: all.", autocompletion=complete_stage, show_default=False)] = None,
     out: OutOption = None,
     profile: ProfileOption = None,
     overrides: SetOption = None,
@@ -139,7 +139,7 @@ def explain_command(
     seed: SeedOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """What a stage's key is made of, and which field or file makes it run again."""
+    """Show the inputs of a stage's cache key, and which setting or file makes it run again."""
     from gsbake.cli.inspect import explain
 
     explain(Options(out=out, profile=profile, overrides=overrides or [], device=device.value, seed=seed, as_json=as_json), stage)
@@ -150,12 +150,12 @@ def replace_command(
     stage: Annotated[str, typer.Argument(help="Stage whose output is replaced.", autocompletion=complete_stage)],
     files: Annotated[list[Path] | None, typer.Argument(metavar="FILE...", help="Your files, or one folder.", show_default=False)] = None,
     out: OutOption = None,
-    undo: Annotated[bool, typer.Option("--undo", help="Let the stage's own output count again.")] = False,
+    undo: Annotated[bool, typer.Option("--undo", help="Use the stage's own output again.")] = False,
     dry_run: DryRunOption = False,
     quiet: QuietOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Put your own files in place of a stage's output, such as an edited mesh."""
+    """Replace a stage's output with your own files, such as an edited mesh."""
     from gsbake.cli.replace import replace
 
     replace(Options(out=out, dry_run=dry_run, quiet=quiet, as_json=as_json), stage, files or [], undo)
@@ -183,13 +183,13 @@ def cache_gc_command(
         str | None, typer.Option("--keep", metavar="SIZE", help="Keep at most this much, such as 20GB.", show_default=False)
     ] = None,
     older: Annotated[
-        str | None, typer.Option("--older", metavar="AGE", help="Delete what was unused for longer, such as 30d.", show_default=False)
+        str | None, typer.Option("--older", metavar="AGE", help="Delete what is unused for longer, such as 30d.", show_default=False)
     ] = None,
     dry_run: DryRunOption = False,
     quiet: QuietOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Delete outputs of old settings, checkpoints, and what killed runs left behind; your replacements stay."""
+    """Delete outputs of old settings, checkpoints and files of killed runs; your replacements are kept."""
     from gsbake.cli.cache import collect_garbage
 
     collect_garbage(Options(out=out, dry_run=dry_run, quiet=quiet, as_json=as_json), keep, older)
@@ -203,7 +203,7 @@ def profiles_command(
     overrides: SetOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """List the profiles, or show one: every setting, its value, where that comes from, and what it means."""
+    """List the profiles, or show one: every setting, its value, the source of the value, and its help."""
     from gsbake.cli.inspect import list_profiles, show_profile
 
     if name is None:
@@ -214,10 +214,10 @@ def profiles_command(
 
 @app.command("doctor")
 def doctor_command(
-    out: Annotated[Path, typer.Option("--out", "-o", metavar="DIR", help="Folder whose disk is looked at.")] = Path("out"),
+    out: Annotated[Path, typer.Option("--out", "-o", metavar="DIR", help="Folder whose free disk space is checked.")] = Path("out"),
     as_json: JsonOption = False,
 ) -> None:
-    """What is installed, which backend runs, what is missing, and what to do about it."""
+    """Check the installation: libraries, backend, memory and disk, with advice where something is missing."""
     from gsbake.cli.doctor import doctor
 
     doctor(as_json, out)
@@ -225,17 +225,17 @@ def doctor_command(
 
 @app.command("synth")
 def synth_command(
-    folder: Annotated[Path, typer.Argument(help="Where the capture is written.")],
-    views: Annotated[int, typer.Option(min=1, help="Number of photos.")] = 24,
-    size: Annotated[int, typer.Option(min=1, help="Edge of the square photos in pixels.")] = 128,
-    seed: Annotated[int, typer.Option(help="Seed of the noise.")] = 0,
+    folder: Annotated[Path, typer.Argument(help="Output folder of the capture.")],
+    views: Annotated[int, typer.Option(min=1, max=10_000, help="Number of photos.")] = 24,
+    size: Annotated[int, typer.Option(min=1, max=16_384, help="Edge of the square photos in pixels.")] = 128,
+    seed: Annotated[int, typer.Option(min=0, max=2**31 - 1, help="Seed of the noise.")] = 0,
     poses: Annotated[bool, typer.Option("--poses/--no-poses", help="Write transforms.json.")] = True,
-    background: Annotated[bool, typer.Option("--background", help="Opaque photos with a patterned ground instead of cut-outs.")] = False,
+    background: Annotated[bool, typer.Option("--background", help="Opaque photos with a ground plane, not transparent ones.")] = False,
     dry_run: DryRunOption = False,
     quiet: QuietOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Write the built-in synthetic capture: photos of an analytic object, with the truth beside them."""
+    """Write the built-in synthetic capture: renders of an analytic object, with ground truth."""
     from gsbake.cli.synth import synth
 
     synth(folder, views=views, size=size, seed=seed, poses=poses, background=background, dry_run=dry_run, quiet=quiet, as_json=as_json)

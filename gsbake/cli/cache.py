@@ -1,4 +1,4 @@
-"""`gsbake cache verify` and `gsbake cache gc`: check every stored byte, and delete what is no longer needed."""
+"""`gsbake cache verify` and `gsbake cache gc`: check stored artifacts and delete unused ones."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def parse_age(text: str) -> float:
 
 
 def verify(options: Options) -> None:
-    """Read every file of every artifact again. Raises BadInputError when one is damaged; the next run computes it again."""
+    """Compare every file of every artifact with its digest. Raises BadInputError when one is damaged; the next run computes it again."""
     from gsbake.api import open_store
 
     store, stages = open_store(options.out)
@@ -52,7 +52,7 @@ def verify(options: Options) -> None:
 
 
 def collect_garbage(options: Options, keep: str | None, older: str | None) -> None:
-    """Delete artifacts of old keys, and what killed runs left behind."""
+    """Delete artifacts of old keys, checkpoints and files of killed runs."""
     from gsbake.api import open_store
     from gsbake.pipeline.garbage import choose, delete, list_entries
 

@@ -1,4 +1,4 @@
-"""What a run prints: a progress bar and one line a stage on a terminal, timed lines elsewhere, decisions only when verbose."""
+"""Console output of a run: progress bar and one line per stage on a terminal, timed lines elsewhere, decisions when verbose."""
 
 from __future__ import annotations
 
@@ -15,8 +15,9 @@ from gsbake.pipeline.plan import StageState
 from gsbake.pipeline.stage import Stage
 from gsbake.text import duration, figures, number
 
-#: Seconds between progress lines where there is no terminal.
+#: Seconds between progress lines without a terminal.
 PROGRESS_INTERVAL = 30.0
+_REUSED = {"cached": "cached", "replaced": "replaced by the user"}
 
 
 class QuietDisplay(Observer):
@@ -31,7 +32,7 @@ class QuietDisplay(Observer):
 
 
 class PlainDisplay(QuietDisplay):
-    """Timed lines, for logs and pipes; `verbose` adds why stages run, and every decision."""
+    """Timed lines for logs and pipes; `verbose` adds the reasons of stages and all decisions."""
 
     def __init__(self, console: Console | None = None, verbose: bool = False) -> None:
         super().__init__()
@@ -43,7 +44,7 @@ class PlainDisplay(QuietDisplay):
         self._waiting = ""
 
     def line(self, text: str) -> None:
-        """Print a line with the time since the run began."""
+        """Print a line with the time since the start of the run."""
         self.console.print(f"{_clock(time.monotonic() - self._begin)}  {text}", markup=False)
 
     def run_started(self, stages: list[Stage]) -> None:
@@ -52,23 +53,23 @@ class PlainDisplay(QuietDisplay):
 
     def stage_reused(self, state: StageState) -> None:
         """Print a stage that needs no work."""
-        self.line(f"{state.name}: {'replaced by hand' if state.status == 'replaced' else 'cached'}")
+        self.line(f"{state.name}: {_REUSED[state.status]}")
 
     def stage_started(self, state: StageState) -> None:
-        """Print why a stage runs."""
+        """Print when verbose why a stage runs."""
         self._stage_begin = self._last = time.monotonic()
         if self.verbose:
             self.line(f"{state.name}: {state.title} ({'; '.join(state.reasons)})")
 
     def stage_waiting(self, name: str, holder: LeaseHolder | None) -> None:
-        """Print once who holds the lease."""
+        """Print once which process holds the lease."""
         text = f"{name}: waiting, {holder or 'another process'} is computing it"
         if text != self._waiting:
             self._waiting = text
             self.line(text)
 
     def progress(self, name: str, done: int, total: int, text: str, live: Mapping[str, float]) -> None:
-        """Print a line every now and then."""
+        """Print a line every PROGRESS_INTERVAL seconds."""
         now = time.monotonic()
         if now - self._last < PROGRESS_INTERVAL:
             return
@@ -84,15 +85,15 @@ class PlainDisplay(QuietDisplay):
 
     def stage_stopping(self, name: str) -> None:
         """Print that the stop was received."""
-        self.line(f"{name}: stopping; once more stops at once")
+        self.line(f"{name}: stopping; press Ctrl-C again to stop at once")
 
     def stage_finished(self, state: StageState) -> None:
-        """Print what a stage took and what came out."""
+        """Print time and results of a stage."""
         self.line(f"{state.name}: {_summary(state)}")
 
 
 class TerminalDisplay(PlainDisplay):
-    """A bar with remaining time and live figures; one line a stage."""
+    """Progress bar with remaining time and live figures; one line per stage."""
 
     def __init__(self, verbose: bool = False) -> None:
         super().__init__(verbose=verbose)
@@ -107,7 +108,7 @@ class TerminalDisplay(PlainDisplay):
 
     def stage_reused(self, state: StageState) -> None:
         """Print a stage that needs no work."""
-        self.console.print(f"[green]✓[/] {state.name:<7} [dim]{'replaced by hand' if state.status == 'replaced' else 'cached'}[/]")
+        self.console.print(f"[green]✓[/] {state.name:<7} [dim]{_REUSED[state.status]}[/]")
 
     def stage_started(self, state: StageState) -> None:
         """Open the stage's bar."""
@@ -116,18 +117,18 @@ class TerminalDisplay(PlainDisplay):
         self._bar.start()
 
     def progress(self, name: str, done: int, total: int, text: str, live: Mapping[str, float]) -> None:
-        """Move the bar."""
+        """Update the bar."""
         if self._task is not None:
             note = " ".join(part for part in (text, _live(live)) if part)
             self._bar.update(self._task, completed=done, total=total or None, note=note)
 
     def stage_finished(self, state: StageState) -> None:
-        """Replace the bar by what the stage took and what came out."""
+        """Replace the bar by the stage's time and results."""
         self.close()
         self.console.print(f"[green]✓[/] {state.name:<7} {_summary(state)}")
 
     def close(self) -> None:
-        """Remove the bar, whatever ended the run."""
+        """Remove the bar."""
         if self._task is not None:
             self._bar.remove_task(self._task)
             self._task = None
@@ -135,20 +136,20 @@ class TerminalDisplay(PlainDisplay):
 
 
 def choose_display(*, quiet: bool, verbose: bool, as_json: bool) -> QuietDisplay:
-    """The display that fits where the output goes."""
+    """The display for the options and the kind of output."""
     if quiet or as_json:
         return QuietDisplay()
     return TerminalDisplay(verbose) if Console().is_terminal else PlainDisplay(verbose=verbose)
 
 
 def close_display(display: Observer) -> None:
-    """Leave the terminal as it was."""
+    """Remove the progress bar, if any."""
     if isinstance(display, TerminalDisplay):
         display.close()
 
 
 def _summary(state: StageState) -> str:
-    """Time and what came out: the stage's own summary, else its first figures."""
+    """Time of a stage and its summary, else its first results."""
     manifest: Mapping[str, Any] = state.artifact.manifest if state.artifact is not None else {}
     out = manifest.get("summary") or figures(manifest.get("results", {}))
     return f"{duration(manifest.get('seconds', 0.0)):>12}  {out}".rstrip()

@@ -1,4 +1,4 @@
-"""`gsbake doctor`: what is installed, what runs where, what is missing and what to do about it."""
+"""`gsbake doctor`: check of Python, libraries, backend, memory and disk."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ from gsbake.pipeline.machine import cpu_name, cuda_devices, default_threads, res
 from gsbake.python_process import python_command, python_environment
 from gsbake.text import size
 
-#: Library (as pip calls it) → module that is imported to see whether it works.
+#: {pip package: module that is imported to check it}.
 MODULES = {
     "numpy": "numpy", "scipy": "scipy", "numba": "numba", "torch": "torch", "pycolmap": "pycolmap", "opencv-contrib-python-headless": "cv2",
     "OpenImageIO": "OpenImageIO", "scikit-image": "skimage.measure", "trimesh": "trimesh", "pymeshlab": "pymeshlab", "xatlas": "xatlas",
     "embreex": "embreex", "safetensors": "safetensors", "jinja2": "jinja2",
 }  # fmt: skip
 
-#: Shared library that may be missing → Debian package that brings it.
+#: {shared library: Debian package that contains it}.
 DEBIAN = {
     "libGL.so": "libgl1", "libOpenGL.so": "libopengl0", "libEGL.so": "libegl1", "libGLX.so": "libglx0", "libX11.so": "libx11-6",
     "libfontconfig.so": "libfontconfig1", "libfreetype.so": "libfreetype6", "libglib-2.0.so": "libglib2.0-0", "libgomp.so": "libgomp1",
@@ -47,7 +47,7 @@ sys.stdout.write(f"seconds={time.perf_counter() - start}")
 
 @dataclass(frozen=True)
 class Finding:
-    """One line of the report; `advice` is empty when all is well."""
+    """One checked item; `advice` is empty when it is fine."""
 
     what: str
     found: str
@@ -56,7 +56,7 @@ class Finding:
 
 
 def doctor(as_json: bool, out: Path) -> None:
-    """Print the findings; exit code 1 when something gsbake needs is missing."""
+    """Print the findings; exit code 1 when a requirement is missing."""
     findings = [*machine_findings(out), *library_findings()]
     good = all(f.ok for f in findings)
     if as_json:
@@ -96,15 +96,15 @@ def machine_findings(out: Path) -> list[Finding]:
 
 
 def backend_finding() -> Finding:
-    """Which device `--device auto` takes, and what else is there."""
+    """Backend of `--device auto`, GPUs and the build of torch."""
     build, devices = torch_cuda_build(), cuda_devices()
-    gpu = f"{devices} NVIDIA GPU there" if devices else "no NVIDIA GPU"
+    gpu = f"{devices} NVIDIA GPU{'s' if devices > 1 else ''}" if devices else "no NVIDIA GPU"
     torch_build = f"torch for CUDA {build}" if build else "torch for the CPU"
     return Finding("backend", f"{resolve_device('auto')} ({gpu}, {torch_build})", True)
 
 
 def library_findings() -> list[Finding]:
-    """Import each library in a process of its own, so that one that crashes is found too."""
+    """Import each library in a separate process, so that crashes are found too."""
     known = versions(tuple(MODULES))
     with ThreadPoolExecutor(2) as pool:
         tried = pool.map(_try_import, MODULES.values())
@@ -119,7 +119,7 @@ def library_findings() -> list[Finding]:
 
 
 def advice_for(library: str, error: str, *, installed: bool) -> str:
-    """What to do about a library that does not load."""
+    """Advice for a library that does not load."""
     if not installed:
         return f"pip install {library} (or run `make setup` again)"
     missing = re.search(r"(lib[\w.+-]+?\.so)[.\d]*: cannot open shared object file", error)
@@ -137,7 +137,7 @@ def _try_import(module: str) -> tuple[float | None, str]:
             timeout=120, check=False,
         )  # fmt: skip
     except subprocess.TimeoutExpired:
-        return None, "importing it takes more than two minutes"
+        return None, "import takes more than two minutes"
     found = re.search(r"seconds=([\d.]+)", done.stdout)
     if done.returncode == 0 and found:
         return float(found.group(1)), ""

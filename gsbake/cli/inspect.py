@@ -1,4 +1,4 @@
-"""`gsbake status`, `explain` and `profiles`: what is there, what would run, and why."""
+"""`gsbake status`, `explain` and `profiles`: state of the stages, cache keys and settings."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from gsbake.config.load import LoadedProfile, bounds, fields, load_profile, ship
 from gsbake.pipeline.plan import StageState
 from gsbake.text import duration, figures, size
 
-_WORDS = {"cached": "cached", "replaced": "by hand", "run": "will run", "waits": "will run"}
+_WORDS = {"cached": "cached", "replaced": "replaced", "run": "will run", "waits": "will run"}
 _STYLES = {"cached": "green", "replaced": "cyan", "run": "yellow", "waits": "yellow"}
 
 
@@ -29,8 +29,8 @@ def _table(*columns: str) -> Table:
 
 
 def print_plan(states: list[StageState]) -> None:
-    """A table of the stages: state, time, memory and why."""
-    table = _table("stage", "state", "time", "memory", "why, or what came out")
+    """Print a table of the stages: state, time, memory, and reason or results."""
+    table = _table("stage", "state", "time", "memory", "reason or results")
     for state in states:
         manifest = state.artifact.manifest if state.artifact is not None else None
         table.add_row(
@@ -80,9 +80,9 @@ def status(options: Options) -> None:
 
 
 def explain(options: Options, stage: str | None) -> None:
-    """Print for one stage, or all, what its key is made of and why it would run."""
+    """Print the inputs of the cache key and the reasons to run, for one stage or all."""
     session = options.session()
-    session.engine.registry.up_to(stage)  # says so when there is no such stage
+    session.engine.registry.up_to(stage)  # raises UsageError for an unknown stage
     states = [s for s in session.engine.plan(stage) if stage is None or s.name == stage]
     if options.as_json:
         typer.echo(json.dumps(plan_document(session, states), indent=1, ensure_ascii=False))
@@ -111,19 +111,19 @@ def explain(options: Options, stage: str | None) -> None:
 
 
 def list_profiles(as_json: bool) -> None:
-    """Print the profiles that come with gsbake."""
+    """Print the shipped profiles."""
     found = {name: load_profile(name).profile.description for name in shipped()}
     if as_json:
         typer.echo(json.dumps(found, indent=1, ensure_ascii=False))
         return
-    table = _table("profile", "what for")
+    table = _table("profile", "description")
     for name, description in found.items():
         table.add_row(name, description)
     Console(highlight=False).print(table)
 
 
 def show_profile(name: str, overrides: list[str], as_json: bool) -> None:
-    """Print every setting of a profile with its value, where that comes from, and its help."""
+    """Print every setting of a profile with its value, source, and help."""
     loaded = load_profile(name, overrides)
     values = setting_values(loaded)
     known = fields()
@@ -134,7 +134,7 @@ def show_profile(name: str, overrides: list[str], as_json: bool) -> None:
         }
         typer.echo(json.dumps(document, indent=1, ensure_ascii=False))
         return
-    table = _table("setting", "value", "from", "help")
+    table = _table("setting", "value", "source", "help")
     for key, value in values.items():
         allowed = bounds(known[key])
         text = f"{known[key].description}{f' ({allowed})' if allowed else ''}"

@@ -1,4 +1,4 @@
-"""The options that commands share, once each."""
+"""Command line options shared by several commands."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 class Device(StrEnum):
-    """Where heavy kernels run."""
+    """Device of the kernels."""
 
     auto = "auto"
     cpu = "cpu"
@@ -47,7 +47,7 @@ PhotosArgument = Annotated[
     Path | None,
     typer.Argument(
         metavar="PHOTOS",
-        help="Folder of photos, or a capture folder with images/, masks/ and poses. Needed the first time only.",
+        help="Folder of photos, or a capture folder with images/, masks/ and poses. Needed in the first run only.",
         show_default=False,
     ),
 ]
@@ -64,11 +64,11 @@ ProfileOption = Annotated[
 SetOption = Annotated[
     list[str] | None,
     typer.Option(
-        "--set", metavar="SECTION.KEY=VALUE", help="Change one setting; repeatable.", show_default=False, autocompletion=complete_setting
+        "--set", metavar="SECTION.KEY=VALUE", help="Override one setting; repeatable.", show_default=False, autocompletion=complete_setting
     ),
 ]
 MasksOption = Annotated[
-    Path | None, typer.Option("--masks", metavar="DIR", help="Masks, one per photo, white where the object is.", show_default=False)
+    Path | None, typer.Option("--masks", metavar="DIR", help="Masks, one per photo, white on the object.", show_default=False)
 ]
 PosesOption = Annotated[
     Path | None,
@@ -76,11 +76,13 @@ PosesOption = Annotated[
         "--poses", metavar="PATH", help="Known poses: transforms.json, a COLMAP model folder or poses_bounds.npy.", show_default=False
     ),
 ]
-InvertOption = Annotated[bool, typer.Option("--invert-masks", help="Masks are white where the background is.")]
-DeviceOption = Annotated[Device, typer.Option("--device", help="Where heavy kernels run.")]
-ThreadsOption = Annotated[int, typer.Option("--threads", min=0, help="Threads; 0 takes the physical cores.", show_default=False)]
-SeedOption = Annotated[int | None, typer.Option("--seed", help="Seed of everything random.  [default: 0]", show_default=False)]
-DryRunOption = Annotated[bool, typer.Option("--dry-run", "-n", help="Print what would be done, and why; do nothing.")]
+InvertOption = Annotated[bool, typer.Option("--invert-masks", help="Masks are white on the background.")]
+DeviceOption = Annotated[Device, typer.Option("--device", help="Device of the kernels.")]
+ThreadsOption = Annotated[int, typer.Option("--threads", min=0, help="Number of threads; 0 uses the physical cores.", show_default=False)]
+SeedOption = Annotated[
+    int | None, typer.Option("--seed", help="Seed of all random numbers, 0 to 2147483647.  [default: 0]", show_default=False)
+]
+DryRunOption = Annotated[bool, typer.Option("--dry-run", "-n", help="Print what would run, and why; run nothing.")]
 QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="Print warnings and errors only.")]
 VerboseOption = Annotated[bool, typer.Option("--verbose", "-v", help="Print every decision with its evidence.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON document instead of text.")]
@@ -88,7 +90,7 @@ JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON documen
 
 @dataclass(frozen=True)
 class Options:
-    """The shared options of one call."""
+    """Values of the shared options."""
 
     photos: Path | None = None
     out: Path | None = None
@@ -105,7 +107,7 @@ class Options:
     as_json: bool = False
 
     def session(self, observer: Observer | None = None) -> Session:
-        """The run that the options describe, ready to go; nothing is written."""
+        """Session of the run that the options describe; nothing is written."""
         from gsbake.api import RunOptions, open_session
 
         run = RunOptions(

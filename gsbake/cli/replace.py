@@ -1,4 +1,4 @@
-"""`gsbake replace STAGE FILE…`: a person's own file in place of a stage's output."""
+"""`gsbake replace STAGE FILE…`: replacement of a stage's output with the user's files."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from gsbake.errors import BadInputError, UsageError
 from gsbake.pipeline.replace import folder_files, replace_output, undo_replacement
 from gsbake.pipeline.store import Artifact
 
-#: A single file with this ending stands for these files of the stage: an edited mesh is both the detailed and the reduced one.
-STANDS_FOR = {("mesh", ".ply"): ("mesh.ply", "dense.ply")}
+#: {(stage, suffix): files that a single file with this suffix replaces}: an edited mesh is both the low-poly and the dense mesh.
+REPLACED_FILES = {("mesh", ".ply"): ("mesh.ply", "dense.ply")}
 
 
 def replace(options: Options, stage: str, paths: list[Path], undo: bool) -> None:
-    """Register the files, or take the registration back."""
+    """Register the replacement, or undo it."""
     session = options.session()
     store = session.engine.store
     session.engine.registry.load(stage)
@@ -26,23 +26,23 @@ def replace(options: Options, stage: str, paths: list[Path], undo: bool) -> None
     if undo:
         if not options.dry_run:
             undo_replacement(store, stage)
-        _say(options, {"stage": stage, "undone": True}, f"{stage}: its own output counts again")
+        _print_result(options, {"stage": stage, "undone": True}, f"{stage}: its own output is used again")
         return
-    base = _current(options, stage)
-    files = _named(stage, paths, base)
+    base = _current_output(options, stage)
+    files = _replacement_files(stage, paths, base)
     if options.dry_run:
-        _say(options, {"stage": stage, "would_replace": sorted(files)}, f"{stage}: would replace {', '.join(sorted(files))}")
+        _print_result(options, {"stage": stage, "would_replace": sorted(files)}, f"{stage}: would replace {', '.join(sorted(files))}")
         return
     artifact = replace_output(store, stage, files, base)
-    _say(
+    _print_result(
         options,
         {"stage": stage, "replaced": sorted(files), "folder": str(artifact.folder)},
-        f"{stage}: {', '.join(sorted(files))} put in place by hand; `gsbake run` goes on from there",
+        f"{stage}: {', '.join(sorted(files))} replaced; `gsbake run` continues from there",
     )
 
 
-def _current(options: Options, stage: str) -> Artifact | None:
-    """The stage's output as things stand: by hand, else cached, else the newest there is."""
+def _current_output(options: Options, stage: str) -> Artifact | None:
+    """The stage's present output: the replacement, else the cached artifact, else the newest one; None without any."""
     session = options.session()
     replacement = session.engine.store.replacement(stage)
     if replacement is not None:
@@ -57,8 +57,8 @@ def _current(options: Options, stage: str) -> Artifact | None:
     return Artifact(folder, {name: entry["digest"] for name, entry in manifest["files"].items()}, manifest)
 
 
-def _named(stage: str, paths: list[Path], base: Artifact | None) -> dict[str, Path]:
-    """{name in the artifact: the person's file}."""
+def _replacement_files(stage: str, paths: list[Path], base: Artifact | None) -> dict[str, Path]:
+    """{file in the artifact: file of the user}."""
     for path in paths:
         if not path.exists():
             raise BadInputError(f"'{path}' does not exist.")
@@ -67,7 +67,7 @@ def _named(stage: str, paths: list[Path], base: Artifact | None) -> dict[str, Pa
     files: dict[str, Path] = {}
     known = set(base.files) if base is not None else set()
     for path in paths:
-        targets = STANDS_FOR.get((stage, path.suffix.lower()), ())
+        targets = REPLACED_FILES.get((stage, path.suffix.lower()), ())
         if len(paths) == 1 and targets and path.name not in set(targets[1:]):
             _check_ply(path)
             files.update(dict.fromkeys(targets, path))
@@ -77,7 +77,7 @@ def _named(stage: str, paths: list[Path], base: Artifact | None) -> dict[str, Pa
             raise UsageError(f"Stage '{stage}' has no file '{path.name}' in its output; it has {', '.join(sorted(known)[:8])}.")
         else:
             raise UsageError(
-                f"Stage '{stage}' has not run yet, so nothing tells what '{path.name}' replaces: run it first, or give a folder."
+                f"Stage '{stage}' has not run yet, so it is unknown which file '{path.name}' replaces: run it first, or give a folder."
             )
     return files
 
@@ -85,10 +85,10 @@ def _named(stage: str, paths: list[Path], base: Artifact | None) -> dict[str, Pa
 def _check_ply(path: Path) -> None:
     with path.open("rb") as file:
         if file.read(3) != b"ply":
-            raise BadInputError(f"'{path}' is not a PLY file, whatever its name says; export the mesh as PLY.")
+            raise BadInputError(f"'{path}' is not a PLY file; export the mesh as PLY.")
 
 
-def _say(options: Options, document: dict[str, object], text: str) -> None:
+def _print_result(options: Options, document: dict[str, object], text: str) -> None:
     if options.as_json:
         typer.echo(json.dumps(document, ensure_ascii=False))
     elif not options.quiet:

@@ -1,4 +1,4 @@
-"""`gsbake run` and the stage commands: bring the pipeline up to a stage."""
+"""`gsbake run` and the stage commands."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from gsbake.text import duration, number, size
 
 
 def run_pipeline(options: Options, target: str | None) -> None:
-    """Run up to `target` (everything without one) and print where the results are."""
+    """Bring the stages up to `target` (None: all) up to date and print a summary."""
     start = time.perf_counter()
     display = choose_display(quiet=options.quiet, verbose=options.verbose, as_json=options.as_json)
     session = options.session(display)
@@ -36,12 +36,12 @@ def run_pipeline(options: Options, target: str | None) -> None:
     if options.as_json:
         typer.echo(json.dumps(_document(result, seconds), indent=1, ensure_ascii=False))
     elif not options.quiet:
-        for name, text in closing(result, seconds):
+        for name, text in summary_lines(result, seconds):
             typer.echo(f"{name:<9} {text}")
 
 
-def closing(result: Result, seconds: float) -> list[tuple[str, str]]:
-    """The last lines of a run: asset, test figure, warnings, report and time, as far as the run went."""
+def summary_lines(result: Result, seconds: float) -> list[tuple[str, str]]:
+    """Summary lines (name, text) of a run: asset, image metrics, warnings, report and time, as far as they exist."""
     lines = []
     figures = {state.name: state.artifact.manifest.get("results", {}) for state in result.stages if state.artifact is not None}
     asset, export, report = result.files.get("asset.glb"), figures.get("export", {}), figures.get("report", {})

@@ -1,4 +1,4 @@
-"""`gsbake synth`: writes the built-in capture."""
+"""`gsbake synth`: the built-in synthetic capture."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from gsbake.text import duration
 def synth(
     folder: Path, *, views: int, size: int, seed: int, poses: bool, background: bool, dry_run: bool, quiet: bool, as_json: bool
 ) -> None:
-    """Write the capture and say where it is."""
+    """Write the capture and print its folder."""
     start = time.perf_counter()
     if not dry_run:
         from gsbake.synth.capture import write_capture

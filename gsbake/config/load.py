@@ -1,4 +1,6 @@
-"""Profiles: TOML files that extend one another, `--set section.key=value` on top, and errors that name the nearest valid key.
+"""Loading of profiles: TOML files that extend one another, overridden by `--set section.key=value`.
+
+An unknown key is an error that names the nearest valid one; an invalid value is an error that names the allowed ones.
 
 extends = "preview"          # a shipped profile, or a path relative to this file
 
@@ -21,14 +23,17 @@ from pydantic.fields import FieldInfo
 
 from gsbake.config.schema import Profile
 from gsbake.errors import BadInputError, UsageError
+from gsbake.text import number
 
-#: What `--profile` means when it is not given.
+#: Profile without `--profile`.
 DEFAULT = "relight"
+#: Characters of an invalid value that a message shows.
+MAX_VALUE_LENGTH = 60
 
 
 @dataclass(frozen=True)
 class LoadedProfile:
-    """A validated profile; `origins` says for each "section.key" where its value comes from ("default", a file's name, "--set")."""
+    """A validated profile; `origins` maps each "section.key" to the source of its value ("default", a profile, a file or "--set")."""
 
     name: str
     profile: Profile
@@ -36,16 +41,16 @@ class LoadedProfile:
 
 
 def shipped() -> dict[str, Path]:
-    """{name: file} of the profiles that come with gsbake, in alphabetical order."""
+    """{name: file} of the shipped profiles, in alphabetical order."""
     folder = Path(str(resources.files("gsbake.profiles")))
     return {path.stem: path for path in sorted(folder.glob("*.toml"))}
 
 
 def load_profile(name: str = DEFAULT, overrides: Sequence[str] = ()) -> LoadedProfile:
-    """The profile called `name` (shipped, or a TOML file) with `overrides` ("section.key=value") applied.
+    """Load the profile `name` (a shipped one or a TOML file) and apply `overrides` ("section.key=value").
 
-    Raises UsageError for a profile that does not exist or an override without '=', BadInputError for an unknown key or a bad
-    value, naming file, key and what would be right.
+    Raises UsageError for a profile that does not exist or an override without '=', BadInputError for an unknown key or an invalid value,
+    with file, key and allowed values.
     """
     values: dict[str, Any] = {}
     origins: dict[str, str] = {}
@@ -74,12 +79,18 @@ def fields() -> dict[str, FieldInfo]:
 
 
 def bounds(field: FieldInfo) -> str:
-    """The allowed values of a field in words: "≥ 0", "one of auto, points", or ""."""
-    choices = get_args(field.annotation)
-    if choices and not any(isinstance(c, type) for c in choices):
-        return "one of " + ", ".join(str(c) for c in choices)
-    signs = {"ge": "≥", "gt": ">", "le": "≤", "lt": "<"}
-    return ", ".join(f"{sign} {getattr(m, name)}" for m in field.metadata for name, sign in signs.items() if hasattr(m, name))
+    """The allowed values of a field in words: "a whole number from 0 to 100", "one of auto, points", "true or false"; "" for any text."""
+    kind = field.annotation
+    if kind is bool:
+        return "true or false"
+    if choices := get_args(kind):
+        words = [word for c in choices for word in (("true", "false") if c is bool else get_args(c) or (c,))]
+        return "one of " + ", ".join(str(word) for word in words)
+    limits = {name: number(getattr(m, name)) for m in field.metadata for name in ("ge", "gt", "le") if hasattr(m, name)}
+    if not limits:
+        return ""
+    lower = f"from {limits['ge']}" if "ge" in limits else f"above {limits['gt']}, up"
+    return f"a {'whole ' if kind is int else ''}number {lower} to {limits['le']}"
 
 
 def _shipped_folder() -> Path:
@@ -87,7 +98,7 @@ def _shipped_folder() -> Path:
 
 
 def _find(name: str, relative_to: Path | None) -> Path:
-    """The file a profile name or path stands for; a name in `extends` may be a path relative to its file."""
+    """Path of a profile given by name or path; a path in `extends` is relative to the extending file."""
     known = shipped()
     if name in known:
         return known[name]
@@ -103,11 +114,11 @@ def _find(name: str, relative_to: Path | None) -> Path:
 
 
 def _chain(path: Path) -> list[Path]:
-    """The file and those it extends, the most basic last."""
+    """The file, the one it extends, and so on up to the base."""
     chain: list[Path] = []
     while True:
         if path.resolve() in [p.resolve() for p in chain]:
-            raise BadInputError(f"{chain[-1]}: 'extends' goes round in a circle through {path.name}.")
+            raise BadInputError(f"{chain[-1]}: 'extends' forms a cycle through {path.name}.")
         chain.append(path)
         parent = _toml(path).get("extends")
         if parent is None:
@@ -120,14 +131,14 @@ def _chain(path: Path) -> list[Path]:
 def _toml(path: Path) -> dict[str, Any]:
     try:
         return tomllib.loads(path.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except ValueError as error:  # not TOML, not UTF-8, or an integer too long to convert
         raise BadInputError(f"{path} is not valid TOML: {error}.") from error
     except OSError as error:
         raise BadInputError(f"{path} cannot be read: {error.strerror}.") from error
 
 
 def _read(path: Path) -> dict[str, Any]:
-    """{"section.key": value} of one file, keys checked."""
+    """{"section.key": value} of one file. Raises BadInputError for an unknown key."""
     out: dict[str, Any] = {}
     for name, value in _toml(path).items():
         if name == "extends":
@@ -149,7 +160,7 @@ def _check_key(key: str, where: str) -> None:
 
 
 def _nearest(key: str, known: Iterable[str]) -> str:
-    """The most similar key; one with the same last part comes first, for a setting put into the wrong section."""
+    """The most similar key; keys with the same last part first, because the section may be wrong."""
     last = key.rsplit(".", 1)[-1]
     nearest = max((k for k in known if "." in k), key=lambda k: (k.split(".")[1] == last, difflib.SequenceMatcher(None, key, k).ratio()))
     return f"the nearest is '{nearest}'"
@@ -165,8 +176,8 @@ def _parse_override(text: str) -> tuple[str, Any]:
         return key, raw
     try:
         return key, tomllib.loads(f"value = {raw}")["value"]
-    except tomllib.TOMLDecodeError:
-        return key, raw  # a bare word, as in --set mesh.holes=leave
+    except ValueError:
+        return key, raw  # a bare word, as in --set mesh.holes=leave, or an integer too long to convert
 
 
 def _validate(values: Mapping[str, Any], origins: Mapping[str, str]) -> Profile:
@@ -185,10 +196,9 @@ def _validate(values: Mapping[str, Any], origins: Mapping[str, str]) -> Profile:
         value = first["input"]
         field = fields().get(key)
         allowed = bounds(field) if field is not None else ""
-        if first["type"].startswith("bool"):
-            allowed = "true or false"
         text = f"must be {allowed}" if allowed else f"fails with: {first['msg']}"
         if isinstance(value, str) and field is not None:
             near = difflib.get_close_matches(value, [str(c) for c in get_args(field.annotation)], 1)
             text += f" (did you mean '{near[0]}'?)" if near else ""
-        raise BadInputError(f"{origins.get(key, 'profile')}: {key} = {value!r} is invalid: it {text}.") from error
+        shown = repr(value) if len(repr(value)) <= MAX_VALUE_LENGTH else repr(value)[:MAX_VALUE_LENGTH] + "…"
+        raise BadInputError(f"{origins.get(key, 'profile')}: {key} = {shown} is invalid: it {text}.") from error

@@ -1,7 +1,8 @@
-"""Every setting gsbake has, by section; each field's description is its help text.
+"""Schema of all settings by section, with defaults, ranges and help texts.
 
-A profile (TOML) fills these sections. An unknown key, or a value outside its range, is an error that names the nearest valid key.
-A stage declares the fields it reads ("train.iterations" or "train.*"): only those enter its cache key.
+A profile (TOML) fills these sections. An unknown key or a value outside its range is an error that names the setting. Every number has a
+lower and an upper bound and is finite. A stage declares the fields it reads ("train.iterations" or "train.*"): only those enter its cache
+key.
 """
 
 from __future__ import annotations
@@ -13,11 +14,16 @@ from pydantic import BaseModel, ConfigDict, Field
 from gsbake.monitor import Rule
 
 Fraction = Annotated[float, Field(ge=0, le=1)]
+#: Weight of a loss term or a prior; 0 switches it off.
+Weight = Annotated[float, Field(ge=0, le=10_000)]
+LearningRate = Annotated[float, Field(gt=0, le=1)]
+#: Longer side of a photo in pixels.
+PhotoSize = Annotated[int, Field(ge=16, le=16_384)]
 Pruning = Literal["visibility", "sdf", "gsdf", "gaussianroom", "gs-ror2"]
 
 
 class Section(BaseModel):
-    """Base of all sections: unknown keys are errors, docs come from the field descriptions."""
+    """Base of all sections: unknown keys and numbers that are not finite are errors."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
@@ -25,52 +31,53 @@ class Section(BaseModel):
 class Ingest(Section):
     """Reading photos, masks and known poses."""
 
-    max_size: int = Field(1600, ge=16, le=16384, description="Longer side of the working photos in pixels. Larger photos are reduced with an area filter.")
-    masks: Literal["auto", "require", "ignore"] = Field("auto", description="auto: use the masks that are there; require: a photo without a mask is an error; ignore: use none.")
-    invert_masks: bool = Field(False, description="Masks are white where the background is.")
-    min_photos: int = Field(3, ge=2, description="Fewer usable photos than this are an error.")
+    max_size: PhotoSize = Field(1600, description="Longer side of the working photos in pixels. Larger photos are downsampled with an area filter.")
+    masks: Literal["auto", "require", "ignore"] = Field("auto", description="auto: use the masks there are; require: a photo without a mask is an error; ignore: use none.")
+    invert_masks: bool = Field(False, description="Masks are white on the background instead of the object.")
+    max_megapixels: float = Field(250.0, gt=0, le=10_000, description="Photos and masks with more megapixels are skipped, from their header alone.")
+    min_photos: int = Field(3, ge=2, le=10_000, description="Minimum number of usable photos; fewer are an error.")
 
 
 class Poses(Section):
     """Structure from motion and the unit frame."""
 
-    source: Literal["auto", "given", "solve"] = Field("auto", description="auto: use given poses, else solve; given: missing poses are an error; solve: structure from motion in any case.")
-    max_features: int = Field(8192, ge=256, description="SIFT features per photo.")
-    peak_threshold: float = Field(0.0033, gt=0, description="SIFT peak threshold; a lower one finds more features on smooth surfaces.")
-    matching: Literal["auto", "exhaustive", "ranked", "sequential", "vocabulary"] = Field("auto", description="Which pairs of photos are matched; auto chooses by number and names of the photos.")
+    source: Literal["auto", "given", "solve"] = Field("auto", description="auto: given poses if there are any, else structure from motion; given: missing poses are an error; solve: always structure from motion.")
+    max_features: int = Field(8192, ge=256, le=100_000, description="Maximum number of SIFT features per photo.")
+    peak_threshold: float = Field(0.0033, gt=0, le=1, description="SIFT peak threshold; a lower one finds more features on surfaces with little texture.")
+    matching: Literal["auto", "exhaustive", "ranked", "sequential", "vocabulary"] = Field("auto", description="Selection of the photo pairs to match; auto decides by the number and names of the photos.")
     mapper: Literal["incremental", "global"] = Field("incremental", description="COLMAP mapper.")
-    min_registered: Fraction = Field(0.5, description="A smaller share of registered photos is an error.")
+    min_registered: Fraction = Field(0.5, description="Minimum share of registered photos; a smaller one is an error.")
     masked_features: bool | Literal["auto"] = Field(
-        "auto", description="Detect features only inside the masks; auto does so where the background is static (turntables)."
+        "auto", description="Detect features inside the masks only. auto: only where the background is static (turntables)."
     )
-    max_size: int = Field(1600, ge=64, le=16384, description="Longer side in pixels at which features are detected.")
+    max_size: int = Field(1600, ge=64, le=16_384, description="Longer side in pixels of the photos in which features are detected.")
     fine_features: bool | Literal["auto"] = Field(
-        "auto", description="Detect features in photos upsampled twofold too (5 times the cost); auto does so where features are few or photos fail to register."
+        "auto", description="Also detect features in photos upsampled by 2 (5 times the time). auto: only where features are few or photos fail to register."
     )
 
 
 class Stereo(Section):
-    """Multi-view stereo: depth maps where photos can be matched."""
+    """Multi-view stereo: depth maps by patch matching."""
 
-    enabled: Rule = Field("auto", description="Match photos before training; auto skips it when photos are too few or too small.")
-    max_size: int = Field(800, ge=64, le=4000, description="Longer side in pixels at which photos are matched.")
+    enabled: Rule = Field("auto", description="Run multi-view stereo before training. auto: unless photos are too few or too small.")
+    max_size: int = Field(800, ge=64, le=4000, description="Longer side in pixels of the photos that are matched.")
     neighbours: int = Field(6, ge=1, le=8, description="Source views per reference view.")
-    best_views: int = Field(4, ge=1, le=8, description="Source views whose cost is averaged per pixel: the best ones.")
-    consistency_views: int = Field(12, ge=1, le=32, description="Views that a depth map is checked against.")
-    min_consistent_views: int = Field(2, ge=1, le=10, description="Views that must agree with a depth.")
+    best_views: int = Field(4, ge=1, le=8, description="Source views with the lowest matching cost, over which a pixel's cost is averaged.")
+    consistency_views: int = Field(12, ge=1, le=32, description="Views with which the geometric consistency of a depth map is checked.")
+    min_consistent_views: int = Field(2, ge=1, le=10, description="Minimum number of views that agree on a depth; other depths are dropped.")
 
 
 class Surfels(Section):
-    """The surfel model and its rasteriser."""
+    """Surfel model and rasteriser."""
 
-    shading: Literal["colour", "pbr"] = Field("colour", description="colour: plain colour with view dependence; pbr: deferred split-sum shading with a learnt environment map.")
-    sh_degree: int = Field(1, ge=0, le=2, description="Degree of the spherical harmonics in colour shading.")
-    transfer: Literal["sech2", "bell", "gaussian", "laplace", "neus"] = Field("sech2", description="Transfer function from SDF sample to opacity: the discretized SDF's sech², 3DGSR's bell, a Gaussian, VolSDF's Laplace or NeuS's law on a thin layer.")
-    max_count: int = Field(60_000, ge=100, description="Upper bound on the number of surfels.")
+    shading: Literal["colour", "pbr"] = Field("colour", description="colour: radiance as spherical harmonics; pbr: deferred split-sum shading with a learnt environment map.")
+    sh_degree: int = Field(1, ge=0, le=2, description="Degree of the spherical harmonics (surfels.shading = colour).")
+    transfer: Literal["sech2", "bell", "gaussian", "laplace", "neus"] = Field("sech2", description="Transfer function from SDF sample to opacity: sech² (discretized SDF), the bell of 3DGSR, a Gaussian, the Laplace density of VolSDF, or the density of NeuS on a thin layer.")
+    max_count: int = Field(60_000, ge=100, le=10_000_000, description="Maximum number of surfels.")
 
 
 class Light(Section):
-    """The environment map."""
+    """Environment map."""
 
     size: int = Field(32, ge=4, le=128, description="Edge of the cube map's faces in texels.")
 
@@ -78,116 +85,116 @@ class Light(Section):
 class Train(Section):
     """Training of the surfels."""
 
-    iterations: int = Field(3000, ge=0, le=10_000_000, description="Training iterations; the schedule scales with them.")
-    max_size: int = Field(512, ge=16, description="Longer side of the training photos in pixels.")
-    coarse_share: Fraction = Field(0.5, description="Share of the iterations at half resolution.")
-    init_surfels: int = Field(20_000, ge=10, description="Initial number of surfels.")
-    init: Literal["auto", "stereo", "points", "hull", "sphere"] = Field("auto", description="Initialisation: stereo points, SfM points, the visual hull, a sphere, or the best of these there is.")
+    iterations: int = Field(3000, ge=0, le=10_000_000, description="Training iterations; all schedules scale with them.")
+    max_size: PhotoSize = Field(512, description="Longer side of the training photos in pixels.")
+    coarse_share: Fraction = Field(0.5, description="Share of the iterations that train at half resolution, before those at full resolution.")
+    init_surfels: int = Field(20_000, ge=10, le=10_000_000, description="Initial number of surfels.")
+    init: Literal["auto", "stereo", "points", "hull", "sphere"] = Field("auto", description="Initialisation: stereo points, the visual hull, tie points or a sphere. auto: the first of these that is available.")
     densify: Literal["auto", "gradient", "sdf", "gsdf", "gaussianroom", "none"] = Field(
-        "gradient", description="Densification policy: largest screen-space gradient; sdf: of these, those within a spacing of the surface; the rules of GSDF or GaussianRoom; none. auto: none after stereo initialisation, else gradient."
+        "gradient", description="Densification. gradient: surfels with the largest screen-space gradient; sdf: of these, those close to the surface; gsdf, gaussianroom: the rules of those papers. auto: none after stereo initialisation, else gradient."
     )
-    prune: Pruning = Field("visibility", description="Pruning policy during training, by SDF sample (the policies of refine.prune).")
-    holdout: int = Field(8, ge=0, description="Every n-th photo is held out of training; 0 holds none out.")
-    lr_position: float = Field(8e-4, gt=0, description="Learning rate of positions; decays to 1/100.")
-    lr_scale: float = Field(0.02, gt=0, description="Learning rate of log-scales; decays to 1/10.")
-    lr_rotation: float = Field(2e-3, gt=0, description="Learning rate of quaternions; decays to 1/10.")
-    lr_sdf: float = Field(0.005, gt=0, description="Learning rate of SDF samples; decays to 1/10.")
-    lr_gamma: float = Field(0.03, gt=0, description="Learning rate of the sharpness γ; decays to 1/10.")
-    lr_material: float = Field(1.6e-2, gt=0, description="Learning rate of colours and materials; decays to 1/10.")
-    lr_light: float = Field(5e-2, gt=0, description="Learning rate of the environment map; decays to 1/10.")
+    prune: Pruning = Field("visibility", description="Pruning during training; the policies of refine.prune.")
+    holdout: int = Field(8, ge=0, le=1000, description="Every n-th photo is held out of training; 0 holds none out.")
+    lr_position: LearningRate = Field(8e-4, description="Learning rate of positions (unit frame); decays to 1/100.")
+    lr_scale: LearningRate = Field(0.02, description="Learning rate of log-scales; decays to 1/10.")
+    lr_rotation: LearningRate = Field(2e-3, description="Learning rate of quaternions; decays to 1/10.")
+    lr_sdf: LearningRate = Field(0.005, description="Learning rate of SDF samples; decays to 1/10.")
+    lr_gamma: LearningRate = Field(0.03, description="Learning rate of the sharpness γ; decays to 1/10.")
+    lr_material: LearningRate = Field(1.6e-2, description="Learning rate of colours and materials; decays to 1/10.")
+    lr_light: LearningRate = Field(5e-2, description="Learning rate of the environment map; decays to 1/10.")
 
 
 class Loss(Section):
     """Weights of the training losses."""
 
     ssim: Fraction = Field(0.2, description="Share of 1 − SSIM in the colour loss; the rest is L1.")
-    median: float = Field(1.0, ge=0, description="Median loss: raises the sharpness γ as the median SDF sample shrinks.")
-    projection: float = Field(10.0, ge=0, description="Projection loss: surfels moved by their SDF sample lie on the rendered depth.")
-    normal: float = Field(0.2, ge=0, description="Surfel normals against normals of the depth map.")
-    distortion: float = Field(100.0, ge=0, description="Depth distortion: concentrates the weights along a ray.")
-    mask: float = Field(0.3, ge=0, description="Cross-entropy of alpha and mask.")
-    smoothness: float = Field(0.02, ge=0, description="Edge-aware smoothness of materials.")
-    neutral_light: float = Field(0.005, ge=0, description="Regularisation towards a grey environment map.")
+    median: Weight = Field(1.0, description="Median loss: raises the sharpness γ as the median SDF sample shrinks.")
+    projection: Weight = Field(10.0, description="Projection loss: surfels displaced by their SDF sample lie on the rendered depth.")
+    normal: Weight = Field(0.2, description="Consistency of surfel normals with the normals of the depth map.")
+    distortion: Weight = Field(100.0, description="Depth distortion: concentrates the blending weights along a ray.")
+    mask: Weight = Field(0.3, description="Cross-entropy of rendered alpha and mask.")
+    smoothness: Weight = Field(0.02, description="Edge-aware smoothness of materials (surfels.shading = pbr).")
+    neutral_light: Weight = Field(0.005, description="Regularisation of the environment map towards grey (surfels.shading = pbr).")
 
 
 class Refine(Section):
     """Pruning, densification and fine-tuning after training."""
 
-    iterations: int = Field(600, ge=0, le=10_000_000, description="Fine-tuning iterations after pruning and densification.")
+    iterations: int = Field(600, ge=0, le=10_000_000, description="Fine-tuning iterations.")
     prune: Pruning = Field(
-        "visibility", description="Pruning policy: visibility alone; sdf: distance to the rendered surface (prune_distance); the rules of GSDF, GaussianRoom or GS-ROR²."
+        "visibility", description="Pruning. visibility: surfels that no photo sees; sdf: also those far from the rendered surface (refine.prune_distance); gsdf, gaussianroom, gs-ror2: the rules of those papers."
     )
-    prune_distance: float = Field(3.0, gt=0, description="Surfels farther from the rendered surface than this many surfel spacings are pruned (refine.prune = sdf).")
-    densify_share: Fraction = Field(0.3, description="At most this share of surfels is added where the surface is undersampled.")
+    prune_distance: float = Field(3.0, gt=0, le=1000, description="Maximum distance to the rendered surface in surfel spacings (refine.prune = sdf).")
+    densify_share: Fraction = Field(0.3, description="Maximum share of surfels added where the surface is undersampled.")
 
 
 class Mesh(Section):
     """Distance field, marching cubes, clean-up and decimation."""
 
     resolution: int = Field(0, ge=0, le=2048, description="Voxels along the longest side; 0 derives it from surfel spacing and pixel footprint.")
-    max_resolution: int = Field(384, ge=16, le=2048, description="Upper bound of the derived resolution.")
-    field: Literal["tsdf", "imls"] = Field("tsdf", description="Field that is meshed: fused depth maps, or the surfels' SDF samples.")
-    holes: Literal["close", "leave"] = Field("close", description="Close what no photo observed, or leave it open.")
-    support_plane: Literal["remove", "keep"] = Field("remove", description="Without masks: remove the plane that the object stands on, or keep it.")
-    faces: int = Field(30_000, ge=100, description="Triangles of the asset.")
-    smoothing_iterations: int = Field(2, ge=0, description="Taubin smoothing iterations on the dense mesh.")
-    normal_wavelength: float = Field(8.0, ge=0, description="Wavelength in voxels below which detail comes from rendered normals instead of depth; 0 is off.")
-    silhouette_iterations: int = Field(3, ge=0, description="Iterations of silhouette refinement against the masks; 0 is off.")
-    photometric_iterations: int = Field(2, ge=0, description="Iterations of photometric refinement on textured surfaces; 0 is off.")
-    min_component: Fraction = Field(0.02, description="Components with a smaller share of the largest one's area are removed.")
+    max_resolution: int = Field(384, ge=16, le=2048, description="Maximum of the derived resolution in voxels.")
+    field: Literal["tsdf", "imls"] = Field("tsdf", description="Field that is meshed. tsdf: fused depth maps; imls: the surfels' SDF samples.")
+    holes: Literal["close", "leave"] = Field("close", description="Fill the surface where no photo observed it, or leave holes.")
+    support_plane: Literal["remove", "keep"] = Field("remove", description="Without masks: remove or keep the plane on which the object stands.")
+    faces: int = Field(30_000, ge=100, le=10_000_000, description="Triangles of the low-poly mesh.")
+    smoothing_iterations: int = Field(2, ge=0, le=1000, description="Taubin smoothing iterations on the dense mesh.")
+    normal_wavelength: float = Field(8.0, ge=0, le=1000, description="Wavelength in voxels below which detail comes from rendered normals instead of depth; 0 is off.")
+    silhouette_iterations: int = Field(3, ge=0, le=100, description="Mesh refinement iterations against the masks; 0 is off.")
+    photometric_iterations: int = Field(2, ge=0, le=100, description="Mesh refinement iterations by photometric consistency on textured surfaces; 0 is off.")
+    min_component: Fraction = Field(0.02, description="Minimum area of a connected component as a share of the largest one's; smaller ones are removed.")
 
 
 class Bake(Section):
     """UV atlas, textures and materials."""
 
     size: Literal[128, 256, 512, 1024, 2048, 4096] = Field(1024, description="Edge of the square textures in texels.")
-    occlusion_rays: int = Field(64, ge=0, description="Rays per texel for ambient occlusion; 0 is off.")
+    occlusion_rays: int = Field(64, ge=0, le=4096, description="Rays per texel for ambient occlusion; 0 is off.")
     visibility: Literal["none", "ambient", "directional", "bounce", "reflections"] = Field(
-        "reflections", description="What the material fit knows of the object around a texel: nothing; ambient occlusion; shadows of the current light; indirect diffuse light too; mirror reflections of the object too."
+        "reflections", description="Light transport in the material fit, each with those before. none: unoccluded; ambient: ambient occlusion; directional: shadows; bounce: indirect diffuse light; reflections: specular reflections of the object itself."
     )
     materials: Literal["none", "delight", "fit", "surfels"] = Field(
-        "none", description="none: projected colours; delight: colours without the shading of one diffuse light; fit: materials and light fitted to the photos in texture space; surfels: those the surfels learnt (surfels.shading = pbr)."
+        "none", description="none: projected colours; delight: projected colours divided by the shading of one diffuse environment; fit: materials and environment map fitted to the photos in texture space; surfels: materials learnt in training (surfels.shading = pbr)."
     )
-    fit_iterations: int = Field(400, ge=1, description="Iterations of the material fit.")
-    fit_size: int = Field(800, ge=16, description="Longer side in pixels of the photos that materials are fitted to.")
-    smoothness: float = Field(0.03, ge=0, description="Total variation weight: neighbouring texels have similar materials.")
-    base_color_l1: float = Field(0.005, ge=0, description="L1 weight on base colour; fixes the albedo–illumination scale.")
-    metallic_l1: float = Field(0.003, ge=0, description="L1 weight on metallic: most surfaces are dielectric.")
-    neutral_light: float = Field(0.0005, ge=0, description="Regularisation towards a grey environment map.")
-    sparsity: float = Field(0.03, ge=0, description="Reflectance sparsity prior: an object has few materials. Scaled by the mean residual.")
-    default_roughness: Fraction = Field(0.8, description="Roughness where none is measured (bake.materials = none or delight).")
+    fit_iterations: int = Field(400, ge=1, le=100_000, description="Iterations of the material fit.")
+    fit_size: PhotoSize = Field(800, description="Longer side in pixels of the photos to which materials are fitted.")
+    smoothness: Weight = Field(0.03, description="Total variation of materials between neighbouring texels.")
+    base_color_l1: Weight = Field(0.005, description="L1 norm of base colour; resolves the albedo–illumination ambiguity.")
+    metallic_l1: Weight = Field(0.003, description="L1 norm of metallic; most surfaces are dielectric.")
+    neutral_light: Weight = Field(0.0005, description="Regularisation of the environment map towards grey.")
+    sparsity: Weight = Field(0.03, description="Reflectance sparsity prior: an object has few materials. Scaled by the mean residual.")
+    default_roughness: Fraction = Field(0.8, description="Roughness where none is fitted (bake.materials = none or delight).")
 
 
 class Export(Section):
-    """The GLB and the files beside it."""
+    """GLB and the files beside it."""
 
-    max_megabytes: float = Field(5.0, gt=0, description="File size above which the audit warns.")
-    max_triangles: int = Field(100_000, ge=100, description="Triangle count above which the audit fails.")
+    max_megabytes: float = Field(5.0, gt=0, le=4096, description="Maximum file size in MB: normal and material maps are reduced to meet it; the audit warns above it.")
+    max_triangles: int = Field(100_000, ge=100, le=10_000_000, description="Maximum triangle count; the audit fails above it.")
     copyright: str = Field("", description="Copyright line of the asset.")
 
 
 class Report(Section):
-    """The HTML report."""
+    """HTML report."""
 
-    views: int = Field(4, ge=1, description="Held-out photos shown beside renders of the asset.")
-    view_size: int = Field(512, ge=32, description="Longer side of the renders in pixels.")
+    views: int = Field(4, ge=1, le=24, description="Photos shown beside renders of the asset.")
+    view_size: int = Field(512, ge=32, le=4096, description="Longer side of the renders in pixels.")
 
 
 class Skip(Section):
-    """Work that a scene may not need. auto: measured evidence decides; always: skip it; never: do it in any case."""
+    """Work that a capture may not need. auto: skip it where measurements allow; always: skip it; never: do it."""
 
     resolution: Rule = Field("auto", description="Full resolution, where photos hold no detail above half of it.")
-    redundant_photos: Rule = Field("auto", description="Photos saved twice, or of a place that many others show from the same side. always: in small sets too.")
-    specular: Rule = Field("auto", description="Fitting specular reflection, where the surface looks the same in all photos.")
-    confirmed_steps: Rule = Field("auto", description="Training iterations in proportion to the share of the object that stereo confirmed, up to half of them. always: half of them.")
-    converged_steps: Rule = Field("auto", description="Training iterations after held-out PSNR and median SDF sample have reached a plateau. always: the last iterations in any case.")
-    pose_refinement: Rule = Field("auto", description="Refining poses during training, where held-out photos gain nothing.")
-    exposure_refinement: Rule = Field("auto", description="Learning exposure gains during training, where held-out photos gain nothing.")
+    redundant_photos: Rule = Field("auto", description="Duplicate photos, and photos of views that many others cover. always: in small captures too.")
+    specular: Rule = Field("auto", description="Fitting specular reflection, where the surface shows no view dependence.")
+    confirmed_steps: Rule = Field("auto", description="Up to half of the training iterations, in proportion to the share of the object that stereo confirmed. always: half of them.")
+    converged_steps: Rule = Field("auto", description="Training iterations after held-out PSNR and median SDF sample reach a plateau (early stopping). always: the last iterations in any case.")
+    pose_refinement: Rule = Field("auto", description="Refining poses during training, where held-out PSNR does not improve.")
+    exposure_refinement: Rule = Field("auto", description="Learning exposure gains during training, where held-out PSNR does not improve.")
     empty_cells: Rule = Field("auto", description="Voxels far from the surface.")
-    exposure_equalisation: Rule = Field("auto", description="Dividing out exposure gains, where photos agree in brightness on the surface.")
+    exposure_equalisation: Rule = Field("auto", description="Dividing out exposure gains, where the photos agree in brightness on the surface.")
     normal_map: Rule = Field("auto", description="The normal map, where the low-poly mesh has the normals of the dense one.")
-    metallic_map: Rule = Field("auto", description="The metallic map, where no texel is metallic and held-out photos do not need it.")
-    roughness_map: Rule = Field("auto", description="The roughness map, where one value explains held-out photos as well.")
+    metallic_map: Rule = Field("auto", description="The metallic map, where no texel is metallic and held-out PSNR does not need it.")
+    roughness_map: Rule = Field("auto", description="The roughness map, where one value fits held-out photos as well.")
 
 
 class Profile(Section):

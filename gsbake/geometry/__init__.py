@@ -1,1 +1,1 @@
-"""Cameras, meshes, point clouds, rays and tangent frames: what every step stands on."""
+"""Cameras, meshes, point clouds, ray casting and tangent frames."""

@@ -1,7 +1,7 @@
-"""Pinhole cameras, the similarity between frames, and their JSON form.
+"""Pinhole cameras, similarity transforms and their JSON format.
 
 OpenCV axes (x right, y down, z forward), world→camera `R, t`; pixel (i, j) has its centre at (i + .5, j + .5).
-A `CameraSet` also carries the similarity from its frame to the world frame, so that no artifact loses its scale.
+A `CameraSet` also stores the similarity from its frame to the world frame, so that every artifact has a scale.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 #: OpenCV camera axes → OpenGL camera axes (flip y and z).
-OPENGL = np.diag([1.0, -1.0, -1.0])
+OPENCV_TO_OPENGL = np.diag([1.0, -1.0, -1.0])
 
 
 @dataclass(frozen=True)
@@ -28,20 +28,20 @@ class Similarity:
     translation: Array = field(default_factory=lambda: np.zeros(3))
 
     def apply(self, points: Array) -> Array:
-        """Map points (..., 3) from the inner frame to the outer one."""
+        """Map points (..., 3) from the source to the target frame."""
         return self.scale * points @ self.rotation.T + self.translation
 
     def inverse(self) -> Similarity:
-        """The map from the outer frame back to the inner one."""
+        """The map from the target to the source frame."""
         rot = self.rotation.T
         return Similarity(1.0 / self.scale, rot, -(rot @ self.translation) / self.scale)
 
     def then(self, outer: Similarity) -> Similarity:
-        """First self, then `outer`."""
+        """Composition: self first, then `outer`."""
         return Similarity(outer.scale * self.scale, outer.rotation @ self.rotation, outer.apply(self.translation))
 
     def matrix(self) -> Array:
-        """The homogeneous (4, 4) matrix."""
+        """Homogeneous (4, 4) matrix."""
         out = np.eye(4)
         out[:3, :3] = self.scale * self.rotation
         out[:3, 3] = self.translation
@@ -50,7 +50,7 @@ class Similarity:
 
 @dataclass(frozen=True)
 class Camera:
-    """One photo's camera; `distortion` holds OpenCV coefficients (k1, k2, p1, p2[, k3…]) or is empty for a pinhole."""
+    """Camera of one photo; `distortion` is OpenCV coefficients (k1, k2, p1, p2[, k3…]), empty for a pinhole."""
 
     name: str
     width: int
@@ -75,7 +75,7 @@ class Camera:
 
     @property
     def view_direction(self) -> Array:
-        """Unit vector (3,) the camera looks along."""
+        """Unit viewing direction (3,)."""
         return self.R[2]
 
     def scaled(self, width: int, height: int) -> Camera:
@@ -85,7 +85,7 @@ class Camera:
             self, width=width, height=height, fx=self.fx * sx, fy=self.fy * sy, cx=self.cx * sx, cy=self.cy * sy
         )
 
-    def within(self, size: int) -> Camera:
+    def downscaled_to(self, size: int) -> Camera:
         """The same camera for the photo reduced so that its longer side has at most `size` pixels."""
         longer = max(self.width, self.height)
         if longer <= size:
@@ -93,40 +93,40 @@ class Camera:
         return self.scaled(max(1, round(self.width * size / longer)), max(1, round(self.height * size / longer)))
 
     def project(self, points: Array) -> tuple[Array, Array]:
-        """Pixels (n, 2) and depths (n,) of points (n, 3), distortion ignored; depth ≤ 0 lies behind the camera."""
+        """Pixels (n, 2) and depths (n,) of points (n, 3), without distortion; depth ≤ 0 is behind the camera."""
         cam = points @ self.R.T + self.t
         z = cam[:, 2]
-        safe = np.where(np.abs(z) < 1e-12, 1e-12, z)
-        return np.stack([self.fx * cam[:, 0] / safe + self.cx, self.fy * cam[:, 1] / safe + self.cy], 1), z
+        nonzero_z = np.where(np.abs(z) < 1e-12, 1e-12, z)
+        return np.stack([self.fx * cam[:, 0] / nonzero_z + self.cx, self.fy * cam[:, 1] / nonzero_z + self.cy], 1), z
 
-    def shows(self, pixel: Array, z: Array) -> NDArray[np.bool_]:
-        """Whether what `project` gave, pixels (n, 2) and depths (n,), lies in front of the camera and inside the picture (n,)."""
+    def in_view(self, pixel: Array, z: Array) -> NDArray[np.bool_]:
+        """Whether pixels (n, 2) with depths (n,) from `project` lie in front of the camera and inside the image (n,)."""
         return np.asarray((z > 1e-6) & (pixel >= 0).all(1) & (pixel[:, 0] < self.width) & (pixel[:, 1] < self.height))
 
     def rays(self) -> Array:
-        """Directions (height, width, 3) in the set's frame through pixel centres, scaled so that depth z = 1."""
+        """Ray directions (height, width, 3) in the set's frame through pixel centres, scaled to depth z = 1."""
         x = (np.arange(self.width) + 0.5 - self.cx) / self.fx
         y = (np.arange(self.height) + 0.5 - self.cy) / self.fy
         grid = np.stack(np.broadcast_arrays(x[None, :], y[:, None], np.ones(())), -1)
         return grid @ self.R
 
     def moved(self, frame: Similarity) -> Camera:
-        """The same camera after its frame is mapped by `frame` (inner → outer); depths scale with it."""
+        """The same camera in the target frame of `frame`; depths scale with it."""
         rot = self.R @ frame.rotation.T
         centre = frame.apply(self.centre)
         return replace(self, R=rot, t=-rot @ centre)
 
     def camera_to_world_opengl(self) -> Array:
-        """The (4, 4) camera-to-world matrix with OpenGL axes, as `transforms.json` stores it."""
+        """Camera-to-world matrix (4, 4) with OpenGL axes, as in `transforms.json`."""
         out = np.eye(4)
-        out[:3, :3] = self.R.T @ OPENGL
+        out[:3, :3] = self.R.T @ OPENCV_TO_OPENGL
         out[:3, 3] = self.centre
         return out
 
     @staticmethod
     def pose_from_opengl(matrix: Array) -> tuple[Array, Array]:
         """`R, t` (world→camera, OpenCV axes) from a camera-to-world OpenGL matrix (≥ 3x4)."""
-        rot = (np.asarray(matrix, float)[:3, :3] @ OPENGL).T
+        rot = (np.asarray(matrix, float)[:3, :3] @ OPENCV_TO_OPENGL).T
         return rot, -rot @ np.asarray(matrix, float)[:3, 3]
 
 
@@ -134,7 +134,7 @@ class Camera:
 class CameraSet:
     """Cameras of one capture in one frame.
 
-    `to_world` maps that frame to the Z-up world frame; `poses` says where they come from ("given" or "solved");
+    `to_world` maps that frame to the Z-up world frame; `poses` is the origin of the poses ("given" or "solved");
     `metric` is True when world units are metres.
     """
 
@@ -163,9 +163,9 @@ class CameraSet:
 
     @staticmethod
     def load(path: Path) -> CameraSet:
-        """Read what `save` wrote."""
+        """Read a file written by `save`."""
         body = json.loads(path.read_text())
-        sim = body["to_world"]
+        similarity = body["to_world"]
         return CameraSet(
             cameras=tuple(
                 Camera(
@@ -176,7 +176,7 @@ class CameraSet:
                 )
                 for c in body["cameras"]
             ),
-            to_world=Similarity(sim["scale"], np.array(sim["rotation"], float), np.array(sim["translation"], float)),
+            to_world=Similarity(similarity["scale"], np.array(similarity["rotation"], float), np.array(similarity["translation"], float)),
             poses=body["poses"],
             metric=body["metric"],
         )

@@ -8,17 +8,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-#: Property names of a record's vector fields; a scalar field is its own property.
+#: Property names of a record's vector fields; a scalar field's property has the field's name.
 PROPERTIES = {"position": ("x", "y", "z"), "normal": ("nx", "ny", "nz"), "colour": ("red", "green", "blue")}
-#: PLY's names of the scalar types in use.
+#: PLY names of the supported scalar types.
 TYPES = {"<f4": "float", "|u1": "uchar"}
 
-#: A coloured point.
-COLOURED = np.dtype([("position", "<f4", 3), ("colour", "u1", 3)])
+#: Record of a coloured point.
+COLOURED_POINT = np.dtype([("position", "<f4", 3), ("colour", "u1", 3)])
 
 
 def _header(record: np.dtype[Any], count: int) -> bytes:
-    """The header of `count` points whose fields are those of `record`."""
+    """PLY header of `count` points with the fields of `record`."""
     lines = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]
     for name in record.names or ():
         kind = TYPES[record[name].base.str]
@@ -27,31 +27,31 @@ def _header(record: np.dtype[Any], count: int) -> bytes:
 
 
 def write_points(path: Path, rows: NDArray[Any]) -> None:
-    """Write the structured array `rows` (n,): vector fields as in `PROPERTIES`, scalar fields of 32-bit floats or bytes."""
+    """Write the structured array `rows` (n,): vector fields of `PROPERTIES`, scalar fields of 32-bit floats or bytes."""
     path.write_bytes(_header(rows.dtype, len(rows)) + rows.tobytes())
 
 
 def read_points(path: Path, record: np.dtype[Any]) -> NDArray[Any]:
-    """The structured array (n,) that `write_points` wrote. Raises ValueError for a PLY with other properties."""
+    """Read a structured array (n,) written by `write_points`. Raises ValueError for a PLY with other properties."""
     data = path.read_bytes()
     end = data.find(b"end_header\n") + len(b"end_header\n")
     count = next((int(line.split()[2]) for line in data[:end].splitlines() if line.startswith(b"element vertex")), 0)
     if data[:end] != _header(record, count) or len(data) - end != count * record.itemsize:
-        raise ValueError(f"{path} does not hold points with {', '.join(record.names or ())}")
+        raise ValueError(f"{path} does not contain points with {', '.join(record.names or ())}")
     return np.frombuffer(data, record, count, end)
 
 
 def write_cloud(path: Path, points: ArrayLike, colours: ArrayLike) -> None:
     """Write `points` (n, 3) and 8-bit `colours` (n, 3)."""
     xyz = np.asarray(points, float).reshape(-1, 3)
-    rows = np.zeros(len(xyz), COLOURED)
+    rows = np.zeros(len(xyz), COLOURED_POINT)
     rows["position"], rows["colour"] = xyz, np.asarray(colours, np.uint8).reshape(-1, 3)
     write_points(path, rows)
 
 
 def read_cloud(path: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
-    """Points (n, 3) and colours (n, 3) that `write_cloud` wrote. Raises ValueError for any other PLY."""
-    rows = read_points(path, COLOURED)
+    """Read points (n, 3) and colours (n, 3) written by `write_cloud`. Raises ValueError for any other PLY."""
+    rows = read_points(path, COLOURED_POINT)
     return rows["position"].astype(np.float64), rows["colour"].copy()
 
 
@@ -71,9 +71,9 @@ def write_mesh(path: Path, vertices: ArrayLike, faces: ArrayLike) -> None:
 
 
 def read_mesh(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Vertices (v, 3) and triangles (f, 3) of a PLY mesh of any program.
+    """Read vertices (v, 3) and triangles (f, 3) of any PLY mesh.
 
-    Raises ValueError when it is not readable, has no triangles, or positions that are not finite.
+    Raises ValueError for an unreadable file, no triangles, or non-finite positions.
     """
     import trimesh
 
@@ -83,5 +83,5 @@ def read_mesh(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     except (OSError, ValueError, AttributeError, IndexError, KeyError) as error:
         raise ValueError(f"{path} is not a readable triangle mesh ({error})") from error
     if len(faces) == 0 or not np.isfinite(vertices).all():
-        raise ValueError(f"{path} has no triangles or positions that are not finite")
+        raise ValueError(f"{path} has no triangles or has non-finite positions")
     return vertices, faces

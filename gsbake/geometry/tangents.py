@@ -1,9 +1,9 @@
-"""Tangents after MikkTSpace, for glTF: the one function that both the normal-map bake and the export use.
+"""MikkTSpace tangents for glTF, used by the normal-map bake and the export.
 
-Every triangle's tangent follows from its positions and UVs; around a vertex the triangles that share its position, normal and UV and hang
-together over edges without change of handedness are averaged, each projected on the vertex's tangent plane and weighted by its corner angle
-there. A vertex with several such groups, as where UVs are mirrored, is split. glTF stores v downwards while tangent space has +Y up, so
-handedness is taken with v flipped: the bitangent w · (normal × tangent) points up in the image.
+A triangle's tangent follows from its positions and UVs. At a vertex the tangents of triangles that share its position, normal and UV and
+are connected over edges without change of handedness are averaged, each projected onto the vertex's tangent plane and weighted by its
+corner angle. A vertex with several such groups (mirrored UVs) is split. glTF stores v downwards while tangent space has +Y up, so
+handedness is computed with v flipped: the bitangent w · (normal × tangent) points up in the image.
 
 Mikkelsen, *Simulation of wrinkled surfaces revisited*, 2008 (MikkTSpace); glTF 2.0 specification, section 3.7.2.1 (Meshes).
 """
@@ -29,7 +29,7 @@ class Tangents:
     """Result of `tangents`.
 
     `tangent` (v', 4) float32, xyz of unit length and orthogonal to the normal, w = ±1; `source` (v',) input vertex of each vertex; `faces`
-    (f, 3) int32. The first v vertices are the input's; those after them are split off.
+    (f, 3) int32. The first v vertices are the input's; copies of split vertices follow.
     """
 
     tangent: NDArray[np.float32]
@@ -48,8 +48,8 @@ def tangents(position: NDArray[Any], normal: NDArray[Any], uv: NDArray[Any], fac
     total, mirrored = np.zeros((count, 3)), np.zeros(count, bool)
     for k in range(3):
         here, ahead, behind = (triangles[:, (k + i) % 3] for i in range(3))
-        angle = np.einsum("nd,nd->n", _flat(p[ahead] - p[here], n[here]), _flat(p[behind] - p[here], n[here]))
-        term = np.arccos(np.clip(angle, -1, 1))[:, None] * _flat(tangent, n[here]) * valid[:, None]
+        angle = np.einsum("nd,nd->n", _project_to_plane(p[ahead] - p[here], n[here]), _project_to_plane(p[behind] - p[here], n[here]))
+        term = np.arccos(np.clip(angle, -1, 1))[:, None] * _project_to_plane(tangent, n[here]) * valid[:, None]
         for axis in range(3):
             total[:, axis] += np.bincount(group[:, k], term[:, axis], count)
         mirrored[group[valid & ~positive, k]] = True
@@ -60,22 +60,22 @@ def tangents(position: NDArray[Any], normal: NDArray[Any], uv: NDArray[Any], fac
     used = group_of >= 0
     out[used, :3] = unit(total)[group_of[used]]
     out[used & mirrored[group_of], 3] = -1
-    lost = np.flatnonzero(np.einsum("nd,nd->n", out[:, :3], out[:, :3]) < 0.5)
-    out[lost, :3] = _any_perpendicular(n[source[lost]])
+    undefined = np.flatnonzero(np.einsum("nd,nd->n", out[:, :3], out[:, :3]) < 0.5)
+    out[undefined, :3] = _any_perpendicular(n[source[undefined]])
     return Tangents(out.astype(np.float32), source.astype(np.int32), corner.astype(np.int32))
 
 
-def _flat(vector: Floats, normal: Floats) -> Floats:
-    """Unit directions (n, 3) of `vector` (n, 3) projected on the planes of `normal` (n, 3)."""
+def _project_to_plane(vector: Floats, normal: Floats) -> Floats:
+    """Unit directions (n, 3) of `vector` (n, 3) projected onto the planes of `normal` (n, 3)."""
     return unit(vector - normal * np.einsum("nd,nd->n", normal, vector)[:, None])
 
 
 def _groups(keys: Floats, faces: Ints, positive: NDArray[np.bool_], valid: NDArray[np.bool_]) -> Ints:
-    """Group (f, 3) of each triangle corner: corners at one point that reach each other over edges between triangles of one handedness.
+    """Group (f, 3) of each triangle corner: corners at one point connected over edges between triangles of equal handedness.
 
     Vertices with equal rows of `keys` (v, k) are one point. A triangle without UV area joins any group at its corners.
     """
-    # Adding 0 turns -0 into +0, which would else be another point.
+    # Adding 0 turns -0 into +0: both are the same point.
     point = np.unique(keys.astype(np.float32) + np.float32(0), axis=0, return_inverse=True)[1].ravel()
     corner = point[faces]
     corners = np.arange(faces.size).reshape(-1, 3)
@@ -104,7 +104,7 @@ def _groups(keys: Floats, faces: Ints, positive: NDArray[np.bool_], valid: NDArr
 
 
 def _split(faces: Ints, group: Ints, vertices: int) -> tuple[Ints, Ints, Ints]:
-    """Vertices so that none has two groups: source vertex (v',), faces (f, 3), group (v',; -1 where unused).
+    """Split vertices with several groups: source vertex (v',), faces (f, 3), group (v',; -1 where unused).
 
     The first group of each vertex keeps its index; others are appended.
     """
@@ -121,7 +121,7 @@ def _split(faces: Ints, group: Ints, vertices: int) -> tuple[Ints, Ints, Ints]:
 
 
 def _face_tangents(p: Floats, up: Floats, faces: Ints) -> tuple[Floats, NDArray[np.bool_], NDArray[np.bool_]]:
-    """Unit direction (f, 3) of growing u per triangle, whether its UVs turn as its corners do, and whether it has both areas."""
+    """Per triangle: unit direction (f, 3) of increasing u, whether its UV winding is positive, whether it is non-degenerate."""
     a, b, c = (faces[:, k] for k in range(3))
     d1, d2 = p[b] - p[a], p[c] - p[a]
     s1, s2 = up[b] - up[a], up[c] - up[a]
@@ -134,7 +134,7 @@ def _face_tangents(p: Floats, up: Floats, faces: Ints) -> tuple[Floats, NDArray[
 
 
 def _any_perpendicular(normal: Floats) -> Floats:
-    """Some unit vector (n, 3) perpendicular to each normal, for vertices whose UVs give no direction."""
+    """A unit vector (n, 3) perpendicular to each normal, for vertices with degenerate UVs."""
     axis = np.eye(3)[np.argmin(np.abs(normal), axis=1)]
     return unit(np.cross(normal, axis))
 
@@ -142,7 +142,7 @@ def _any_perpendicular(normal: Floats) -> Floats:
 def frame_to_world(vector: NDArray[Any], normal: NDArray[Any], tangent: NDArray[Any]) -> Floats:
     """Unit directions (n, 3) of tangent-space `vector` (n, 3), for interpolated `normal` (n, 3) and `tangent` (n, 4).
 
-    As MikkTSpace asks, the interpolated vectors are used as they come, without normalising them first.
+    As MikkTSpace requires, the interpolated vectors are not normalised first.
     """
     n, t = np.asarray(normal, np.float64), np.asarray(tangent, np.float64)
     v = np.asarray(vector, np.float64)

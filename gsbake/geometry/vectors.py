@@ -1,4 +1,4 @@
-"""Vectors as rows of arrays."""
+"""Operations on arrays of row vectors."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-#: Vectors no longer than this have no direction.
-SHORTEST = 1e-20
+#: Minimum length of a vector with a direction.
+MIN_LENGTH = 1e-20
 
 
 def unit(vectors: NDArray[Any]) -> NDArray[Any]:
-    """Vectors (…, k) at unit length, in their own float type; one without a direction becomes 0."""
+    """Normalise vectors (…, k), in their own float type; vectors below `MIN_LENGTH` become 0."""
     length = np.linalg.norm(vectors, axis=-1, keepdims=True)
-    return np.asarray(np.where(length > SHORTEST, vectors / np.maximum(length, SHORTEST), 0.0))
+    return np.asarray(np.where(length > MIN_LENGTH, vectors / np.maximum(length, MIN_LENGTH), 0.0))

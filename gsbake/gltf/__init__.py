@@ -1,1 +1,1 @@
-"""The GLB file: writer, tangents, audit."""
+"""Asset export: GLB reader and writer, 8-bit textures, asset frame, audit."""

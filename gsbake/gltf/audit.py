@@ -1,8 +1,8 @@
-"""The asset checked against the rules gsbake keeps for its own output.
+"""Audit of the asset against rules for gsbake's output.
 
-Rules of severity "error" must hold or the export fails; "warning" is told to the person; "info" is for the record. They follow the glTF 2.0
-specification, the Khronos *3D Commerce Asset Creation Guidelines 1.0* and what the Khronos validator reports, and are read from the bytes
-of the finished file, not from what the writer meant to write.
+A failed rule of severity "error" fails the export; "warning" is reported to the user; "info" is only recorded. The rules follow the
+glTF 2.0 specification, the Khronos *3D Commerce Asset Creation Guidelines 1.0* and the Khronos validator. They are checked on the bytes of
+the finished file, independently of the writer.
 """
 
 from __future__ import annotations
@@ -19,21 +19,21 @@ from gsbake.texturing.texels import overlapping
 
 Severity = Literal["error", "warning", "info"]
 
-#: Usual edge of a texture, in texels.
+#: Range of common texture sizes, in texels.
 USUAL_SIZES = (512, 2048)
-#: sRGB codes a real surface's base colour lies within.
+#: Range of sRGB codes of base colours of real surfaces.
 PLAUSIBLE_COLOUR = (30, 243)
-#: Resolution at which overlaps of the UV layout are looked for.
+#: Resolution at which overlaps of the UV layout are detected, in texels.
 OVERLAP_SIZE = 2048
-#: Share of that many texels which may overlap, for rounding at shared edges.
-OVERLAP_SHARE = 1e-5
-#: PNG chunks that make viewers disagree about colour.
+#: Largest share of overlapping texels, for rounding at shared edges.
+MAX_OVERLAP_SHARE = 1e-5
+#: PNG chunks that viewers interpret differently.
 COLOUR_CHUNKS = ("gAMA", "iCCP", "cHRM", "sRGB")
 
 
 @dataclass(frozen=True)
 class Finding:
-    """One rule and whether it holds."""
+    """Result of one rule."""
 
     rule: str
     passed: bool
@@ -42,7 +42,7 @@ class Finding:
 
 
 def audit(data: bytes, name: str, max_megabytes: float, max_triangles: int) -> list[Finding]:
-    """Check the bytes of a GLB; `name` is for messages. A file that cannot be read at all gives one failed finding."""
+    """Audit the bytes of a GLB; `name` identifies it in errors. An unreadable file gives one failed finding."""
     try:
         asset = parse_glb(data, name)
     except BadInputError as error:
@@ -55,7 +55,7 @@ def audit(data: bytes, name: str, max_megabytes: float, max_triangles: int) -> l
     check("readable GLB", True, f"glTF {asset.document['asset'].get('version')}, {len(data)} bytes")
     _structure(asset, check)
     _geometry(asset, check, max_triangles)
-    _layout(asset, check)
+    _uv_layout(asset, check)
     _images(asset, check)
     megabytes = len(data) / 1e6
     check("file size", megabytes <= max_megabytes, f"{megabytes:.2f} MB of {max_megabytes:g} MB", "warning")
@@ -63,28 +63,28 @@ def audit(data: bytes, name: str, max_megabytes: float, max_triangles: int) -> l
 
 
 def failed(findings: list[Finding]) -> list[Finding]:
-    """The findings of severity "error" that do not hold."""
+    """Failed findings of severity "error"."""
     return [f for f in findings if not f.passed and f.severity == "error"]
 
 
 def as_json(findings: list[Finding]) -> list[dict[str, Any]]:
-    """Findings as JSON-able records."""
+    """Findings as JSON-serialisable records."""
     return [asdict(f) for f in findings]
 
 
 def _structure(asset: GltfAsset, check: Any) -> None:
-    """Document: version, one mesh and material, self-contained, buffer views in order."""
+    """Rules of the document: version, one mesh and material, self-contained, buffer views in order."""
     document = asset.document
-    head = document["asset"]
-    check("glTF version", head.get("version") == "2.0", f"version {head.get('version')}")
-    check("generator", bool(head.get("generator")), str(head.get("generator", "none")), "warning")
-    scale = head.get("extras", {}).get("scale")
+    header = document["asset"]
+    check("glTF version", header.get("version") == "2.0", f"version {header.get('version')}")
+    check("generator", bool(header.get("generator")), str(header.get("generator", "none")), "warning")
+    scale = header.get("extras", {}).get("scale")
     check("scale is stated", scale in ("metres", "unknown"), f"asset.extras.scale = {scale}", "warning")
     counts = {key: len(document.get(key, [])) for key in ("meshes", "materials", "scenes", "buffers")}
     primitives = sum(len(m["primitives"]) for m in document["meshes"])
     check("one mesh, one material", counts["meshes"] == counts["materials"] == primitives == 1, f"{counts}, {primitives} primitives")
-    outside = [x for key in ("buffers", "images") for x in document.get(key, []) if "uri" in x]
-    check("self-contained", not outside, f"{len(outside)} outside references")
+    external = [x for key in ("buffers", "images") for x in document.get(key, []) if "uri" in x]
+    check("self-contained", not external, f"{len(external)} external references")
     extensions = document.get("extensionsRequired", [])
     check("no required extensions", not extensions, ", ".join(extensions) or "none")
     material = document["materials"][0] if document.get("materials") else {}
@@ -98,7 +98,7 @@ def _structure(asset: GltfAsset, check: Any) -> None:
 
 
 def _geometry(asset: GltfAsset, check: Any, max_triangles: int) -> None:
-    """Attributes: finite, unit length, in range, bounds as stated."""
+    """Rules of the attributes: finite, unit length, in range, bounds as stated."""
     attributes, faces = asset.attributes, asset.faces
     missing = [k for k in ("POSITION", "NORMAL", "TEXCOORD_0") if k not in attributes]
     if "normal" in asset.roles and "TANGENT" not in attributes:
@@ -117,41 +117,41 @@ def _geometry(asset: GltfAsset, check: Any, max_triangles: int) -> None:
         area = np.linalg.norm(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=1)
         check("no degenerate triangles", (area > 0).all(), f"{int((area <= 0).sum())} without area", "warning")
     if "NORMAL" in attributes:
-        off = float(np.abs(np.linalg.norm(attributes["NORMAL"], axis=1) - 1).max())
-        check("unit normals", off < 5e-4, f"off by at most {off:.1e}")
+        error = float(np.abs(np.linalg.norm(attributes["NORMAL"], axis=1) - 1).max())
+        check("unit normals", error < 5e-4, f"length error at most {error:.1e}")
     if "TANGENT" in attributes and "NORMAL" in attributes:
         tangent = attributes["TANGENT"].astype(np.float64)
-        off = float(np.abs(np.linalg.norm(tangent[:, :3], axis=1) - 1).max())
-        check("unit tangents", off < 5e-4 and bool((np.abs(tangent[:, 3]) == 1).all()), f"off by at most {off:.1e}; w is ±1")
-        lean = float(np.abs(np.einsum("nd,nd->n", tangent[:, :3], attributes["NORMAL"].astype(np.float64))).max())
-        check("tangents in the surface", lean < 1e-2, f"cosine to the normal at most {lean:.1e}")
+        error = float(np.abs(np.linalg.norm(tangent[:, :3], axis=1) - 1).max())
+        check("unit tangents", error < 5e-4 and bool((np.abs(tangent[:, 3]) == 1).all()), f"length error at most {error:.1e}; w is ±1")
+        cosine = float(np.abs(np.einsum("nd,nd->n", tangent[:, :3], attributes["NORMAL"].astype(np.float64))).max())
+        check("tangents in the surface", cosine < 1e-2, f"cosine to the normal at most {cosine:.1e}")
 
 
-def _layout(asset: GltfAsset, check: Any) -> None:
-    """UVs: in the unit square, no mirrored and no overlapping triangles."""
+def _uv_layout(asset: GltfAsset, check: Any) -> None:
+    """Rules of the UVs: in the unit square, no mirrored and no overlapping triangles."""
     if "TEXCOORD_0" not in asset.attributes or asset.faces.max(initial=-1) >= len(asset.attributes["TEXCOORD_0"]):
         return
     uv, faces = asset.attributes["TEXCOORD_0"].astype(np.float64), asset.faces
     check("UVs in 0..1", uv.min() >= 0 and uv.max() <= 1, f"{uv.min():.4f}..{uv.max():.4f}")
     a, b, c = (uv[faces[:, k]] for k in range(3))
-    # v points downwards, so triangles that turn left on the surface have negative area here.
+    # v points down, so triangles that are counter-clockwise on the surface have negative area.
     area = 0.5 * ((b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (c[:, 0] - a[:, 0]) * (b[:, 1] - a[:, 1]))
     flipped = int((area > 1e-12).sum())
     check("no mirrored UVs", flipped == 0, f"{flipped} of {len(faces)} triangles")
     shared = overlapping(uv, faces, OVERLAP_SIZE)
-    check("no overlapping UVs", shared <= OVERLAP_SHARE * OVERLAP_SIZE**2, f"{shared} of {OVERLAP_SIZE}² texels")
+    check("no overlapping UVs", shared <= MAX_OVERLAP_SHARE * OVERLAP_SIZE**2, f"{shared} of {OVERLAP_SIZE}² texels")
     check("UV space used", True, f"{np.abs(area).sum():.0%} of the square", "info")
 
 
 def _images(asset: GltfAsset, check: Any) -> None:
-    """Textures: PNG of a power of two without colour chunks; packing; plausible values."""
+    """Rules of the textures: PNG of a power of two without colour chunks, packing, plausible values."""
     surface = asset.document["materials"][0].get("pbrMetallicRoughness", {}) if asset.document.get("materials") else {}
-    numbers = {"roughnessFactor", "metallicFactor"} <= surface.keys()
-    stated = "base_color" in asset.roles and ("orm" in asset.roles or numbers)
-    check("textures present", stated, ", ".join(asset.roles) + (" and numbers" if numbers else ""))
-    alone = "orm" not in asset.roles
-    check("occlusion packed with roughness", alone or asset.roles.get("occlusion") in (None, asset.roles["orm"]), "one image")
-    for role in ("base_color", "occlusion" if alone else "orm", "normal", "emissive"):
+    factors = {"roughnessFactor", "metallicFactor"} <= surface.keys()
+    present = "base_color" in asset.roles and ("orm" in asset.roles or factors)
+    check("textures present", present, ", ".join(asset.roles) + (" and factors" if factors else ""))
+    occlusion_only = "orm" not in asset.roles
+    check("occlusion packed with roughness", occlusion_only or asset.roles.get("occlusion") in (None, asset.roles["orm"]), "one image")
+    for role in ("base_color", "occlusion" if occlusion_only else "orm", "normal", "emissive"):
         if role not in asset.roles:
             continue
         content = asset.images[asset.roles[role]]
@@ -160,10 +160,9 @@ def _images(asset: GltfAsset, check: Any) -> None:
             check(f"{role}: PNG", False, "not a PNG file")
             continue
         width, height, depth, kind = struct.unpack_from(">IIBB", content, 16)
-        named, wanted = ("grey", 0) if role == "occlusion" else ("RGB", 2)
-        check(f"{role}: 8-bit {named} PNG", depth == 8 and kind == wanted, f"{width}x{height}, {depth} bits, colour type {kind}")
-        power = width == height and width & (width - 1) == 0
-        check(f"{role}: square power of two", power, f"{width}x{height}")
+        colours, colour_type = ("grey", 0) if role == "occlusion" else ("RGB", 2)
+        check(f"{role}: 8-bit {colours} PNG", depth == 8 and kind == colour_type, f"{width}x{height}, {depth} bits, colour type {kind}")
+        check(f"{role}: square power of two", width == height and width & (width - 1) == 0, f"{width}x{height}")
         check(f"{role}: usual size", USUAL_SIZES[0] <= width <= USUAL_SIZES[1], f"{width} texels", "info")
         colour = [c for c in chunks if c in COLOUR_CHUNKS]
         check(f"{role}: no colour chunks", not colour, ", ".join(colour) or "none")
@@ -175,19 +174,19 @@ def _images(asset: GltfAsset, check: Any) -> None:
             check("base colour within 30..243", outside < 0.05, f"{outside:.1%} of the values outside", "info")
         if role == "normal":
             length = np.linalg.norm(pixels / 127.5 - 1, axis=2)
-            off = float((np.abs(length - 1) > 0.1).mean())
-            check("normal map of unit vectors", off < 0.02, f"{off:.2%} of the texels off by more than 0.1")
+            share = float((np.abs(length - 1) > 0.1).mean())
+            check("normal map of unit vectors", share < 0.02, f"length error above 0.1 in {share:.2%} of the texels")
             inward = float((pixels[..., 2] < 128).mean())
             check("normal map points outwards", inward < 0.001, f"{inward:.2%} of the texels")
 
 
 def png_chunks(content: bytes) -> list[str]:
-    """Names of a PNG's chunks in order; empty when it is no whole PNG."""
+    """Names of a PNG's chunks in order; empty when the PNG is invalid or truncated."""
     if content[:8] != b"\x89PNG\r\n\x1a\n":
         return []
-    names, at = [], 8
-    while at + 8 <= len(content):
-        size = struct.unpack_from(">I", content, at)[0]
-        names.append(content[at + 4 : at + 8].decode("latin-1"))
-        at += 12 + size
-    return names if names and names[-1] == "IEND" and at == len(content) else []
+    names, offset = [], 8
+    while offset + 8 <= len(content):
+        size = struct.unpack_from(">I", content, offset)[0]
+        names.append(content[offset + 4 : offset + 8].decode("latin-1"))
+        offset += 12 + size
+    return names if names and names[-1] == "IEND" and offset == len(content) else []

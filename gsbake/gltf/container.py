@@ -1,4 +1,4 @@
-"""The GLB container: a header, one JSON chunk, one binary chunk.
+"""GLB container format: a header, one JSON chunk, one binary chunk.
 
 glTF 2.0 specification, chapter 4 (GLB File Format Specification).
 """
@@ -25,7 +25,7 @@ def pack_glb(document: dict[str, Any], binary: bytes) -> bytes:
 
 
 def unpack_glb(data: bytes, name: str) -> tuple[dict[str, Any], bytes]:
-    """JSON document and binary chunk of a GLB; BadInputError, naming `name`, when the bytes are not a whole GLB."""
+    """JSON document and binary chunk of a GLB; raises BadInputError, which names `name`, when the bytes are not a complete GLB."""
     if len(data) < 20 or struct.unpack_from("<I", data)[0] != MAGIC:
         raise BadInputError(f"{name} is not a GLB file.")
     _, version, length = struct.unpack_from("<III", data)
@@ -33,20 +33,20 @@ def unpack_glb(data: bytes, name: str) -> tuple[dict[str, Any], bytes]:
         raise BadInputError(f"{name} is damaged or not glTF 2.0 (version {version}, {len(data)} of {length} bytes); export it again.")
     document: dict[str, Any] | None = None
     binary = b""
-    at = 12
-    while at + 8 <= length:
-        size, kind = struct.unpack_from("<II", data, at)
-        chunk = data[at + 8 : at + 8 + size]
+    offset = 12
+    while offset + 8 <= length:
+        size, kind = struct.unpack_from("<II", data, offset)
+        chunk = data[offset + 8 : offset + 8 + size]
         if len(chunk) != size:
-            raise BadInputError(f"{name} is damaged: a chunk ends after the file; export it again.")
+            raise BadInputError(f"{name} is damaged: a chunk exceeds the file; export it again.")
         if kind == JSON_CHUNK and document is None:
             try:
                 document = json.loads(chunk)
             except ValueError as error:
-                raise BadInputError(f"{name} holds broken JSON ({error}); export it again.") from error
+                raise BadInputError(f"{name} holds invalid JSON ({error}); export it again.") from error
         elif kind == BINARY_CHUNK and not binary:
             binary = chunk
-        at += 8 + size
+        offset += 8 + size
     if not isinstance(document, dict):
         raise BadInputError(f"{name} has no JSON chunk; export it again.")
     return document, binary

@@ -1,7 +1,7 @@
-"""Linear masters to the 8-bit images of the asset, as small as the budget asks and no smaller.
+"""Encoding of linear textures to the 8-bit images of the asset, within a size budget.
 
-Base colour and emission are coded in sRGB; occlusion-roughness-metallic and the normal map stay linear. If the asset would exceed its size,
-the low bits of the linear maps go first, then their resolution; the colours are never touched.
+Base colour and emission are coded in sRGB; occlusion-roughness-metallic (ORM) and the normal map are linear. If the asset would exceed its
+size, first the low bits of the linear maps are dropped, then their resolution is halved; colours keep full precision.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gsbake.gltf.write import GltfImages
+from gsbake.gltf.write import GltfTextures
 from gsbake.imaging.png import encode_png
 from gsbake.imaging.srgb import encode_bytes
 
@@ -21,68 +21,69 @@ Bytes = NDArray[np.uint8]
 
 
 @dataclass(frozen=True)
-class Saving:
-    """One rung of the ladder: low bits dropped from ORM and from the normal map, and by how much both are reduced in size."""
+class PrecisionLevel:
+    """Low bits dropped from ORM and from the normal map, the factor by which both are downsampled, and a description."""
 
     orm_bits: int
     normal_bits: int
-    shrink: int
+    downsampling: int
     text: str
 
 
 #: Tried in order until the asset fits.
-LADDER = (
-    Saving(0, 0, 1, "full precision"),
-    Saving(2, 1, 1, "6-bit ORM, 7-bit normals"),
-    Saving(2, 1, 2, "6-bit ORM, 7-bit normals, both at half resolution"),
+PRECISION_LEVELS = (
+    PrecisionLevel(0, 0, 1, "full precision"),
+    PrecisionLevel(2, 1, 1, "6-bit ORM, 7-bit normals"),
+    PrecisionLevel(2, 1, 2, "6-bit ORM, 7-bit normals, both at half resolution"),
 )
 
 
 @dataclass(frozen=True)
-class Sheets:
+class TextureMaps:
     """The 8-bit maps (s, s, 3): base colour and emission coded in sRGB, ORM and normal map linear.
 
-    Where roughness and metallic are one number all over, they are `constants` instead, and `orm` (s, s) is occlusion alone.
+    When roughness and metallic are constant, they are stored in `factors`, and `orm` (s, s) is occlusion only.
     """
 
     base_color: Bytes
     orm: Bytes
     normal: Bytes | None
     emissive: Bytes | None
-    constants: tuple[float, float] | None = None
+    factors: tuple[float, float] | None = None
 
 
-def quantise(base_color: NDArray[Any], orm: NDArray[Any], normal: NDArray[Any] | None, emissive: NDArray[Any] | None = None) -> Sheets:
-    """Masters (s, s, 3) as 8-bit maps."""
-    glow = None if emissive is None else encode_bytes(np.asarray(emissive, np.float64))
-    packed, constants = _linear(orm), None
+def quantise(base_color: NDArray[Any], orm: NDArray[Any], normal: NDArray[Any] | None, emissive: NDArray[Any] | None = None) -> TextureMaps:
+    """Quantise linear textures (s, s, 3) to 8-bit maps."""
+    emission = None if emissive is None else encode_bytes(np.asarray(emissive, np.float64))
+    packed, factors = _to_8bit(orm), None
     if (packed[..., 1:] == packed[0, 0, 1:]).all():
-        constants = (round(float(orm[0, 0, 1]), 3), round(float(orm[0, 0, 2]), 3))
+        factors = (round(float(orm[0, 0, 1]), 3), round(float(orm[0, 0, 2]), 3))
         packed = np.ascontiguousarray(packed[..., 0])
-    return Sheets(encode_bytes(np.asarray(base_color, np.float64)), packed, None if normal is None else _linear(normal), glow, constants)
+    colour = encode_bytes(np.asarray(base_color, np.float64))
+    return TextureMaps(colour, packed, None if normal is None else _to_8bit(normal), emission, factors)
 
 
-def encode_within(sheets: Sheets, budget: int) -> tuple[GltfImages, Saving]:
-    """PNG files whose sizes sum to at most `budget` bytes if any rung of `LADDER` reaches that, else those of the last rung."""
-    base = encode_png(sheets.base_color)
-    glow = None if sheets.emissive is None else encode_png(sheets.emissive)
-    for saving in LADDER:
-        orm = encode_png(_coarser(_smaller(sheets.orm, saving.shrink), saving.orm_bits))
+def encode_within_budget(maps: TextureMaps, budget: int) -> tuple[GltfTextures, PrecisionLevel]:
+    """PNG files of at most `budget` bytes in all at the first of `PRECISION_LEVELS` that fits, else at the last level."""
+    base = encode_png(maps.base_color)
+    emissive = None if maps.emissive is None else encode_png(maps.emissive)
+    for level in PRECISION_LEVELS:
+        orm = encode_png(_reduce_precision(_downsample(maps.orm, level.downsampling), level.orm_bits))
         normal = None
-        if sheets.normal is not None:
-            normal = encode_png(_coarser(_shorter(sheets.normal, saving.shrink), saving.normal_bits))
-        if len(base) + len(orm) + len(normal or b"") + len(glow or b"") <= budget:
+        if maps.normal is not None:
+            normal = encode_png(_reduce_precision(_downsample_normals(maps.normal, level.downsampling), level.normal_bits))
+        if len(base) + len(orm) + len(normal or b"") + len(emissive or b"") <= budget:
             break
-    return GltfImages(base, orm, normal, glow), saving
+    return GltfTextures(base, orm, normal, emissive), level
 
 
-def _linear(image: NDArray[Any]) -> Bytes:
-    """Linear values 0..1 as 8-bit codes; 0.5 becomes 128, glTF's flat normal."""
+def _to_8bit(image: NDArray[Any]) -> Bytes:
+    """Linear values 0..1 as 8-bit codes; 0.5 maps to 128, glTF's flat normal."""
     return np.asarray(np.floor(np.clip(np.asarray(image, np.float64), 0, 1) * 255 + 0.5), np.uint8)
 
 
-def _coarser(image: Bytes, bits: int) -> Bytes:
-    """Codes rounded to multiples of 2**bits around 128, with both ends of the range kept."""
+def _reduce_precision(image: Bytes, bits: int) -> Bytes:
+    """Codes rounded to multiples of 2**bits around 128; 0 and 255 are preserved."""
     if bits == 0:
         return image
     step = 1 << bits
@@ -90,18 +91,18 @@ def _coarser(image: Bytes, bits: int) -> Bytes:
     return np.where((image == 255) | (image == 0), image, rounded).astype(np.uint8)
 
 
-def _smaller(image: Bytes, shrink: int) -> Bytes:
-    """The image reduced by an area filter."""
-    if shrink == 1:
+def _downsample(image: Bytes, downsampling: int) -> Bytes:
+    """The image downsampled by an area filter."""
+    if downsampling == 1:
         return image
-    return np.asarray(cv2.resize(image, None, fx=1 / shrink, fy=1 / shrink, interpolation=cv2.INTER_AREA), np.uint8)
+    return np.asarray(cv2.resize(image, None, fx=1 / downsampling, fy=1 / downsampling, interpolation=cv2.INTER_AREA), np.uint8)
 
 
-def _shorter(normal: Bytes, shrink: int) -> Bytes:
-    """A normal map reduced by an area filter, its vectors at unit length again."""
-    if shrink == 1:
+def _downsample_normals(normal: Bytes, downsampling: int) -> Bytes:
+    """A normal map downsampled by an area filter, with renormalised vectors."""
+    if downsampling == 1:
         return normal
     vector = normal.astype(np.float32) / 127.5 - 1
-    mean = np.asarray(cv2.resize(vector, None, fx=1 / shrink, fy=1 / shrink, interpolation=cv2.INTER_AREA), np.float32)
+    mean = np.asarray(cv2.resize(vector, None, fx=1 / downsampling, fy=1 / downsampling, interpolation=cv2.INTER_AREA), np.float32)
     mean = mean / np.maximum(np.linalg.norm(mean, axis=2, keepdims=True), 1e-6)
-    return _linear(0.5 * mean + 0.5)
+    return _to_8bit(0.5 * mean + 0.5)

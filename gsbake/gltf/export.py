@@ -1,4 +1,4 @@
-"""From textures and mesh to the asset: the GLB in its own frame, cameras, light and previews beside it, and its audit."""
+"""Export of the asset: GLB in the asset frame, cameras, environment map, previews and audit."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from gsbake.config.schema import Export
 from gsbake.errors import BadInputError
 from gsbake.geometry.cameras import CameraSet, Similarity
 from gsbake.gltf.audit import as_json, audit, failed
-from gsbake.gltf.encode import Sheets, encode_within, quantise
+from gsbake.gltf.encode import TextureMaps, encode_within_budget, quantise
 from gsbake.gltf.frame import asset_frame, transforms_json
 from gsbake.gltf.write import GltfMesh, build_glb
 from gsbake.imaging.exr import read_exr, write_hdr
@@ -37,7 +37,7 @@ PREVIEW_LEVEL = 6
 
 @dataclass(frozen=True)
 class ExportOptions:
-    """Settings of the export; `materials` and `texture_size` are those of the bake, for the asset's extras."""
+    """Settings of the export; `materials` and `texture_size` are settings of the bake that the asset's extras record."""
 
     export: Export = Export()
     materials: str = "none"
@@ -54,43 +54,43 @@ def export_asset(
     *,
     monitor: Monitor = SILENT,
 ) -> dict[str, Any]:
-    """Write the asset of the folder `baked` into the folder `out` and return its figures.
+    """Write the asset of the artifact folder `baked` into the folder `out` and return its figures.
 
-    Written: `asset.glb` (glTF's frame), `cameras.json`, `light.hdr` (with materials), `previews/` and `audit.json`. `surfels` is the folder
-    with the refined cameras, `ingest` the one that names the user's files. Raises BadInputError when the asset fails its audit.
+    Written: `asset.glb` (asset frame, +Y up), `cameras.json`, `light.hdr` (with materials), `previews/` and `audit.json`. The artifact
+    folder `surfels` holds refined cameras, `ingest` the names of the user's files. Raises BadInputError when the asset fails its audit.
     """
     options = options or ExportOptions()
     settings = options.export
     cameras = PosedPhotos.open(poses, surfels).cameras
-    arrays = _arrays(baked / "mesh.safetensors")
+    arrays = _load_mesh_arrays(baked / "mesh.safetensors")
     frame = asset_frame(cameras, arrays["position"])
-    mesh = _place(arrays, frame)
+    mesh = _to_asset_frame(arrays, frame)
     with monitor.part("images"):
         normal, emissive = (read_exr(path) if path.exists() else None for path in (baked / "normal.exr", baked / "emissive.exr"))
-        sheets = quantise(read_exr(baked / "base_color.exr"), read_exr(baked / "orm.exr"), normal, emissive)
+        maps = quantise(read_exr(baked / "base_color.exr"), read_exr(baked / "orm.exr"), normal, emissive)
         geometry = sum(a.nbytes for a in (mesh.position, mesh.normal, mesh.tangent, mesh.uv, mesh.faces)) + 4096
-        images, saving = encode_within(sheets, int(settings.max_megabytes * 1e6) - geometry)
+        images, level = encode_within_budget(maps, int(settings.max_megabytes * 1e6) - geometry)
     monitor.check_stop()
     with monitor.part("write"):
-        extras = _extras(options, cameras, mesh, sheets)
-        data = build_glb(mesh, images, "asset", f"gsbake {__version__}", settings.copyright, extras, sheets.constants)
+        extras = _extras(options, cameras, mesh, maps)
+        data = build_glb(mesh, images, "asset", f"gsbake {__version__}", settings.copyright, extras, maps.factors)
         (out / "asset.glb").write_bytes(data)
-        (out / "cameras.json").write_text(json.dumps(transforms_json(cameras, frame, _sources(ingest)), indent=1))
+        (out / "cameras.json").write_text(json.dumps(transforms_json(cameras, frame, _source_file_names(ingest)), indent=1))
         if options.materials != "none":
             _write_light(baked, out, frame)
     with monitor.part("previews"):
-        _write_previews(out / "previews", sheets, mesh)
-    if saving.text != "full precision":
-        monitor.decide("texture precision", saving.text, f"the size asked for is {settings.max_megabytes:g} MB (export.max_megabytes)")
+        _write_previews(out / "previews", maps, mesh)
+    if level.text != "full precision":
+        monitor.decide("texture precision", level.text, f"the size limit is {settings.max_megabytes:g} MB (export.max_megabytes)")
     with monitor.part("audit"):
         passed, rules = _audit(data, out, settings, monitor)
     return {
         "megabytes": len(data) / 1e6,
         "triangles": len(mesh.faces),
         "vertices": len(mesh.position),
-        "texture_size": int(sheets.base_color.shape[0]),
+        "texture_size": int(maps.base_color.shape[0]),
         "image_bytes": {name: len(content or b"") for name, content in vars(images).items()},
-        "precision": saving.text,
+        "precision": level.text,
         "scale": extras["scale"],
         "audit_passed": passed,
         "audit_rules": rules,
@@ -98,51 +98,51 @@ def export_asset(
 
 
 def _audit(data: bytes, out: Path, settings: Export, monitor: Monitor) -> tuple[int, int]:
-    """Check the asset, write `audit.json`; how many rules passed, and how many there are."""
+    """Audit the asset and write `audit.json`; returns the number of passed rules and of all rules."""
     findings = audit(data, "asset.glb", settings.max_megabytes, settings.max_triangles)
     (out / "audit.json").write_text(json.dumps(as_json(findings), indent=1))
     for finding in findings:
         if not finding.passed and finding.severity == "warning":
             monitor.warn(f"export: {finding.rule}: {finding.detail}.")
-    wrong = failed(findings)
-    if wrong:
-        details = "; ".join(f"{f.rule} ({f.detail})" for f in wrong)
-        raise BadInputError(f"export: the asset breaks {len(wrong)} of its rules: {details}; change the mesh or the limits in the profile.")
+    errors = failed(findings)
+    if errors:
+        details = "; ".join(f"{f.rule} ({f.detail})" for f in errors)
+        raise BadInputError(f"export: the asset fails {len(errors)} audit rules: {details}; change the mesh or the limits in the profile.")
     return sum(f.passed for f in findings), len(findings)
 
 
-def _arrays(path: Path) -> dict[str, NDArray[Any]]:
+def _load_mesh_arrays(path: Path) -> dict[str, NDArray[Any]]:
     """The arrays of `mesh.safetensors`."""
     try:
         arrays: dict[str, NDArray[Any]] = load_file(path)
     except (OSError, SafetensorError) as error:
-        raise BadInputError(f"{path} is not readable ({error}); bake again.") from error
+        raise BadInputError(f"{path} cannot be read ({error}); bake again.") from error
     missing = {"position", "normal", "tangent", "uv", "faces"} - arrays.keys()
     if missing:
         raise BadInputError(f"{path} lacks {', '.join(sorted(missing))}; bake again.")
     return arrays
 
 
-def _place(arrays: dict[str, NDArray[Any]], frame: Similarity) -> GltfMesh:
-    """The mesh in the asset's frame; handedness stays, because the map is a proper similarity."""
+def _to_asset_frame(arrays: dict[str, NDArray[Any]], frame: Similarity) -> GltfMesh:
+    """The mesh in the asset frame; `frame` is a proper similarity, so handedness is preserved."""
 
-    def turned(vectors: NDArray[Any]) -> NDArray[np.float64]:
+    def rotated(vectors: NDArray[Any]) -> NDArray[np.float64]:
         out = vectors.astype(np.float64) @ frame.rotation.T
         return out / np.maximum(np.linalg.norm(out, axis=1, keepdims=True), 1e-12)
 
-    tangent = np.column_stack([turned(arrays["tangent"][:, :3]), arrays["tangent"][:, 3]])
+    tangent = np.column_stack([rotated(arrays["tangent"][:, :3]), arrays["tangent"][:, 3]])
     return GltfMesh(
         frame.apply(arrays["position"].astype(np.float64)).astype(np.float32),
-        turned(arrays["normal"]).astype(np.float32),
+        rotated(arrays["normal"]).astype(np.float32),
         tangent.astype(np.float32),
         arrays["uv"].astype(np.float32),
         arrays["faces"].astype(np.int32),
     )
 
 
-def _extras(options: ExportOptions, cameras: CameraSet, mesh: GltfMesh, sheets: Sheets) -> dict[str, Any]:
-    """What the asset says about itself: settings, scale, digests of its content."""
-    numbers = None if sheets.constants is None else np.array(sheets.constants, "<f8")
+def _extras(options: ExportOptions, cameras: CameraSet, mesh: GltfMesh, maps: TextureMaps) -> dict[str, Any]:
+    """The asset's extras: settings, scale, digests of its content."""
+    factors = None if maps.factors is None else np.array(maps.factors, "<f8")
 
     def digest(*parts: NDArray[Any] | None) -> str:
         hasher = blake3()
@@ -152,43 +152,43 @@ def _extras(options: ExportOptions, cameras: CameraSet, mesh: GltfMesh, sheets: 
         return hasher.hexdigest(16)
 
     return {
-        "profile": {"materials": options.materials, "texture_size": options.texture_size, "normal_map": sheets.normal is not None},
+        "profile": {"materials": options.materials, "texture_size": options.texture_size, "normal_map": maps.normal is not None},
         "scale": "metres" if cameras.metric else "unknown",
         "poses": cameras.poses,
         "digests": {
             "mesh": digest(mesh.position, mesh.normal, mesh.tangent, mesh.uv, mesh.faces),
-            "textures": digest(sheets.base_color, sheets.orm, sheets.normal, sheets.emissive, numbers),
+            "textures": digest(maps.base_color, maps.orm, maps.normal, maps.emissive, factors),
         },
     }
 
 
-def _sources(ingest: Path) -> dict[str, str]:
-    """File name of the user's photo by the photo's name inside gsbake."""
+def _source_file_names(ingest: Path) -> dict[str, str]:
+    """File name of the user's photo by the photo's name in gsbake."""
     photos = json.loads((ingest / "photos.json").read_text())["photos"]
     return {photo["name"]: PurePath(photo["source"]).name for photo in photos}
 
 
 def _write_light(baked: Path, out: Path, frame: Similarity) -> None:
-    """The learnt environment map, equirectangular, in the asset's frame."""
+    """Write the estimated environment map, equirectangular, in the asset frame."""
     from gsbake.shading.environment import EnvironmentLight
 
     light = EnvironmentLight.load(baked / "light.safetensors")
     write_hdr(out / "light.hdr", light.equirectangular(LIGHT_HEIGHT, frame.rotation, "gltf"))
 
 
-def _write_previews(folder: Path, sheets: Sheets, mesh: GltfMesh) -> None:
-    """PNG images of the maps and of the UV layout."""
+def _write_previews(folder: Path, maps: TextureMaps, mesh: GltfMesh) -> None:
+    """Write PNG previews of the maps and of the UV layout."""
     folder.mkdir()
-    size = min(PREVIEW_SIZE, sheets.base_color.shape[0])
+    size = min(PREVIEW_SIZE, maps.base_color.shape[0])
 
     def reduced(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
         return np.asarray(cv2.resize(image, (size, size), interpolation=cv2.INTER_AREA), np.uint8)
 
-    named = {"base_color": sheets.base_color, "orm": sheets.orm, "normal": sheets.normal, "emissive": sheets.emissive}
-    for name, sheet in named.items():
-        if sheet is not None:
-            (folder / f"{name}.png").write_bytes(encode_png(reduced(sheet), PREVIEW_LEVEL))
-    wires = (reduced(sheets.base_color) // 2 + 64).astype(np.uint8)
+    images = {"base_color": maps.base_color, "orm": maps.orm, "normal": maps.normal, "emissive": maps.emissive}
+    for name, image in images.items():
+        if image is not None:
+            (folder / f"{name}.png").write_bytes(encode_png(reduced(image), PREVIEW_LEVEL))
+    wireframe = (reduced(maps.base_color) // 2 + 64).astype(np.uint8)
     lines = np.rint(mesh.uv[mesh.faces].astype(np.float64) * size * 16 - 8).astype(np.int32)
-    cv2.polylines(wires, list(lines), True, (20, 20, 20), 1, cv2.LINE_AA, 4)
-    (folder / "uv.png").write_bytes(encode_png(wires, PREVIEW_LEVEL))
+    cv2.polylines(wireframe, list(lines), True, (20, 20, 20), 1, cv2.LINE_AA, 4)
+    (folder / "uv.png").write_bytes(encode_png(wireframe, PREVIEW_LEVEL))

@@ -1,7 +1,7 @@
-"""The asset's own frame: glTF's right-handed +Y up, and where the origin lies.
+"""The asset frame: glTF's right-handed +Y up axes, and the origin.
 
-World is Z-up; (x, y, z) becomes (x, z, −y), so Blender's front (−Y) becomes glTF's (+Z). Poses that came with the photos keep their origin;
-solved ones have none worth keeping, so the origin moves to the bottom centre of the object.
+The world is Z-up; (x, y, z) maps to (x, z, −y), so Blender's front (−Y) is glTF's front (+Z). Given poses keep their origin; that of solved
+poses is arbitrary, so the origin moves to the bottom centre of the object.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ Y_UP = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
 
 
 def asset_frame(cameras: CameraSet, position: NDArray[Any]) -> Similarity:
-    """The map from the unit frame of `cameras` to the asset's frame; `position` (v, 3) is the mesh in the unit frame."""
+    """The map from the unit frame of `cameras` to the asset frame; `position` (v, 3) are the mesh's vertices in the unit frame."""
     to_gltf = cameras.to_world.then(Similarity(1.0, Y_UP, np.zeros(3)))
     if cameras.poses == "given":
         return to_gltf
@@ -29,10 +29,10 @@ def asset_frame(cameras: CameraSet, position: NDArray[Any]) -> Similarity:
 
 
 def transforms_json(cameras: CameraSet, frame: Similarity, sources: dict[str, str]) -> dict[str, Any]:
-    """nerfstudio's `transforms.json` with the cameras in the asset's frame.
+    """nerfstudio's `transforms.json` with the cameras in the asset frame.
 
-    `frame` maps the cameras' frame to the asset's; `sources` gives the file name of each photo by its name in the set. Matrices are
-    camera to asset with OpenGL axes; intrinsics stand in every frame.
+    `frame` maps the cameras' frame to the asset frame; `sources` maps each camera's name to the file name of its photo. Matrices are
+    camera-to-asset with OpenGL axes; intrinsics are per frame.
     """
     frames = []
     for camera in cameras.cameras:

@@ -1,6 +1,6 @@
-"""A small reader of GLB files, for the report and the audit: the first mesh primitive, its material and its images.
+"""Reader of GLB files for the report and the audit: the first mesh primitive, its material and its images.
 
-Reads any GLB with float attributes and embedded images; it is no general glTF library.
+Reads any GLB with float attributes and embedded images; it is not a general glTF library.
 """
 
 from __future__ import annotations
@@ -16,17 +16,17 @@ from numpy.typing import NDArray
 from gsbake.errors import BadInputError
 from gsbake.gltf.container import unpack_glb
 
-COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
-WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
+COMPONENT_TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+COMPONENT_COUNTS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 
 
 @dataclass(frozen=True)
 class GltfAsset:
-    """A GLB taken apart.
+    """Parsed content of a GLB.
 
-    `attributes` maps names ("POSITION", …) to arrays (v, k); `faces` (f, 3) int64; `images` holds the encoded bytes of each image and
-    `roles` the image index of each texture role of the material ("base_color", "orm", "occlusion", "normal", "emissive"; absent roles
-    are left out).
+    `document` is the JSON document; `attributes` maps names ("POSITION", …) to arrays (v, k); `faces` (f, 3) int64; `images` holds the
+    encoded bytes of each image and `roles` the image index of each texture role that the material has ("base_color", "orm", "occlusion",
+    "normal", "emissive"); `size` is the file size in bytes.
     """
 
     document: dict[str, Any]
@@ -37,7 +37,7 @@ class GltfAsset:
     size: int
 
     def image(self, role: str) -> NDArray[np.uint8] | None:
-        """Pixels (h, w, 3) RGB of a role's image as stored, or None when the material has none."""
+        """Pixels (h, w, 3) 8-bit RGB of a role's image as stored, or None when the material has none."""
         if role not in self.roles:
             return None
         pixels = cv2.imdecode(np.frombuffer(self.images[self.roles[role]], np.uint8), cv2.IMREAD_COLOR)
@@ -47,12 +47,12 @@ class GltfAsset:
 
 
 def read_glb(path: Path) -> GltfAsset:
-    """Read a GLB. Raises BadInputError when it is damaged or holds no triangle mesh."""
+    """Read a GLB file. Raises BadInputError when it is damaged or holds no triangle mesh."""
     return parse_glb(path.read_bytes(), str(path))
 
 
 def parse_glb(data: bytes, name: str) -> GltfAsset:
-    """Read the bytes of a GLB; `name` is for messages."""
+    """Parse the bytes of a GLB; `name` identifies it in errors. Raises BadInputError as `read_glb`."""
     document, binary = unpack_glb(data, name)
     try:
         primitive = document["meshes"][0]["primitives"][0]
@@ -61,7 +61,7 @@ def parse_glb(data: bytes, name: str) -> GltfAsset:
             faces = _accessor(document, binary, primitive["indices"]).astype(np.int64).reshape(-1, 3)
         else:
             faces = np.arange(len(attributes["POSITION"])).reshape(-1, 3)
-        images = tuple(_view(document, binary, image["bufferView"]) for image in document.get("images", []))
+        images = tuple(_buffer_view(document, binary, image["bufferView"]) for image in document.get("images", []))
         material = document.get("materials", [{}])[primitive.get("material", 0)]
         roles = _roles(document, material)
     except (KeyError, IndexError, ValueError, TypeError) as error:
@@ -69,24 +69,24 @@ def parse_glb(data: bytes, name: str) -> GltfAsset:
     return GltfAsset(document, attributes, faces, images, roles, len(data))
 
 
-def _view(document: dict[str, Any], binary: bytes, index: int) -> bytes:
+def _buffer_view(document: dict[str, Any], binary: bytes, index: int) -> bytes:
     view = document["bufferViews"][index]
     start = view.get("byteOffset", 0)
     content = binary[start : start + view["byteLength"]]
     if len(content) != view["byteLength"]:
-        raise ValueError(f"buffer view {index} ends after the binary chunk")
+        raise ValueError(f"buffer view {index} exceeds the binary chunk")
     return content
 
 
 def _accessor(document: dict[str, Any], binary: bytes, index: int) -> NDArray[Any]:
-    """An accessor's values (count, width), or (count,) for scalars; interleaved views are resolved."""
+    """Values of an accessor (count, width), or (count,) for scalars, also from interleaved buffer views."""
     accessor = document["accessors"][index]
-    kind, width, count = np.dtype(COMPONENTS[accessor["componentType"]]), WIDTHS[accessor["type"]], accessor["count"]
-    content = _view(document, binary, accessor["bufferView"])
+    kind, width, count = np.dtype(COMPONENT_TYPES[accessor["componentType"]]), COMPONENT_COUNTS[accessor["type"]], accessor["count"]
+    content = _buffer_view(document, binary, accessor["bufferView"])
     stride = document["bufferViews"][accessor["bufferView"]].get("byteStride", kind.itemsize * width)
     start = accessor.get("byteOffset", 0)
     if start + stride * (count - 1) + kind.itemsize * width > len(content):
-        raise ValueError(f"accessor {index} ends after its buffer view")
+        raise ValueError(f"accessor {index} exceeds its buffer view")
     values = np.ndarray((count, width), kind, content, start, (stride, kind.itemsize)).copy()
     return values[:, 0] if width == 1 else values
 

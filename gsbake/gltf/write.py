@@ -1,6 +1,6 @@
-"""A small writer of the one kind of glTF file gsbake makes: one mesh, one material, up to four textures, one GLB.
+"""Writer of the asset's GLB: one mesh, one material, up to four textures.
 
-trimesh and others cannot write TANGENT, and bytes that depend only on the input make assets comparable by digest.
+Other libraries such as trimesh do not write TANGENT. The bytes depend only on the input, so assets are comparable by digest.
 
 glTF 2.0 specification, sections 3.6 (buffers, accessors), 3.7 (meshes), 3.9 (materials).
 """
@@ -35,9 +35,9 @@ class GltfMesh:
 
 
 @dataclass(frozen=True)
-class GltfImages:
-    """Encoded PNG files: base colour (sRGB), occlusion-roughness-metallic and normal map (both linear), emissive (sRGB); the last two may
-    be absent."""
+class GltfTextures:
+    """Encoded PNG files: base colour (sRGB), occlusion-roughness-metallic (ORM) and normal map (both linear), emissive (sRGB); the last
+    two may be absent. With constant roughness and metallic, `orm` is occlusion only."""
 
     base_color: bytes
     orm: bytes
@@ -47,7 +47,7 @@ class GltfImages:
 
 @dataclass
 class _Buffer:
-    """The growing binary chunk with its views and accessors."""
+    """Builder of the binary chunk with its buffer views and accessors."""
 
     data: bytearray = field(default_factory=bytearray)
     views: list[dict[str, Any]] = field(default_factory=list)
@@ -64,7 +64,7 @@ class _Buffer:
         return len(self.views) - 1
 
     def accessor(self, values: NDArray[Any], kind: str, component: int, target: int, bounds: bool = False) -> int:
-        """Append an array as an accessor of its own view; returns its index."""
+        """Append an array as an accessor with its own buffer view; returns its index."""
         entry: dict[str, Any] = {
             "bufferView": self.view(values.tobytes(), target),
             "componentType": component,
@@ -80,51 +80,23 @@ class _Buffer:
 
 def build_glb(
     mesh: GltfMesh,
-    images: GltfImages,
+    textures: GltfTextures,
     name: str,
     generator: str,
     copyright_line: str = "",
     extras: dict[str, Any] | None = None,
-    constants: tuple[float, float] | None = None,
+    factors: tuple[float, float] | None = None,
 ) -> bytes:
-    """The bytes of the asset. Raises ValueError when the mesh is empty or its arrays do not fit together.
+    """The bytes of the asset. Raises ValueError when the mesh is empty or its arrays differ in length.
 
-    `constants` are roughness and metallic where `images.orm` is occlusion alone.
+    `factors` are constant roughness and metallic; `textures.orm` is then occlusion only.
     """
     count = len(mesh.position)
     if len(mesh.faces) == 0 or not (len(mesh.normal) == len(mesh.tangent) == len(mesh.uv) == count):
         raise ValueError("the mesh is empty or its attributes differ in length")
     buffer = _Buffer()
-    attributes = {
-        "POSITION": buffer.accessor(np.ascontiguousarray(mesh.position, "<f4"), "VEC3", FLOAT, ARRAY_BUFFER, bounds=True),
-        "NORMAL": buffer.accessor(np.ascontiguousarray(mesh.normal, "<f4"), "VEC3", FLOAT, ARRAY_BUFFER),
-        "TANGENT": buffer.accessor(np.ascontiguousarray(mesh.tangent, "<f4"), "VEC4", FLOAT, ARRAY_BUFFER),
-        "TEXCOORD_0": buffer.accessor(np.ascontiguousarray(mesh.uv, "<f4"), "VEC2", FLOAT, ARRAY_BUFFER),
-    }
-    # 65535 is the primitive-restart value of 16-bit indices and may not be used.
-    component, width = (UNSIGNED_SHORT, "<u2") if count < 65535 else (UNSIGNED_INT, "<u4")
-    indices = buffer.accessor(np.ascontiguousarray(mesh.faces, width).ravel(), "SCALAR", component, ELEMENT_ARRAY_BUFFER)
-    pictures: list[dict[str, Any]] = []
-    surface: dict[str, Any] = {"baseColorTexture": {"index": 0}}
-    if constants is None:
-        surface["metallicRoughnessTexture"] = {"index": 1}
-    else:
-        surface["roughnessFactor"], surface["metallicFactor"] = constants
-    material: dict[str, Any] = {
-        "name": name,
-        "pbrMetallicRoughness": surface,
-        "occlusionTexture": {"index": 1},
-        "alphaMode": "OPAQUE",
-    }
-    packed = "orm" if constants is None else "occlusion"
-    contents = {"base_color": images.base_color, packed: images.orm, "normal": images.normal, "emissive": images.emissive}
-    for label, content in contents.items():
-        if content is not None:
-            pictures.append({"name": label, "mimeType": "image/png", "bufferView": buffer.view(content)})
-            if label in ("normal", "emissive"):
-                material[f"{label}Texture"] = {"index": len(pictures) - 1}
-    if images.emissive is not None:
-        material["emissiveFactor"] = [1, 1, 1]
+    primitive = _primitive(mesh, buffer)
+    material, images = _material(textures, name, factors, buffer)
     asset: dict[str, Any] = {"version": "2.0", "generator": generator}
     if copyright_line:
         asset["copyright"] = copyright_line
@@ -135,13 +107,55 @@ def build_glb(
         "scene": 0,
         "scenes": [{"nodes": [0]}],
         "nodes": [{"name": name, "mesh": 0}],
-        "meshes": [{"name": name, "primitives": [{"attributes": attributes, "indices": indices, "material": 0, "mode": 4}]}],
+        "meshes": [{"name": name, "primitives": [primitive]}],
         "materials": [material],
-        "textures": [{"sampler": 0, "source": k} for k in range(len(pictures))],
+        "textures": [{"sampler": 0, "source": k} for k in range(len(images))],
         "samplers": [{"magFilter": LINEAR, "minFilter": LINEAR_MIPMAP_LINEAR, "wrapS": CLAMP, "wrapT": CLAMP}],
-        "images": pictures,
+        "images": images,
         "accessors": buffer.accessors,
         "bufferViews": buffer.views,
         "buffers": [{"byteLength": len(buffer.data) + -len(buffer.data) % 4}],
     }
     return pack_glb(document, bytes(buffer.data))
+
+
+def _primitive(mesh: GltfMesh, buffer: _Buffer) -> dict[str, Any]:
+    """Append the mesh to the buffer; returns its primitive."""
+    attributes = {
+        "POSITION": buffer.accessor(np.ascontiguousarray(mesh.position, "<f4"), "VEC3", FLOAT, ARRAY_BUFFER, bounds=True),
+        "NORMAL": buffer.accessor(np.ascontiguousarray(mesh.normal, "<f4"), "VEC3", FLOAT, ARRAY_BUFFER),
+        "TANGENT": buffer.accessor(np.ascontiguousarray(mesh.tangent, "<f4"), "VEC4", FLOAT, ARRAY_BUFFER),
+        "TEXCOORD_0": buffer.accessor(np.ascontiguousarray(mesh.uv, "<f4"), "VEC2", FLOAT, ARRAY_BUFFER),
+    }
+    # 65535 is the primitive-restart value of 16-bit indices and may not be used.
+    component, width = (UNSIGNED_SHORT, "<u2") if len(mesh.position) < 65535 else (UNSIGNED_INT, "<u4")
+    indices = buffer.accessor(np.ascontiguousarray(mesh.faces, width).ravel(), "SCALAR", component, ELEMENT_ARRAY_BUFFER)
+    return {"attributes": attributes, "indices": indices, "material": 0, "mode": 4}
+
+
+def _material(
+    textures: GltfTextures, name: str, factors: tuple[float, float] | None, buffer: _Buffer
+) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+    """Append the textures to the buffer; returns the material and the images, where texture k reads image k."""
+    surface: dict[str, Any] = {"baseColorTexture": {"index": 0}}
+    if factors is None:
+        surface["metallicRoughnessTexture"] = {"index": 1}
+    else:
+        surface["roughnessFactor"], surface["metallicFactor"] = factors
+    material: dict[str, Any] = {
+        "name": name,
+        "pbrMetallicRoughness": surface,
+        "occlusionTexture": {"index": 1},
+        "alphaMode": "OPAQUE",
+    }
+    packed = "orm" if factors is None else "occlusion"
+    contents = {"base_color": textures.base_color, packed: textures.orm, "normal": textures.normal, "emissive": textures.emissive}
+    images: list[dict[str, Any]] = []
+    for role, content in contents.items():
+        if content is not None:
+            images.append({"name": role, "mimeType": "image/png", "bufferView": buffer.view(content)})
+            if role in ("normal", "emissive"):
+                material[f"{role}Texture"] = {"index": len(images) - 1}
+    if textures.emissive is not None:
+        material["emissiveFactor"] = [1, 1, 1]
+    return material, images

@@ -1,1 +1,1 @@
-"""Images as arrays: colour curves, reading and writing, sampling, distances, similarity figures."""
+"""Images as arrays: sRGB conversion, file formats, sampling, distance transform, similarity metrics."""

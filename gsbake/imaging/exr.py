@@ -1,4 +1,4 @@
-"""The texture masters (half-float OpenEXR) and the light (Radiance HDR), through OpenImageIO."""
+"""Textures as half-float OpenEXR and environment maps as Radiance HDR, through OpenImageIO."""
 
 from __future__ import annotations
 
@@ -11,22 +11,22 @@ from numpy.typing import NDArray
 
 from gsbake.errors import BadInputError
 
-#: Every file says it was captured then: the time of writing would change the file's digest from run to run.
-EPOCH = "1970:01:01 00:00:00"
-#: Channel names by count; more channels are numbered.
-NAMES = {1: ("Y",), 3: ("R", "G", "B"), 4: ("R", "G", "B", "A")}
+#: DateTime attribute of every file: the actual time would change the file's digest from run to run.
+FIXED_DATE = "1970:01:01 00:00:00"
+#: Channel names by number of channels; other counts use C0, C1, ….
+CHANNEL_NAMES = {1: ("Y",), 3: ("R", "G", "B"), 4: ("R", "G", "B", "A")}
 
 
 def write_exr(path: Path, image: NDArray[Any]) -> None:
-    """Write `image` (h, w, c) as a half-float EXR without loss beyond rounding (ZIP); the same image writes the same bytes.
+    """Write `image` (h, w, c) as a half-float EXR with lossless ZIP compression; equal images give equal bytes.
 
     Raises OSError when it cannot be written.
     """
     height, width, channels = image.shape
     spec = oiio.ImageSpec(width, height, channels, oiio.HALF)
-    spec.channelnames = NAMES.get(channels, tuple(f"C{k}" for k in range(channels)))
+    spec.channelnames = CHANNEL_NAMES.get(channels, tuple(f"C{k}" for k in range(channels)))
     spec["compression"] = "zip"
-    spec["DateTime"] = EPOCH
+    spec["DateTime"] = FIXED_DATE
     _write(path, spec, np.ascontiguousarray(image, np.float16))
 
 
@@ -46,7 +46,7 @@ def _write(path: Path, spec: oiio.ImageSpec, pixels: NDArray[Any]) -> None:
 
 
 def read_exr(path: Path) -> NDArray[np.float32]:
-    """Read an EXR as (h, w, c) float32. Raises BadInputError when there is no such image."""
+    """Read an EXR as (h, w, c) float32. Raises BadInputError for a missing or damaged file."""
     source = oiio.ImageInput.open(str(path))
     if source is None:
         raise BadInputError(f"{path} is not a readable image ({oiio.geterror()}); bake again.")

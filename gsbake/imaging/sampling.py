@@ -1,6 +1,6 @@
-"""Images sampled between their pixels.
+"""Bilinear image sampling.
 
-OpenCV reads a picture at a map of places, and a map may have no more than 32 766 rows or columns; a list of places is laid out in rows.
+OpenCV's remap takes a 2D map of at most 32 766 rows or columns; a list of points is reshaped to such a map.
 """
 
 from __future__ import annotations
@@ -11,26 +11,26 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-#: Places of one row of the map that OpenCV is given.
-ROW = 4096
+#: Columns of the map passed to OpenCV.
+MAP_WIDTH = 4096
 
 
-def read_at(picture: NDArray[Any], x: NDArray[Any], y: NDArray[Any]) -> NDArray[Any]:
-    """The `picture` (h, w), bilinear, at columns `x` and rows `y` (any one shape; pixel centres are whole numbers), in its own type.
+def bilinear_at_pixels(image: NDArray[Any], x: NDArray[Any], y: NDArray[Any]) -> NDArray[Any]:
+    """Bilinear values of `image` (h, w), in its own type, at columns `x` and rows `y` (equal shapes; pixel centres at integers).
 
-    Places outside show the nearest border pixel.
+    Points outside take the nearest border pixel.
     """
     count = x.size
-    rows = max(1, -(-count // ROW))
-    places = np.zeros((2, rows * ROW), np.float32)
-    places[0, :count], places[1, :count] = x.ravel(), y.ravel()
-    columns, lines = places.reshape(2, rows, ROW)
-    value = cv2.remap(picture, columns, lines, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    rows = max(1, -(-count // MAP_WIDTH))
+    coordinates = np.zeros((2, rows * MAP_WIDTH), np.float32)
+    coordinates[0, :count], coordinates[1, :count] = x.ravel(), y.ravel()
+    map_x, map_y = coordinates.reshape(2, rows, MAP_WIDTH)
+    value = cv2.remap(image, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return np.asarray(value.ravel()[:count].reshape(x.shape))
 
 
 def bilinear(image: NDArray[np.float32], uv: NDArray[np.float32], wrap: bool = True) -> NDArray[np.float32]:
-    """Values (n, c) of an image (h, w, c) at uv (n, 2), texel centres at (i + .5) / size; beyond 0..1 repeated or clamped."""
+    """Bilinear values (n, c) of an image (h, w, c) at uv (n, 2), texel centres at (i + .5) / size; repeated or clamped beyond 0..1."""
     height, width = image.shape[:2]
     x, y = uv[:, 0] * width - np.float32(0.5), uv[:, 1] * height - np.float32(0.5)
     col, row = np.floor(x).astype(np.int64), np.floor(y).astype(np.int64)

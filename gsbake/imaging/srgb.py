@@ -1,4 +1,4 @@
-"""The sRGB tone curve (IEC 61966-2-1), for arrays; `imaging.srgb_torch` has it with gradients."""
+"""sRGB tone curve (IEC 61966-2-1) for NumPy arrays; `imaging.srgb_torch` has the differentiable version."""
 
 from __future__ import annotations
 
@@ -7,26 +7,26 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-#: The curve is SLOPE · linear up to KINK (linear) or CODED_KINK (sRGB), and SCALE · linear^(1 / GAMMA) − OFFSET beyond.
-KINK, CODED_KINK, SLOPE = 0.0031308, 0.04045, 12.92
+#: SLOPE · linear up to LINEAR_THRESHOLD (SRGB_THRESHOLD in sRGB), SCALE · linear^(1 / GAMMA) − OFFSET above.
+LINEAR_THRESHOLD, SRGB_THRESHOLD, SLOPE = 0.0031308, 0.04045, 12.92
 SCALE, OFFSET, GAMMA = 1.055, 0.055, 2.4
 
 
 def _decoded(value: NDArray[Any]) -> NDArray[Any]:
-    return np.where(value <= CODED_KINK, value / SLOPE, ((value + OFFSET) / SCALE) ** GAMMA)
+    return np.where(value <= SRGB_THRESHOLD, value / SLOPE, ((value + OFFSET) / SCALE) ** GAMMA)
 
 
 def _encoded(value: NDArray[Any]) -> NDArray[Any]:
-    return np.where(value <= KINK, SLOPE * value, SCALE * value ** (1 / GAMMA) - OFFSET)
+    return np.where(value <= LINEAR_THRESHOLD, SLOPE * value, SCALE * value ** (1 / GAMMA) - OFFSET)
 
 
 #: Linear value of each 8-bit sRGB code.
-LINEAR = _decoded(np.arange(256) / 255).astype(np.float32)
+LINEAR_OF_BYTE = _decoded(np.arange(256) / 255).astype(np.float32)
 
 
 def decode_bytes(coded: NDArray[np.uint8]) -> NDArray[np.float32]:
     """Linear float32 values of 8-bit sRGB `coded`, of the same shape."""
-    return np.asarray(LINEAR[coded], np.float32)
+    return np.asarray(LINEAR_OF_BYTE[coded], np.float32)
 
 
 def decode(coded: NDArray[Any]) -> NDArray[np.float32]:

@@ -1,4 +1,4 @@
-"""From mesh and photos to textures: UV atlas, normal map, ambient occlusion, materials, as linear half-float images."""
+"""Texture baking: UV atlas, normal map, ambient occlusion and materials of a mesh from photos, as linear half-float images."""
 
 from __future__ import annotations
 
@@ -17,26 +17,26 @@ from gsbake.errors import BadInputError
 from gsbake.geometry.ply import read_mesh
 from gsbake.geometry.raycast import RayCaster
 from gsbake.imaging.exr import write_exr
-from gsbake.materials.delighting import find_irradiance, without_shading
-from gsbake.materials.fitting import RAY_OFFSET, SMOOTHING_RADIUS, FitOptions, fit_materials
+from gsbake.materials.delighting import find_irradiance, remove_shading
+from gsbake.materials.fitting import RAY_OFFSET, SMOOTHING_RADIUS, FitSettings, fit_materials
 from gsbake.monitor import SILENT, Monitor, Rule, decide_skip
 from gsbake.surfels.raster.threads import configure
 from gsbake.texturing.atlas import make_atlas
-from gsbake.texturing.inpainting import continue_over_surface, flood
+from gsbake.texturing.inpainting import fill_empty_texels, inpaint_surface
 from gsbake.texturing.needed import normals_agree
-from gsbake.texturing.normal_map import Detail, find_detail, normal_map, vertex_normals
-from gsbake.texturing.occlusion_map import open_share
+from gsbake.texturing.normal_map import DenseSamples, normal_map, sample_dense_mesh, vertex_normals
+from gsbake.texturing.occlusion_map import bake_occlusion
 from gsbake.texturing.photo_projection import project_photos, project_surfel_materials
-from gsbake.texturing.projection import Blended
-from gsbake.texturing.resampling import Coarse
-from gsbake.texturing.unwrapped_mesh import Surface
+from gsbake.texturing.projection import ProjectedTexture
+from gsbake.texturing.resampling import CoarseTexture
+from gsbake.texturing.unwrapped_mesh import UnwrappedMesh
 
 Floats = NDArray[np.float32]
 
-#: Edge of the texture on which the light for delighting is estimated: some ten thousand texels determine its nine coefficients.
+#: Edge in texels of the texture on which delighting estimates the irradiance: ten thousand texels determine its eight coefficients.
 DELIGHT_SIZE = 128
-#: A larger share of the surface that no photo observed is worth a warning.
-MAX_UNSEEN = 0.25
+#: Share of the surface that no photo observed, above which a warning is given.
+MAX_UNOBSERVED = 0.25
 
 
 @dataclass(frozen=True)
@@ -70,18 +70,18 @@ def bake_textures(
 
     Written: `mesh.safetensors` (the unwrapped mesh with its tangent frames), `base_color.exr`, `orm.exr`, `coverage.exr`, where needed
     `normal.exr` and `emissive.exr`, with materials `light.safetensors`. Raises BadInputError when the mesh is damaged, does not fit the
-    atlas, or is seen by no photo.
+    atlas, or is visible in no photo.
     """
     return _Baking(PosedPhotos.open(poses, surfels), surfels, mesh, out, options or BakeOptions(), seed, threads, monitor).run()
 
 
 @dataclass(frozen=True)
 class Textures:
-    """Per texel: `values` (n, 3, 5 or 8) linear base colour, then roughness and metallic, then emission; which are `observed` (n,), and the
-    `confidence` (n,); `normal` of the shading."""
+    """`projected`: values (n, 3, 5 or 8) of the texels, which are linear base colour, then roughness and metallic, then emission; `normal`:
+    shading normals of the texels; `figures` for the manifest."""
 
-    projected: Blended
-    normal: Detail
+    projected: ProjectedTexture
+    normal: DenseSamples
     figures: dict[str, Any]
 
 
@@ -99,12 +99,12 @@ class _Baking:
     monitor: Monitor
 
     def run(self) -> dict[str, Any]:
-        """The recipe."""
+        """Unwrap, sample the dense mesh, trace occlusion, bake materials, fill gaps, write."""
         monitor, settings = self.monitor, self.options.bake
         configure(self.threads)
         if settings.materials == "surfels" and not (self.surfels / "light.safetensors").exists():
             raise BadInputError(
-                'bake: bake.materials is "surfels", but the surfels learnt none; set surfels.shading to "pbr" or bake.materials to "fit".'
+                'bake: bake.materials is "surfels", but the surfels have none; set surfels.shading to "pbr" or bake.materials to "fit".'
             )
         vertices, faces = self._read("mesh.ply")
         surface = self._unwrap(vertices, faces)
@@ -115,8 +115,8 @@ class _Baking:
         with monitor.part("occlusion"):
             occlusion = self._occlusion(surface, dense, detail)
         textures = self._materials(surface, detail, occlusion)
-        if not textures.projected.seen.any():
-            raise BadInputError("bake: no photo sees the mesh; poses and mesh do not belong together, run from the poses stage again.")
+        if not textures.projected.observed.any():
+            raise BadInputError("bake: the mesh is visible in no photo; poses and mesh do not match. Run again from the poses stage.")
         coded = self._normal_map(surface, textures)
         with monitor.part("inpainting"):
             image, emissive = self._image(surface, textures.projected, occlusion, coded, faces, len(vertices))
@@ -131,8 +131,8 @@ class _Baking:
         except ValueError as error:
             raise BadInputError(f"{error}; run the mesh stage again or replace the file.") from error
 
-    def _unwrap(self, vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> Surface:
-        """The low-poly mesh cut into charts, with its texels."""
+    def _unwrap(self, vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> UnwrappedMesh:
+        """The low-poly mesh unwrapped into charts, with its texels."""
         size = self.options.bake.size
         with self.monitor.part("atlas"):
             try:
@@ -140,18 +140,18 @@ class _Baking:
             except ValueError as error:
                 raise BadInputError(f"bake: {error}; raise bake.size or lower mesh.faces.") from error
         with self.monitor.part("texels"):
-            surface = Surface.of(vertices, faces, atlas, size, self.threads)
+            surface = UnwrappedMesh.of(vertices, faces, atlas, size, self.threads)
         self.monitor.progress(1, 4, "atlas", charts=atlas.charts, fill=atlas.fill)
         return surface
 
-    def _dense(self, surface: Surface) -> tuple[tuple[RayCaster, NDArray[np.float64]], Detail]:
-        """The dense mesh with its vertex normals, and its nearest point to each texel."""
+    def _dense(self, surface: UnwrappedMesh) -> tuple[tuple[RayCaster, NDArray[np.float64]], DenseSamples]:
+        """The dense mesh with its vertex normals, and its points at the texels."""
         vertices, faces = self._read("dense.ply")
         caster, normals = RayCaster(vertices, faces, self.threads), vertex_normals(vertices, faces)
-        return (caster, normals), find_detail(surface.at, surface.facing, caster, normals, surface.diagonal)
+        return (caster, normals), sample_dense_mesh(surface.texel_position, surface.texel_normal, caster, normals, surface.diagonal)
 
-    def _occlusion(self, surface: Surface, dense: tuple[RayCaster, NDArray[np.float64]], detail: Detail) -> Floats:
-        """Ambient occlusion (n,) per texel, 1 = open, traced on the dense mesh where there is one."""
+    def _occlusion(self, surface: UnwrappedMesh, dense: tuple[RayCaster, NDArray[np.float64]], detail: DenseSamples) -> Floats:
+        """Ambient occlusion (n,) of the texels, 1 = open; all open with `bake.occlusion_rays` = 0."""
         rays = self.options.bake.occlusion_rays
         if rays == 0:
             return np.ones(len(surface.texels), np.float32)
@@ -160,10 +160,10 @@ class _Baking:
             self.monitor.check_stop()
             self.monitor.progress(done, total, "ambient occlusion")
 
-        return open_share(surface, dense, detail, rays, RAY_OFFSET * surface.diagonal, SMOOTHING_RADIUS, each)
+        return bake_occlusion(surface, dense, detail, rays, RAY_OFFSET * surface.diagonal, SMOOTHING_RADIUS, each)
 
-    def _materials(self, surface: Surface, detail: Detail, occlusion: Floats) -> Textures:
-        """What `bake.materials` asks for; the light is written beside the textures."""
+    def _materials(self, surface: UnwrappedMesh, detail: DenseSamples, occlusion: Floats) -> Textures:
+        """Textures by the method of `bake.materials`; writes `light.safetensors` if the method finds the light."""
         options, monitor = self.options, self.monitor
         light = self.out / "light.safetensors"
         if options.bake.materials == "surfels":
@@ -177,35 +177,33 @@ class _Baking:
             with monitor.part("delighting"):
                 return Textures(self._delight(surface, projected, detail, occlusion), detail, {})
         if options.bake.materials == "fit":
-            fit = FitOptions(
-                options.bake, options.light_size, options.holdout, options.specular, options.metallic_map, options.roughness_map
-            )
+            rules = options.specular, options.metallic_map, options.roughness_map
+            fit = FitSettings(options.bake, options.light_size, options.holdout, *rules)
             with monitor.part("fit"):
                 fitted = fit_materials(surface, self.posed, projected, detail, occlusion, fit, self.seed, monitor)
             fitted.light.save(light)
             return Textures(fitted.textures, fitted.normal, fitted.figures)
         return Textures(projected, detail, {})
 
-    def _delight(self, surface: Surface, projected: Blended, detail: Detail, occlusion: Floats) -> Blended:
-        """Base colour (n, 3): the projected colours without their shading."""
-        visible = np.ones_like(occlusion) if self.options.bake.visibility == "none" else occlusion
-        coarse = Coarse.sized(surface.atlas.uv, surface.atlas.faces, surface.texels, surface.texel, DELIGHT_SIZE)
-        seen = projected.seen.astype(np.float32)[:, None]
-        share = coarse.down(seen)
+    def _delight(self, surface: UnwrappedMesh, projected: ProjectedTexture, detail: DenseSamples, occlusion: Floats) -> ProjectedTexture:
+        """Base colour (n, 3): projected colours divided by their shading."""
+        occlusion = np.ones_like(occlusion) if self.options.bake.visibility == "none" else occlusion
+        coarse = CoarseTexture.sized(surface.atlas.uv, surface.atlas.faces, surface.texels, surface.texel_size, DELIGHT_SIZE)
+        weight = projected.observed.astype(np.float32)[:, None]
+        share = coarse.down(weight)
         known = share[:, 0] > 0.5
-        colour, normal, position, open_there = (
-            coarse.down(seen * x)[known] / share[known] for x in (projected.values, detail.normal, detail.position, visible[:, None])
-        )
-        irradiance = find_irradiance(colour, normal / np.linalg.norm(normal, axis=1, keepdims=True), position, open_there[:, 0])
-        values, mine = projected.values.copy(), projected.seen
-        values[mine], level = without_shading(projected.values[mine], detail.normal[mine], visible[mine], irradiance)
-        irradiance.light(self.options.light_size, level).save(self.out / "light.safetensors")
+        samples = projected.values, detail.normal, detail.position, occlusion[:, None]
+        colour, normal, position, coarse_occlusion = (coarse.down(weight * x)[known] / share[known] for x in samples)
+        irradiance = find_irradiance(colour, normal / np.linalg.norm(normal, axis=1, keepdims=True), position, coarse_occlusion[:, 0])
+        values, mine = projected.values.copy(), projected.observed
+        values[mine], intensity = remove_shading(projected.values[mine], detail.normal[mine], occlusion[mine], irradiance)
+        irradiance.light(self.options.light_size, intensity).save(self.out / "light.safetensors")
         return replace(projected, values=values)
 
-    def _normal_map(self, surface: Surface, textures: Textures) -> Floats | None:
+    def _normal_map(self, surface: UnwrappedMesh, textures: Textures) -> Floats | None:
         """The tangent-space normal map (n, 3), coded to 0..1, or None where the low-poly mesh needs none."""
         fitted = self.options.bake.materials == "fit"
-        agree, evidence = (False, "the material fit refines normals") if fitted else normals_agree(textures.normal, surface.facing)
+        agree, evidence = (False, "normals refined by the material fit") if fitted else normals_agree(textures.normal, surface.texel_normal)
         rule = self.options.normal_map
         if decide_skip(self.monitor, "normal_map", rule, agree, evidence, "no normal map", "normal map baked"):
             return None
@@ -213,21 +211,30 @@ class _Baking:
         return normal_map(textures.normal, interpolate(surface.normal, faces), interpolate(surface.tangent, faces))
 
     def _image(
-        self, surface: Surface, projected: Blended, occlusion: Floats, coded: Floats | None, faces: NDArray[np.int64], vertices: int
+        self,
+        surface: UnwrappedMesh,
+        projected: ProjectedTexture,
+        occlusion: Floats,
+        coded: Floats | None,
+        faces: NDArray[np.int64],
+        vertices: int,
     ) -> tuple[Floats, bool]:
-        """All maps as one image (size, size, channels), unobserved texels and gutters filled: base colour, occlusion, roughness, metallic,
-        the normal map if there is one, emission if there is any; and whether there is."""
+        """All maps as one image (size, size, channels), with unobserved texels and gutters filled, and whether it contains emission.
+
+        Channels: base colour, occlusion, roughness, metallic, the normal map if there is one, emission if there is any. `faces` and the
+        number of `vertices` are those of the mesh before unwrapping.
+        """
         texels, settings = surface.texels, self.options.bake
-        values = continue_over_surface(projected.values, projected.seen, texels, faces, vertices)
+        values = inpaint_surface(projected.values, projected.observed, texels, faces, vertices)
         if values.shape[1] == 3:
             constant = np.tile(np.array([settings.default_roughness, 0.0], np.float32), (len(texels), 1))
             values = np.concatenate([values, constant], 1)
         values = np.clip(values, 0, 1)
         parts = [values[:, :3], occlusion[:, None], values[:, 3:5], *([] if coded is None else [coded]), values[:, 5:]]
-        image = flood(texels.image(np.concatenate(parts, 1)), texels.covered(), rim=max(2, settings.size // 256))
+        image = fill_empty_texels(texels.image(np.concatenate(parts, 1)), texels.covered(), gutter=max(2, settings.size // 256))
         return image, values.shape[1] == 8
 
-    def _write(self, surface: Surface, projected: Blended, image: Floats, normals: bool, emissive: bool) -> None:
+    def _write(self, surface: UnwrappedMesh, projected: ProjectedTexture, image: Floats, normals: bool, emissive: bool) -> None:
         """Write the images, the coverage and the unwrapped mesh."""
         write_exr(self.out / "base_color.exr", image[..., 0:3])
         write_exr(self.out / "orm.exr", image[..., 3:6])
@@ -236,26 +243,26 @@ class _Baking:
         if emissive:
             write_exr(self.out / "emissive.exr", image[..., -3:])
         count = len(surface.texels)
-        coverage = np.stack([np.ones(count, np.float32), projected.seen.astype(np.float32), projected.confidence], 1)
+        coverage = np.stack([np.ones(count, np.float32), projected.observed.astype(np.float32), projected.confidence], 1)
         write_exr(self.out / "coverage.exr", surface.texels.image(coverage))
         arrays = {"position": surface.position, "normal": surface.normal, "tangent": surface.tangent, "uv": surface.atlas.uv}
         body = {name: np.ascontiguousarray(array, np.float32) for name, array in arrays.items()}
         save_file(body | {"faces": np.ascontiguousarray(surface.atlas.faces, np.int32)}, self.out / "mesh.safetensors")
 
-    def _figures(self, surface: Surface, detail: Detail, textures: Textures) -> dict[str, Any]:
-        """What the manifest keeps."""
+    def _figures(self, surface: UnwrappedMesh, detail: DenseSamples, textures: Textures) -> dict[str, Any]:
+        """Results for the manifest; warns of unobserved surface."""
         projected = textures.projected
-        unseen = float(1 - projected.seen.mean())
-        if unseen > MAX_UNSEEN:
-            self.monitor.warn(f"bake: {unseen:.0%} of the surface was observed by no photo; its colours are inpainted.")
+        unobserved = float(1 - projected.observed.mean())
+        if unobserved > MAX_UNOBSERVED:
+            self.monitor.warn(f"bake: {unobserved:.0%} of the surface was observed by no photo and is inpainted.")
         return {
             "charts": surface.atlas.charts,
             "fill": surface.atlas.fill,
             "texels": len(surface.texels),
             "vertices": len(surface.position),
             "faces": len(surface.atlas.faces),
-            "texel_edge": surface.texel,
-            "unseen_share": unseen,
+            "texel_edge": surface.texel_size,
+            "unseen_share": unobserved,
             "median_views": float(np.median(projected.views)),
             "detail_share": float(detail.found.mean()),
             "detail_bound": detail.bound,

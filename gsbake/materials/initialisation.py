@@ -1,11 +1,11 @@
-"""Which roughness the fit of materials starts from, and whether it looks for metals: settled by photos that took no part.
+"""Choice of the fit's initial roughness, and of whether to search for metals, on validation views.
 
-How rough the object is at the start decides which light is found: a surface taken for rough cannot show where the light comes from and its
-reflections end as paint; one taken for smooth blurs the light instead. So short trials from a few values compete on photos they were not
-fitted to, and the best goes on. Where two are close, both are fitted in full.
+The initial roughness decides which light is found: a surface that starts too rough cannot localise light, and its reflections end up in
+base colour; one that starts too smooth makes the light blurred. Short trials from a few values are compared on photos that they were not
+fitted to. Where two are close, both are fitted in full.
 
-Metals that a fit found should show in other photos, too. Where those are shown nearly as well without any metallic, the metals may be white
-or black paint that passes for metal, and the fit is made again without looking for any.
+Detected metals should be confirmed by photos that were not fitted. Where those are reproduced nearly as well with metallic 0, the metals
+may be white or black dielectrics, and the fit is repeated without them.
 """
 
 from __future__ import annotations
@@ -13,102 +13,106 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
-from gsbake.materials.fit import FitSchedule, Fitted, MaterialFit
+from gsbake.materials.fit import Fitted, MaterialFit
 from gsbake.materials.map_selection import without_metal
+from gsbake.materials.options import FitSchedule
 from gsbake.materials.pixels import Pixels
 
-#: Roughness of all texels that trials start from, and their steps, pixels of a photo and every how many-th photo judges them.
-TRIALS, TRIAL_STEPS, TRIAL_PIXELS, TRIAL_PHOTO = (0.2, 0.45, 0.8), 100, 15_000, 5
-#: Starts that a trial leaves less than this behind the best (dB) are fitted in full as well: 100 steps find a blurred light sooner than a
-#: sharp one, and so favour smooth starts.
-RIVAL = 1.0
-#: Metals that held-out photos miss by less than this (dB) are doubted.
-DOUBTED = 0.5
+#: Initial roughness of the trials.
+TRIAL_ROUGHNESS = (0.2, 0.45, 0.8)
+#: Iterations of a trial, pixels of each photo in it, and every how many-th photo validates it.
+TRIAL_STEPS, TRIAL_PIXELS, TRIAL_HOLDOUT = 100, 15_000, 5
+#: Trials within this many dB of the best are fitted in full: 100 steps find a blurred light sooner than a sharp one and so favour smooth
+#: initial values.
+CANDIDATE_MARGIN = 1.0
+#: Metals that raise held-out PSNR by less than this many dB are validated by a fit without them.
+METAL_MARGIN = 0.5
 
-#: Builds a fit that starts from a roughness.
-Make = Callable[[float], MaterialFit]
+#: Builds a fit with an initial roughness.
+MakeFit = Callable[[float], MaterialFit]
 
 
 @dataclass(frozen=True)
-class Choice:
-    """The `fit` chosen and what it `fitted`, the `roughness` it started from, how many fits were made in full, and the evidence for the
-    start and, where metals were doubted, against or for them."""
+class ChosenFit:
+    """The chosen `fit` and its result `fitted`, its initial `roughness`, the number of full `fits` made, the `evidence` for that roughness,
+    and `metal_evidence` where metals were validated by a fit without them."""
 
     fit: MaterialFit
     fitted: Fitted
     roughness: float
     fits: int
-    why: str
-    metals: str | None
+    evidence: str
+    metal_evidence: str | None
 
 
 def best_fit(
-    make: Make,
+    make: MakeFit,
     photos: list[Pixels],
-    held: list[Pixels],
+    held_out: list[Pixels],
     steps: int,
     seed: int,
     trials: Mapping[float, float],
-    matte: bool,
+    diffuse: bool,
     each: Callable[[int, int], None] | None = None,
-) -> Choice:
-    """Fit in full from every start that the `trials` (PSNR in dB of each) leave open, and keep what shows the `held` photos best.
+) -> ChosenFit:
+    """Fit in full from each candidate of the `trials` (PSNR in dB by roughness); take the one with the best PSNR on `held_out`.
 
-    Things that are `matte` start from the roughest and have no metals. Without held photos the first start is taken.
+    A `diffuse` object starts from the highest roughness and has no metals. Without held-out photos the first candidate is taken.
     """
-    judged = any(map(len, held))
-    starts = rivals(trials) or [TRIALS[-1] if matte else TRIALS[1]]
-    starts = starts if judged else starts[:1]
+    starts = roughness_candidates(trials) or [TRIAL_ROUGHNESS[-1] if diffuse else TRIAL_ROUGHNESS[1]]
+    starts = starts if any(map(len, held_out)) else starts[:1]
     fits = [make(roughness) for roughness in starts]
-    results = [fit.run(photos, held, FitSchedule(steps, seed, diffuse=matte), each) for fit in fits]
-    best = max(range(len(fits)), key=lambda k: results[k].held_out or 0.0)
+    results = [fit.run(photos, held_out, FitSchedule(steps, seed, diffuse=diffuse), each) for fit in fits]
+    best = max(range(len(fits)), key=lambda k: results[k].held_out_psnr or 0.0)
     chosen, fitted, made = fits[best], results[best], len(fits)
-    why = ", ".join(f"{score:.2f} dB from {roughness:g}" for roughness, score in trials.items())
+    evidence = ", ".join(f"{score:.2f} dB from {roughness:g}" for roughness, score in trials.items())
     if len(fits) > 1:
-        why += "; fitted in full " + ", ".join(f"{f.held_out:.2f} dB from {r:g}" for f, r in zip(results, starts, strict=True))
-    evidence = None
-    bare = chosen.psnr(held, without_metal(fitted.values)) if fitted.metal.any() else None
-    if bare is not None and fitted.held_out is not None and bare > fitted.held_out - DOUBTED:
+        scores = [f"{f.held_out_psnr:.2f} dB from {r:g}" for f, r in zip(results, starts, strict=True)]
+        evidence += f"; full fits: {', '.join(scores)}"
+    metal_evidence = None
+    dielectric = chosen.psnr(held_out, without_metal(fitted.values)) if fitted.metal.any() else None
+    if dielectric is not None and fitted.held_out_psnr is not None and dielectric > fitted.held_out_psnr - METAL_MARGIN:
         again = make(starts[best])
-        other = again.run(photos, held, FitSchedule(steps, seed, metallic=False), each)
+        other = again.run(photos, held_out, FitSchedule(steps, seed, metallic=False), each)
         made += 1
-        evidence = f"held-out photos are shown to {fitted.held_out:.2f} dB with them, fitted without to {other.held_out or 0.0:.2f} dB"
-        if (other.held_out or 0.0) > fitted.held_out:
+        metal_evidence = f"held-out PSNR {fitted.held_out_psnr:.2f} dB with metals, {other.held_out_psnr or 0.0:.2f} dB fitted without"
+        if (other.held_out_psnr or 0.0) > fitted.held_out_psnr:
             chosen, fitted = again, other
-    return Choice(chosen, fitted, starts[best], made, why or ("the object is matt" if matte else "too few photos for trials"), evidence)
+    evidence = evidence or ("diffuse object" if diffuse else "too few photos for trials")
+    return ChosenFit(chosen, fitted, starts[best], made, evidence, metal_evidence)
 
 
 def trial_roughness(
-    make: Make, photos: list[Pixels], seed: int, each: Callable[[int, int], None] | None = None
+    make: MakeFit, photos: list[Pixels], seed: int, each: Callable[[int, int], None] | None = None
 ) -> dict[float, float]:
-    """PSNR in dB on photos set aside, for each roughness in `TRIALS` as the start of a short fit.
+    """Validation PSNR in dB of a short fit from each of `TRIAL_ROUGHNESS`.
 
-    Empty with fewer than `TRIAL_PHOTO` photos.
+    Empty with fewer than `TRIAL_HOLDOUT` photos.
     """
-    if len(photos) < TRIAL_PHOTO:
+    if len(photos) < TRIAL_HOLDOUT:
         return {}
-    few = [p.thinned(TRIAL_PIXELS) for p in photos]
-    judges, rest = few[::TRIAL_PHOTO], [p for i, p in enumerate(few) if i % TRIAL_PHOTO]
+    subset = [p.subsampled(TRIAL_PIXELS) for p in photos]
+    validation, training = subset[::TRIAL_HOLDOUT], [p for i, p in enumerate(subset) if i % TRIAL_HOLDOUT]
     found: dict[float, float] = {}
-    for turn, roughness in enumerate(TRIALS):
+    for turn, roughness in enumerate(TRIAL_ROUGHNESS):
         schedule = FitSchedule(TRIAL_STEPS, seed, metallic=False, emission=False, intensity=False, sparsity=False)
-        score = make(roughness).run(rest, judges, schedule).held_out
+        score = make(roughness).run(training, validation, schedule).held_out_psnr
         if score is not None:
             found[roughness] = score
         if each is not None:
-            each(turn + 1, len(TRIALS))
+            each(turn + 1, len(TRIAL_ROUGHNESS))
     return found
 
 
-def rivals(trials: Mapping[float, float]) -> list[float]:
-    """The roughnesses of `trials` (PSNR in dB of each) that a whole fit must tell apart, best first."""
+def roughness_candidates(trials: Mapping[float, float]) -> list[float]:
+    """The roughnesses of `trials` (PSNR in dB of each) within `CANDIDATE_MARGIN` of the best, best first."""
     order = sorted(trials, key=lambda roughness: -trials[roughness])
-    return [roughness for roughness in order if trials[roughness] > trials[order[0]] - RIVAL]
+    return [roughness for roughness in order if trials[roughness] > trials[order[0]] - CANDIDATE_MARGIN]
 
 
 def trial_cost(photos: list[Pixels], step: float) -> float:
-    """Seconds that `trial_roughness` would take, from those of one `step` of the fit itself: steps cost by the pixels they shade."""
-    if len(photos) < TRIAL_PHOTO:
+    """Seconds that `trial_roughness` takes, from those of one `step` of the full fit; cost is proportional to the pixels shaded."""
+    if len(photos) < TRIAL_HOLDOUT:
         return 0.0
     pixels = sum(len(p) for p in photos) / len(photos)
-    return len(TRIALS) * TRIAL_STEPS * step * min(1.0, TRIAL_PIXELS / max(1.0, pixels))
+    return len(TRIAL_ROUGHNESS) * TRIAL_STEPS * step * min(1.0, TRIAL_PIXELS / max(1.0, pixels))

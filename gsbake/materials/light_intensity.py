@@ -1,23 +1,22 @@
-"""How bright and how even the light is, and how rough the paint: a search of three numbers, every texel's best paint solved for each try.
+"""Search for light intensity, contrast and roughness by variable projection, with base colours solved for each candidate.
 
-Under one light that does not move, a brighter light and darker paint look nearly the same: only reflections tell them apart, whose strength
-is known (.04 of the light, METHOD §6). Gradient steps find light and paint together and hardly move along that valley; above all an even
-glow that they started from stays, because paint has taken up its share. Here the paint takes part as what it is given the light: for a
-light L every texel's best base colour b in
+Under one fixed environment, brighter light on darker albedo looks nearly the same; only specular reflection, whose strength is known (4 %
+at normal incidence), tells them apart. Gradient steps hardly move along that valley; above all a uniform component of the initial light
+stays, because base colours have compensated for it. Here, for an environment L, the best base colour b of each texel in
 
     shade = b · E(n) + L(d) · (.04 A + B)
 
-is a sum over its pixels, so that what the photos say of the light alone can be compared (variable projection; Golub & Pereyra, *The
-differentiation of pseudo-inverses and nonlinear least squares problems whose variables separate*, 1973). Tried are lights
+is a weighted least-squares solution over its pixels, so residuals depend on the light alone (variable projection; Golub & Pereyra, *The
+differentiation of pseudo-inverses and nonlinear least squares problems whose variables separate*, 1973). Candidates are environments
 
     L' = s · mean(L) · (L / mean(L))^γ / mean of the same
 
-of other brightness s and contrast γ, and every texel rougher by one shift of logit(roughness), as long as the photos are explained
-better, and at the end single colours of the light a little brighter or darker. Roughness takes part because a wrong one bends the light:
-reflections that paint taken for too smooth would show, and photos do not, ask for a dim and even light, and the way out leads over a hill.
-Base colours are found robustly by reweighting: a misplaced reflection must not decide. Errors are those of sRGB values, averaged over
-blocks of a twelfth of the object before they count: a sharp reflection a few pixels off, right in strength, would otherwise ask for a
-darker light, as noise in what explains always weakens what is found (attenuation; Fuller, *Measurement Error Models*, 1987).
+of intensity s and contrast γ, and one shift of logit(roughness) for all dielectric texels, by coordinate descent as long as residuals fall;
+at the end the intensity of single colour channels. Roughness takes part because a wrong one biases the light: reflections that a too
+smooth material would show, and photos do not, favour a dim, uniform environment, from which coordinate descent in the light alone does not
+return. Base colours are solved robustly by reweighting, so that misplaced reflections do not decide. Residuals are of sRGB values, averaged
+over blocks of a twelfth of the object: a sharp reflection that is misplaced by a few pixels would otherwise favour a darker light, by
+regression dilution (Fuller, *Measurement Error Models*, 1987).
 """
 
 from __future__ import annotations
@@ -30,153 +29,161 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsbake.imaging.srgb import encode
-from gsbake.materials.metallic import Evidence, by_eye
+from gsbake.materials.metallic import PhotoSamples, perceptual_weights
 
 Floats = NDArray[np.float64]
 
-#: Factors on brightness, exponents of contrast and shifts of logit(roughness) that are tried, until none helps.
-BRIGHTER, STRONGER, ROUGHER = 1.2, 1.15, 0.4
-#: Steps of brightness, contrast and roughness, in the order they are tried. Never smoother: a blurred light asks for that by itself.
-WAYS = ((-1, 0, 0), (1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (1, 0, 1), (0, 1, 1))
-#: Where else a search begins: a bright light on rough paint, as a valley of its own leads there.
-ELSEWHERE = (2, 0, 4)
-#: Factor on one colour of the light that is tried at the end.
-TINT = 1.1
-#: Furthest that the search goes: brightness, contrast and the shift of logit(roughness).
-FURTHEST = (3.0, 2.0, 3.0)
-#: A try must lower the error by this share; one of rougher paint by the second; where else it led by the third.
-CLEARLY, SURELY, FAR = 0.002, 0.01, 0.03
-#: Rounds of reweighting, and the error of an sRGB value from which pixels count less.
-ROUNDS, NEAR = 2, 0.02
+#: Search steps: factor on intensity, exponent of contrast, shift of logit(roughness).
+INTENSITY_FACTOR, CONTRAST_EXPONENT, ROUGHNESS_STEP = 1.2, 1.15, 0.4
+#: Directions of search in steps of intensity, contrast and roughness, in order. Never smoother: a blurred environment favours that.
+DIRECTIONS = ((-1, 0, 0), (1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (1, 0, 1), (0, 1, 1))
+#: Start of a second search, in steps: bright light on rough material is a separate local minimum.
+SECOND_START = (2, 0, 4)
+#: Factor on the intensity of single channels, tried at the end.
+TINT_FACTOR = 1.1
+#: Bounds of the search: factor of intensity, factor of the contrast exponent, shift of logit(roughness).
+LIMITS = (3.0, 2.0, 3.0)
+#: Relative decrease of the residual that a step must bring; a step with more roughness; the result of the second search.
+MIN_DECREASE, MIN_ROUGHER_DECREASE, MIN_SECOND_DECREASE = 0.002, 0.01, 0.03
+#: Rounds of reweighting, and the residual of an sRGB value (0..1) from which pixels weigh less.
+REWEIGHTING_ROUNDS, ROBUST_SCALE = 2, 0.02
 
 
 @dataclass(frozen=True)
-class Level:
-    """`brightness` s (3,) and `contrast` γ of the light that explains the photos best, with paint `rougher` by so much in logit(roughness);
-    `gain` is the share of the error that went."""
+class LightAdjustment:
+    """Result of `search_light`: factors `intensity` (3,) and exponent `contrast` on the environment, `roughness_shift` of logit(roughness)
+    of dielectrics, and `improvement`, the relative decrease of the residual."""
 
-    brightness: Floats
+    intensity: Floats
     contrast: float
-    rougher: float
-    gain: float
+    roughness_shift: float
+    improvement: float
 
     def __str__(self) -> str:
-        red, green, blue = self.brightness
-        rougher = f", paint rougher by {self.rougher:+.1f}" if self.rougher else ""
-        light = f"{red:.2f} {green:.2f} {blue:.2f} times as bright at contrast {self.contrast:.2f}"
-        return f"{light}{rougher} ({self.gain:.1%} less unexplained)"
+        red, green, blue = self.intensity
+        roughness = f", roughness logit {self.roughness_shift:+.1f}" if self.roughness_shift else ""
+        light = f"RGB factors {red:.2f} {green:.2f} {blue:.2f}, contrast {self.contrast:.2f}"
+        return f"{light}{roughness} (residual -{self.improvement:.1%})"
 
-    def roughened(self, roughness: NDArray[Any]) -> NDArray[np.float32]:
-        """`roughness` (n,) of paint, as much rougher."""
-        return roughened(roughness, self.rougher)
+    def shifted_roughness(self, roughness: NDArray[Any]) -> NDArray[np.float32]:
+        """`roughness` (n,) of dielectrics after the shift."""
+        return shift_roughness(roughness, self.roughness_shift)
 
 
-def roughened(roughness: NDArray[Any], rougher: float) -> NDArray[np.float32]:
-    """`roughness` (n,) with its logit shifted by `rougher`."""
+def shift_roughness(roughness: NDArray[Any], shift: float) -> NDArray[np.float32]:
+    """`roughness` (n,) with `shift` added to its logit."""
     odds = np.clip(roughness, 1e-4, 1 - 1e-4)
-    odds = odds / (1 - odds) * np.exp(rougher)
+    odds = odds / (1 - odds) * np.exp(shift)
     return np.asarray(odds / (1 + odds), np.float32)
 
 
-def graded(radiance: NDArray[Any], brightness: NDArray[Any], contrast: float, area: NDArray[Any]) -> NDArray[np.float32]:
-    """The light `radiance` (6, s, s, 3) with its mean over the sphere, texels weighted by their solid angles `area` (6, s, s), times
-    `brightness` (3,), and each direction's ratio to that mean raised to `contrast`."""
+def adjust_radiance(radiance: NDArray[Any], intensity: NDArray[Any], contrast: float, area: NDArray[Any]) -> NDArray[np.float32]:
+    """The environment `radiance` (6, s, s, 3) with its mean over the sphere (texels weighted by solid angles `area` (6, s, s)) times
+    `intensity` (3,), and each direction's ratio to that mean raised to `contrast`."""
 
     def mean(light: NDArray[Any]) -> NDArray[Any]:
         return np.asarray((light * area[..., None]).sum((0, 1, 2)) / area.sum())
 
-    level = mean(radiance)
-    shape = (np.maximum(radiance, 1e-6) / level) ** contrast
-    return np.asarray(brightness * level * shape / mean(shape), np.float32)
+    average = mean(radiance)
+    shape = (np.maximum(radiance, 1e-6) / average) ** contrast
+    return np.asarray(intensity * average * shape / mean(shape), np.float32)
 
 
-def find_level(
-    evidence: Callable[[Floats, float], Sequence[Evidence]], roughness: NDArray[np.float32], tint: bool = True, rough: bool = True
-) -> Level:
-    """The brightness of each colour and the contrast under which paint explains most, and how much rougher than `roughness` (n,) it is.
+def search_light(
+    samples: Callable[[Floats, float], Sequence[PhotoSamples]], roughness: NDArray[np.float32], tint: bool = True, rough: bool = True
+) -> LightAdjustment:
+    """The intensity of each colour channel, the contrast and the roughness shift with the lowest residual.
 
-    `evidence` gives the pixels of all photos under the light of a brightness (3,) and a contrast. Without `tint` colours stay as they are
-    to one another, without `rough` the paint stays as rough as it is; with it, a second search begins far off.
+    `samples` gives the pixels of all photos under the environment of an intensity (3,) and a contrast; `roughness` (n,) is that of the
+    texels. Without `tint` the ratio of the channels is fixed. Without `rough` the roughness is fixed; with it, a second search starts at
+    `SECOND_START`.
     """
-    seen: dict[_Place, Floats] = {}
-    lit: dict[tuple[float, ...], Sequence[Evidence]] = {}
+    residuals: dict[_Candidate, Floats] = {}
+    lit: dict[tuple[float, ...], Sequence[PhotoSamples]] = {}
 
-    def at(place: _Place) -> Floats:
-        if place not in seen:
-            light = (*place.brightness, STRONGER**place.stronger)
+    def residual(candidate: _Candidate) -> Floats:
+        if candidate not in residuals:
+            light = (*candidate.intensity, CONTRAST_EXPONENT**candidate.contrast_steps)
             if light not in lit:
-                lit[light] = evidence(place.brightness, light[-1])
-            seen[place] = _unexplained(lit[light], roughened(roughness, ROUGHER * place.rougher))
-        return seen[place]
+                lit[light] = samples(candidate.intensity, light[-1])
+            residuals[candidate] = _residual(lit[light], shift_roughness(roughness, ROUGHNESS_STEP * candidate.roughness_steps))
+        return residuals[candidate]
 
-    def down(here: _Place) -> _Place:
+    def descend(best: _Candidate) -> _Candidate:
         moved = True
         while moved:
             moved = False
-            for way in (way for way in WAYS if rough or not way[2]):
-                least = 1 - (SURELY if way[2] else CLEARLY)
-                there = here.beside(*way)
-                while there.near and at(there).sum() < least * at(here).sum():
-                    here, there, moved = there, there.beside(*way), True
-        return here
+            for direction in (direction for direction in DIRECTIONS if rough or not direction[2]):
+                bound = 1 - (MIN_ROUGHER_DECREASE if direction[2] else MIN_DECREASE)
+                tried = best.step(*direction)
+                while tried.within_limits and residual(tried).sum() < bound * residual(best).sum():
+                    best, tried, moved = tried, tried.step(*direction), True
+        return best
 
-    start = _Place(0, 0, 0)
-    here = down(start)
+    start = _Candidate(0, 0, 0)
+    best = descend(start)
     if rough:
-        there = down(start.beside(*ELSEWHERE))
-        here = there if at(there).sum() < (1 - FAR) * at(here).sum() else here
-    for sign in (-1, 1) if tint else ():
-        all_three = replace(here, tint=(sign, sign, sign))
-        better = at(all_three) < (1 - CLEARLY) * at(here)
-        there = replace(here, tint=tuple(sign * int(b) for b in better))
-        if 0 < better.sum() < 3 and at(there).sum() < at(here).sum():
-            here = there
-            break
-    gain = float(1 - at(here).sum() / max(float(at(start).sum()), 1e-12))
-    return Level(here.brightness, STRONGER**here.stronger, ROUGHER * here.rougher, gain)
+        second = descend(start.step(*SECOND_START))
+        best = second if residual(second).sum() < (1 - MIN_SECOND_DECREASE) * residual(best).sum() else best
+    if tint:
+        best = _tinted(best, residual)
+    improvement = float(1 - residual(best).sum() / max(float(residual(start).sum()), 1e-12))
+    return LightAdjustment(best.intensity, CONTRAST_EXPONENT**best.contrast_steps, ROUGHNESS_STEP * best.roughness_steps, improvement)
 
 
 @dataclass(frozen=True)
-class _Place:
-    """Where the search stands, in steps of brightness, contrast and roughness, and of each colour's tint."""
+class _Candidate:
+    """A candidate, in steps of intensity, contrast and roughness, and of each colour channel's tint."""
 
-    brighter: int
-    stronger: int
-    rougher: int
+    intensity_steps: int
+    contrast_steps: int
+    roughness_steps: int
     tint: tuple[int, ...] = (0, 0, 0)
 
     @property
-    def brightness(self) -> Floats:
-        return BRIGHTER**self.brighter * np.power(TINT, np.array(self.tint, np.float64))
+    def intensity(self) -> Floats:
+        return INTENSITY_FACTOR**self.intensity_steps * np.power(TINT_FACTOR, np.array(self.tint, np.float64))
 
     @property
-    def near(self) -> bool:
-        far = (BRIGHTER ** abs(self.brighter), STRONGER ** abs(self.stronger), ROUGHER * abs(self.rougher))
-        return all(value <= most for value, most in zip(far, FURTHEST, strict=True))
+    def within_limits(self) -> bool:
+        intensity, contrast = INTENSITY_FACTOR ** abs(self.intensity_steps), CONTRAST_EXPONENT ** abs(self.contrast_steps)
+        change = intensity, contrast, ROUGHNESS_STEP * abs(self.roughness_steps)
+        return all(value <= limit for value, limit in zip(change, LIMITS, strict=True))
 
-    def beside(self, brighter: int, stronger: int, rougher: int) -> _Place:
-        return _Place(self.brighter + brighter, self.stronger + stronger, self.rougher + rougher, self.tint)
+    def step(self, intensity: int, contrast: int, roughness: int) -> _Candidate:
+        return _Candidate(self.intensity_steps + intensity, self.contrast_steps + contrast, self.roughness_steps + roughness, self.tint)
 
 
-def _unexplained(photos: Sequence[Evidence], roughness: NDArray[np.float32]) -> Floats:
-    """Errors (3,) of the sRGB values that the best paint leaves, averaged over blocks of pixels."""
+def _tinted(best: _Candidate, residual: Callable[[_Candidate], Floats]) -> _Candidate:
+    """`best` with one or two channels a step dimmer or brighter, where that lowers the residual."""
+    for sign in (-1, 1):
+        all_channels = replace(best, tint=(sign, sign, sign))
+        lower = residual(all_channels) < (1 - MIN_DECREASE) * residual(best)
+        tried = replace(best, tint=tuple(sign * int(channel) for channel in lower))
+        if 0 < lower.sum() < 3 and residual(tried).sum() < residual(best).sum():
+            return tried
+    return best
+
+
+def _residual(photos: Sequence[PhotoSamples], roughness: NDArray[np.float32]) -> Floats:
+    """Block-averaged absolute residuals (3,) of sRGB values at the best base colours."""
     offset = np.concatenate([photo.shade(0.0, roughness, 0.0) for photo in photos])
     slope = np.concatenate([photo.shade(1.0, roughness, 0.0) for photo in photos]) - offset
-    colour, share = (np.concatenate([getattr(photo, name) for photo in photos]) for name in ("colour", "weight"))
-    weight = np.concatenate([by_eye(photo) for photo in photos])
+    colour, pixel_weight = (np.concatenate([getattr(photo, name) for photo in photos]) for name in ("colour", "weight"))
+    weight = np.concatenate([perceptual_weights(photo) for photo in photos])
     texel = np.unique(np.concatenate([photo.texel for photo in photos]), return_inverse=True)[1]
     first = np.cumsum([0] + [int(photo.block.max(initial=-1)) + 1 for photo in photos])
     block = np.concatenate([photo.block + start for photo, start in zip(photos, first, strict=False)])
-    shown, base = encode(colour), np.zeros((int(texel.max(initial=-1)) + 1, 3))
+    target, base = encode(colour), np.zeros((int(texel.max(initial=-1)) + 1, 3))
 
     def error() -> NDArray[Any]:
-        return np.asarray(encode(base[texel] * slope + offset) - shown)
+        return np.asarray(encode(base[texel] * slope + offset) - target)
 
-    for turn in range(ROUNDS + 1):
-        use = weight / np.maximum(np.abs(error()), NEAR) if turn else weight
+    for turn in range(REWEIGHTING_ROUNDS + 1):
+        robust = weight / np.maximum(np.abs(error()), ROBUST_SCALE) if turn else weight
         for k in range(3):
-            slopes = np.bincount(texel, use[:, k] * slope[:, k] ** 2)
-            mixed = np.bincount(texel, use[:, k] * slope[:, k] * (colour - offset)[:, k])
+            slopes = np.bincount(texel, robust[:, k] * slope[:, k] ** 2)
+            mixed = np.bincount(texel, robust[:, k] * slope[:, k] * (colour - offset)[:, k])
             base[:, k] = np.clip(mixed / np.maximum(slopes, 1e-12), 0, 1)
-    left = error() * share[:, None]
-    return np.array([np.abs(np.bincount(block, left[:, k])).sum() for k in range(3)]) / max(float(share.sum()), 1e-12)
+    weighted = error() * pixel_weight[:, None]
+    return np.array([np.abs(np.bincount(block, weighted[:, k])).sum() for k in range(3)]) / max(float(pixel_weight.sum()), 1e-12)

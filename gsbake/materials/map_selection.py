@@ -1,7 +1,6 @@
-"""Maps that an asset does not need: metal where there is none, roughness where one number shows the photos as well.
+"""Which material maps are needed: metallic and roughness are replaced by constants where validation views are reproduced as well.
 
-A matt thing's photos say next to nothing about either, so texel by texel the fit's values are mostly noise, and noise that another light
-makes visible. What the fit found is judged against the plainer material on photos that took no part in it.
+Photos of a diffuse object hardly determine either, so per-texel values are mostly noise, which another environment makes visible.
 """
 
 from __future__ import annotations
@@ -14,31 +13,31 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.float32]
 
-#: The plainer material may show the photos worse by this many dB.
-TOLERANCE = 0.05
-#: A thing without metal may have this share of texels that pass for it.
-CHANCE = 0.002
+#: A constant may lower PSNR by this many dB.
+MAX_PSNR_LOSS = 0.05
+#: Up to this share of texels may be detected as metal by chance.
+MAX_METAL_SHARE = 0.002
 
-#: PSNR in dB of photos when the texels have these values (n, 5); None without photos.
-Judge = Callable[[Floats], float | None]
-#: Decides on a rule of `[skip]`: its name, whether the evidence is enough, the evidence, and what is done if left out and if not.
+#: PSNR in dB of validation views with texel values (n, 5); None without views.
+Psnr = Callable[[Floats], float | None]
+#: Decides on a rule of `[skip]`: its name, whether the measurement allows to skip, the evidence, and the choices if skipped and if not.
 Decide = Callable[[str, bool, str, str, str], bool]
 
 
-def plainer(values: Floats, weight: NDArray[Any], metals: int, judge: Judge, decide: Decide) -> Floats:
-    """`values` (n, 5) (linear base colour, roughness, metallic) without the maps that are not needed.
+def drop_unneeded_maps(values: Floats, weight: NDArray[Any], metals: int, psnr: Psnr, decide: Decide) -> Floats:
+    """`values` (n, 5) (linear base colour, roughness, metallic) with constants in place of the maps that are not needed.
 
-    `weight` (n,) is what the photos say about each texel, `metals` how many texels were found to be metal.
+    `weight` (n,) is that of the pixels that show each texel, `metals` the number of texels detected as metal.
     """
-    without = without_metal(values)
-    as_good, evidence = _compared(judge(values), judge(without), "metallic 0")
-    evidence = f"{metals} texels were found to be metal; {evidence}"
-    if decide("metallic_map", metals <= CHANCE * len(values) and as_good, evidence, "metallic 0", "metallic mapped"):
-        values = without
-    alike = of_one_roughness(values, weight)
-    number = f"roughness {alike[0, 3]:.2f}" if len(alike) else "one roughness"
-    as_good, evidence = _compared(judge(values), judge(alike), number)
-    return alike if decide("roughness_map", as_good, evidence, number, "roughness mapped") else values
+    dielectric = without_metal(values)
+    as_good, evidence = _compare(psnr(values), psnr(dielectric), "metallic 0")
+    evidence = f"{metals} metallic texels; {evidence}"
+    if decide("metallic_map", metals <= MAX_METAL_SHARE * len(values) and as_good, evidence, "metallic 0", "metallic mapped"):
+        values = dielectric
+    constant = with_constant_roughness(values, weight)
+    name = f"roughness {constant[0, 3]:.2f}" if len(constant) else "constant roughness"
+    as_good, evidence = _compare(psnr(values), psnr(constant), name)
+    return constant if decide("roughness_map", as_good, evidence, name, "roughness mapped") else values
 
 
 def without_metal(values: Floats) -> Floats:
@@ -49,8 +48,8 @@ def without_metal(values: Floats) -> Floats:
     return out
 
 
-def of_one_roughness(values: Floats, weight: NDArray[Any]) -> Floats:
-    """`values` (n, 5) with the median roughness, by `weight` (n,), in all texels."""
+def with_constant_roughness(values: Floats, weight: NDArray[Any]) -> Floats:
+    """`values` (n, 5) with the median roughness, weighted by `weight` (n,), in all texels."""
     out = values.copy()
     order = np.argsort(values[:, 3], kind="stable")
     total = np.cumsum(np.asarray(weight, np.float64)[order])
@@ -59,9 +58,9 @@ def of_one_roughness(values: Floats, weight: NDArray[Any]) -> Floats:
     return out
 
 
-def _compared(mapped: float | None, plain: float | None, name: str) -> tuple[bool, str]:
-    """Whether the photos are shown as well by the plainer material called `name`, and the evidence."""
-    if mapped is None or plain is None:
-        return False, "there are no photos to tell"
-    evidence = f"photos are shown to {plain:.2f} dB with {name}, {mapped:.2f} dB with a map; {TOLERANCE:g} dB are allowed"
-    return plain > mapped - TOLERANCE, evidence
+def _compare(mapped: float | None, constant: float | None, name: str) -> tuple[bool, str]:
+    """Whether the constant called `name` reproduces the views as well as the map, and the evidence."""
+    if mapped is None or constant is None:
+        return False, "no photos to compare"
+    evidence = f"PSNR {constant:.2f} dB with {name}, {mapped:.2f} dB with a map; tolerance {MAX_PSNR_LOSS:g} dB"
+    return constant > mapped - MAX_PSNR_LOSS, evidence

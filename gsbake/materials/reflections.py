@@ -1,9 +1,9 @@
-"""What of the object itself a mirror would show in each pixel: the view is turned at the shading normal by the law of reflection.
+"""Ray-traced reflections of the object on itself: one reflected ray per pixel, traced once, as mesh and cameras do not change.
 
-One ray a pixel, traced once, as mesh and cameras stay. A smooth lobe then reflects the room where that ray is open and the texel it
-meets where it is not; how far a rough one goes by it is for the shading to say (`gsbake.shading.split_sum.traced_openness`).
+A smooth lobe reflects the environment where the ray is unoccluded, else the texel that it hits. How far a rough lobe follows that ray is
+decided in shading (`gsbake.shading.split_sum.traced_specular_visibility`).
 
-Whitted, *An improved illumination model for shaded display*, CACM 1980 (the reflected ray).
+Whitted, *An improved illumination model for shaded display*, CACM 1980.
 """
 
 from __future__ import annotations
@@ -20,29 +20,31 @@ from gsbake.texturing.texels import Texels
 
 
 @dataclass(frozen=True)
-class Mirrors:
-    """A mesh whose faces the `texels` name, in the `caster`, with texture coordinates `uv` (v, 2), origin top left. Texels lie `at` (n, 3)
-    with shading normals `normal` (n, 3); rays start `above` the surface (mesh units)."""
+class ReflectionTracer:
+    """Traces reflected rays on the mesh in `caster`, whose faces the `texels` refer to, with `uv` (v, 2), origin top left.
+
+    `position` (n, 3) and shading `normal` (n, 3) of the texels; rays start `offset` above the surface (mesh units).
+    """
 
     caster: RayCaster
     uv: NDArray[Any]
     texels: Texels
-    at: NDArray[Any]
+    position: NDArray[Any]
     normal: NDArray[Any]
-    above: float
+    offset: float
 
-    def traced(self, pixels: Pixels) -> Pixels:
-        """The pixels with the texel that each mirrored view meets."""
-        place, shading = (np.einsum("nk,nkd->nd", pixels.share, x[pixels.texel]) for x in (self.at, self.normal))
+    def trace(self, pixels: Pixels) -> Pixels:
+        """The pixels with the texel that each reflected ray hits."""
+        position, shading = (np.einsum("nk,nkd->nd", pixels.bilinear, x[pixels.texel]) for x in (self.position, self.normal))
         shading /= np.maximum(np.linalg.norm(shading, axis=1, keepdims=True), 1e-20)
-        foremost = pixels.texel[np.arange(len(pixels)), pixels.share.argmax(1)]
-        corner = self.caster.vertices[self.caster.faces[self.texels.face[foremost]]]
-        facing = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
-        facing /= np.maximum(np.linalg.norm(facing, axis=1, keepdims=True), 1e-20)
-        ray = 2 * np.einsum("nk,nk->n", shading, pixels.towards)[:, None] * shading - pixels.towards
-        up = np.flatnonzero(np.einsum("nk,nk->n", facing, ray) > 0)  # below the mesh's own horizon it would start inside
-        hits = self.caster.first_hit(place[up] + self.above * facing[up], ray[up])
-        there = np.einsum("nk,nkd->nd", hits.bary[hits.hit], self.uv[self.caster.faces[hits.face[hits.hit]]])
-        met = np.full(len(pixels), -1, np.int64)
-        met[up[hits.hit]] = self.texels.holding(there)
-        return replace(pixels, met=met)
+        dominant = pixels.texel[np.arange(len(pixels)), pixels.bilinear.argmax(1)]
+        corner = self.caster.vertices[self.caster.faces[self.texels.face[dominant]]]
+        geometric = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+        geometric /= np.maximum(np.linalg.norm(geometric, axis=1, keepdims=True), 1e-20)
+        ray = 2 * np.einsum("nk,nk->n", shading, pixels.view)[:, None] * shading - pixels.view
+        above = np.flatnonzero(np.einsum("nk,nk->n", geometric, ray) > 0)  # below the geometric horizon it would start inside
+        hits = self.caster.first_hit(position[above] + self.offset * geometric[above], ray[above])
+        uv = np.einsum("nk,nkd->nd", hits.bary[hits.hit], self.uv[self.caster.faces[hits.face[hits.hit]]])
+        reflected = np.full(len(pixels), -1, np.int64)
+        reflected[above[hits.hit]] = self.texels.containing(uv)
+        return replace(pixels, reflected_texel=reflected)

@@ -1,11 +1,11 @@
-"""What the object is made of: few materials, used again and again.
+"""Reflectance sparsity prior: an object is made of few materials.
 
-Where photos leave open how bright or how rough a texel is, it most likely is what many others are. The density of all texels' materials
-says which are common, and the way up that density is towards the mean of the materials near by, each weighed by a Gaussian of its distance:
-a mean shift. So texels are drawn to that mean. Where materials lie close together (one plastic, made uneven by reflections left over) they
-become one; where they spread evenly (the skin of a fruit) the mean of those near by is what is there already, and nothing moves.
+Where photos leave a texel's material open, it is most likely one that many other texels have. One step of mean shift in the space of base
+colour and roughness, with a Gaussian kernel, moves each material uphill in the density of all texels' materials; the fit draws texels to
+the result. Materials close together (one plastic with residual reflections) merge; where their density is uniform (the skin of a fruit)
+the local mean is the material itself, and nothing moves.
 
-Barron & Malik, *Shape, illumination, and reflectance from shading*, PAMI 2015 (parsimony: few reflectances, a low entropy of them all);
+Barron & Malik, *Shape, illumination, and reflectance from shading*, PAMI 2015 (low entropy of reflectances);
 Comaniciu & Meer, *Mean shift: a robust approach toward feature space analysis*, PAMI 2002; sums are kept on a coarse grid as by Chen, Paris
 & Durand, *Real-time edge-aware image processing with the bilateral grid*, SIGGRAPH 2007.
 """
@@ -23,49 +23,50 @@ from gsbake.imaging.srgb import encode
 
 Floats = NDArray[np.float32]
 
-#: Standard deviations within which materials are near: three of base colour (sRGB) and one of roughness.
-NEAR = (0.03, 0.03, 0.03, 0.1)
-#: What is at least as metallic as this is near to metals alone, the rest to paint alone.
-METAL = 0.5
+#: Standard deviations of the kernel: three of base colour (sRGB 0..1) and one of roughness.
+KERNEL_WIDTHS = (0.03, 0.03, 0.03, 0.1)
+#: Texels from this metallic on count as metal; metals and dielectrics have separate densities.
+METAL_THRESHOLD = 0.5
 
 
-def common(values: NDArray[Any], counted: NDArray[np.bool_]) -> Floats:
-    """The material common around that of each texel, (n, 4): base colour in sRGB and roughness.
+def common_materials(values: NDArray[Any], included: NDArray[np.bool_]) -> Floats:
+    """The local mean material of each texel, (n, 4): base colour in sRGB and roughness.
 
-    `values` (n, 5) are linear base colour, roughness and metallic. Texels that are not `counted` (n,) count for nothing and get their own.
+    `values` (n, 5) are linear base colour, roughness and metallic. Texels that are not `included` (n,) do not enter the density and keep
+    their own material.
     """
-    own = np.column_stack([encode(np.clip(values[:, :3], 0, 1)), values[:, 3]])
-    metal = values[:, 4] >= METAL
-    for kind in (counted & metal, counted & ~metal):
-        own[kind] = shifted(own[kind], NEAR)
-    return np.asarray(own, np.float32)
+    materials = np.column_stack([encode(np.clip(values[:, :3], 0, 1)), values[:, 3]])
+    metal = values[:, 4] >= METAL_THRESHOLD
+    for kind in (included & metal, included & ~metal):
+        materials[kind] = mean_shift(materials[kind], KERNEL_WIDTHS)
+    return np.asarray(materials, np.float32)
 
 
-def shifted(values: NDArray[Any], widths: tuple[float, ...]) -> Floats:
-    """For each of `values` (n, k) the mean (n, k) of all of them, weighed by a Gaussian of their distance.
+def mean_shift(values: NDArray[Any], widths: tuple[float, ...]) -> Floats:
+    """For each of `values` (n, k) the mean (n, k) of all, weighted by a Gaussian of their distance.
 
-    Its standard deviations are `widths` (k,), and a sixth more: sums are taken on a grid of one deviation that is written and read
-    linearly.
+    Its standard deviations are `widths` (k,), and a sixth more: sums are taken on a grid with cells of one deviation, by linear splatting
+    and slicing.
     """
     if not len(values):
         return np.zeros(values.shape, np.float32)
     values = np.asarray(values, np.float64)
-    place = (values - values.min(0)) / np.asarray(widths)
-    low = np.floor(place).astype(np.int64)
-    part = place - low
+    position = (values - values.min(0)) / np.asarray(widths)
+    low = np.floor(position).astype(np.int64)
+    fraction = position - low
     shape = tuple(low.max(0) + 2)
     columns = np.column_stack([values, np.ones(len(values))]).T
     sums = np.zeros((len(columns), int(np.prod(shape))))
     corners = []
     for corner in product((0, 1), repeat=values.shape[1]):
         cell = np.ravel_multi_index(tuple((low + corner).T), shape)
-        share = np.where(np.asarray(corner, bool), part, 1 - part).prod(1)
-        corners.append((cell, share))
+        weight = np.where(np.asarray(corner, bool), fraction, 1 - fraction).prod(1)
+        corners.append((cell, weight))
         for total, column in zip(sums, columns, strict=True):
-            total += np.bincount(cell, share * column, len(total))
-    near = np.zeros(columns.shape)
-    for total, read in zip(sums, near, strict=True):
+            total += np.bincount(cell, weight * column, len(total))
+    sliced = np.zeros(columns.shape)
+    for total, out in zip(sums, sliced, strict=True):
         smooth = ndimage.gaussian_filter(total.reshape(shape), 1.0, mode="constant").ravel()
-        for cell, share in corners:
-            read += share * smooth[cell]
-    return np.asarray((near[:-1] / near[-1]).T, np.float32)
+        for cell, weight in corners:
+            out += weight * smooth[cell]
+    return np.asarray((sliced[:-1] / sliced[-1]).T, np.float32)

@@ -1,13 +1,14 @@
-"""What of the light the object keeps from itself, texel by texel, for any light: traced once, then linear in the light.
+"""Visibility and indirect light per texel, traced once for all environments: both are linear in the light.
 
-Every texel looks along the directions of one of `TURNS` turned copies of a Fibonacci sphere, spread over neighbouring texels in a fixed
-pattern (interleaved sampling): one small filter afterwards sees all copies. Rays that meet the object are kept with their weight and the
-texel they meet. A light is summed over the cells around the directions, so that even a small lamp counts fully in every texel; then
+Every texel samples the directions of one of `ROTATIONS` rotated copies of a Fibonacci sphere, assigned to neighbouring texels in a fixed
+pattern (interleaved sampling), so that a small filter afterwards averages over all copies. Blocked rays are stored with their weight and
+the texel they hit. An environment is summed over the cells around the directions, so that small light sources have their full power in
+every texel; then
 
-    kept(t) = Σ_blocked cos · Ω/π · L(cell),    openness = 1 − luminance(kept) / luminance(all),
-    bounced(t) = Σ_blocked cos · Ω/π · reflectance(hit) · E(hit),
+    blocked(t) = Σ_blocked cos · Ω/π · L(cell),    visible share = 1 − luminance(blocked) / luminance(all),
+    indirect(t) = Σ_blocked cos · Ω/π · reflectance(hit) · E(hit),
 
-all as irradiance / π, two sparse products per light.
+all as irradiance / π, two sparse products per environment.
 
 Sloan, Kautz & Snyder, *Precomputed radiance transfer*, SIGGRAPH 2002 (transfer linear in the light, interreflection included); Keller &
 Heidrich, *Interleaved sampling*, EGWR 2001; Swinbank & Purser, *Fibonacci grids*, 2006.
@@ -29,57 +30,58 @@ from scipy.spatial.transform import Rotation
 from gsbake.geometry.raycast import RayCaster
 from gsbake.geometry.vectors import unit
 from gsbake.shading import cubemap
-from gsbake.texturing.ambient_occlusion import smoothed
+from gsbake.texturing.ambient_occlusion import smooth_over_surface
 from gsbake.texturing.texels import Texels
 
 Floats = NDArray[np.float32]
 
-#: Copies of the directions along one edge of the pattern; the filter of `smoothed` is at least as wide.
-PATTERN = 4
-TURNS = PATTERN * PATTERN
+#: Edge of the interleaving pattern in texels; the filter of `smooth_over_surface` is at least as wide.
+PATTERN_SIZE = 4
+#: Rotated copies of the directions.
+ROTATIONS = PATTERN_SIZE * PATTERN_SIZE
 #: Luminance of linear sRGB (ITU-R BT.709).
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)
-#: Light that went from surface to surface this many times is followed.
+#: Diffuse bounces of indirect light.
 BOUNCES = 2
 
 
 @lru_cache(maxsize=4)
 def directions(count: int) -> Floats:
-    """Unit directions (TURNS, count, 3), each copy even over the whole sphere."""
+    """Unit directions (ROTATIONS, count, 3), each copy uniform over the sphere."""
     k = np.arange(count)
     z = 1 - (2 * k + 1) / count
-    turn = np.pi * (3 - np.sqrt(5)) * k
-    flat = np.sqrt(1 - z * z)
-    sphere = np.stack([flat * np.cos(turn), flat * np.sin(turn), z], 1)
-    return np.stack([r.apply(sphere) for r in Rotation.random(TURNS, random_state=np.random.default_rng(0))]).astype(np.float32)
+    azimuth = np.pi * (3 - np.sqrt(5)) * k
+    radius = np.sqrt(1 - z * z)
+    sphere = np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth), z], 1)
+    return np.stack([r.apply(sphere) for r in Rotation.random(ROTATIONS, random_state=np.random.default_rng(0))]).astype(np.float32)
 
 
 @lru_cache(maxsize=4)
 def _cells(count: int, size: int) -> scipy.sparse.csr_matrix:
-    """The matrix (TURNS·count, 6·size²) that sums a cube map's radiance over each direction's cell, in units of an even cell (4π/count)."""
+    """The matrix (ROTATIONS·count, 6·size²) that integrates a cube map over each direction's cell, in units of the mean cell 4π/count."""
     centre, angle = cubemap.directions(size).reshape(-1, 3), cubemap.solid_angles(size).ravel()
     column = np.arange(len(centre))
-    rows = np.concatenate([turn * count + cKDTree(copy).query(centre)[1] for turn, copy in enumerate(directions(count))])
-    share = np.tile(angle * (count / (4 * np.pi)), TURNS)
-    return scipy.sparse.csr_matrix((share.astype(np.float32), (rows, np.tile(column, TURNS))), shape=(TURNS * count, len(centre)))
+    rows = np.concatenate([rotation * count + cKDTree(copy).query(centre)[1] for rotation, copy in enumerate(directions(count))])
+    weight = np.tile(angle * (count / (4 * np.pi)), ROTATIONS)
+    return scipy.sparse.csr_matrix((weight.astype(np.float32), (rows, np.tile(column, ROTATIONS))), shape=(ROTATIONS * count, len(centre)))
 
 
 @dataclass(frozen=True)
 class Visibility:
     """Blocked rays of the n texels.
 
-    `kept` (n, TURNS·count) holds cos · Ω/π of blocked rays at their direction, `met` (n, n) the same at the texel they meet; `turn` (n,)
-    is each texel's copy of the `count` directions, `normal` (n, 3), `position` (n, 3) and `reach` (mesh units) steer the filter.
+    `blocked` (n, ROTATIONS·count) holds cos · Ω/π of blocked rays by direction, `hits` (n, n) the same by the texel they hit; `rotation`
+    (n,) is each texel's copy of the `count` directions; `normal` (n, 3), `position` (n, 3) and `radius` (mesh units) control the filter.
     """
 
     texels: Texels
     position: Floats
     normal: Floats
-    reach: float
+    radius: float
     count: int
-    turn: NDArray[np.int64]
-    kept: scipy.sparse.csr_matrix
-    met: scipy.sparse.csr_matrix
+    rotation: NDArray[np.int64]
+    blocked: scipy.sparse.csr_matrix
+    hits: scipy.sparse.csr_matrix
 
     @classmethod
     def trace(
@@ -90,65 +92,68 @@ class Visibility:
         normal: NDArray[Any],
         count: int,
         offset: float,
-        reach: float,
+        radius: float,
         each: Callable[[int, int], None] | None = None,
     ) -> Visibility:
         """Trace `count` directions of the sphere from every texel.
 
-        `caster` holds the mesh whose faces the texels name, `uv` (v, 2) its texture coordinates, origin top left; `normal` (n, 3) shading
-        normals. Rays start `offset` above the surface; the filter averages texels within `reach` (both mesh units). `each(done, total)` is
-        called after every round of one ray per texel.
+        `caster` holds the mesh whose faces the texels refer to, `uv` (v, 2) its texture coordinates, origin top left; `normal` (n, 3)
+        shading normals. Rays start `offset` above the surface; the filter averages texels within `radius` (both mesh units).
+        `each(done, total)` is called after every round of one ray per texel.
         """
         corner = caster.vertices[caster.faces[texels.face]]
-        facing = unit(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])).astype(np.float32)
+        geometric = unit(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])).astype(np.float32)
         normal = unit(normal).astype(np.float32)
         position = texels.interpolate(caster.vertices, caster.faces)
-        origin = position + offset * facing
+        origin = position + offset * geometric
         column, row = texels.index % texels.size, texels.index // texels.size
-        turn = (row % PATTERN) * PATTERN + column % PATTERN
-        found: list[tuple[NDArray[Any], ...]] = []
+        rotation = (row % PATTERN_SIZE) * PATTERN_SIZE + column % PATTERN_SIZE
+        rounds: list[tuple[NDArray[Any], ...]] = []
         copies = directions(count)
         for k in range(count):
-            ray = copies[turn, k]
+            ray = copies[rotation, k]
             cosine = np.einsum("nk,nk->n", normal, ray)
-            # A ray above the shading normal's horizon but below the mesh's own would start inside.
-            up = np.flatnonzero((cosine > 0) & (np.einsum("nk,nk->n", facing, ray) > 0))
-            hits = caster.first_hit(origin[up], ray[up])
+            # A ray above the shading normal's horizon but below the geometric one would start inside.
+            above = np.flatnonzero((cosine > 0) & (np.einsum("nk,nk->n", geometric, ray) > 0))
+            hits = caster.first_hit(origin[above], ray[above])
             hit = np.flatnonzero(hits.hit)
-            texel = up[hit]
-            met = texels.holding(np.einsum("nk,nkd->nd", hits.bary[hit], uv[caster.faces[hits.face[hit]]]))
-            found.append((texel, turn[texel] * count + k, met, cosine[texel] * (4 / count)))
+            texel = above[hit]
+            target = texels.containing(np.einsum("nk,nkd->nd", hits.bary[hit], uv[caster.faces[hits.face[hit]]]))
+            rounds.append((texel, rotation[texel] * count + k, target, cosine[texel] * (4 / count)))
             if each is not None:
                 each(k + 1, count)
-        texel, direction, met, weight = (np.concatenate(parts) for parts in zip(*found, strict=True))
-        n, known = len(texels), met >= 0
-        kept = scipy.sparse.csr_matrix((weight, (texel, direction)), shape=(n, TURNS * count))
-        mets = scipy.sparse.csr_matrix((weight[known], (texel[known], met[known])), shape=(n, n))
-        return cls(texels, position, normal, reach, count, turn, kept, mets)
+        texel, direction, target, weight = (np.concatenate(parts) for parts in zip(*rounds, strict=True))
+        n, known = len(texels), target >= 0
+        blocked = scipy.sparse.csr_matrix((weight, (texel, direction)), shape=(n, ROTATIONS * count))
+        hit_texels = scipy.sparse.csr_matrix((weight[known], (texel[known], target[known])), shape=(n, n))
+        return cls(texels, position, normal, radius, count, rotation, blocked, hit_texels)
 
-    def openness(self, radiance: NDArray[Any]) -> Floats:
-        """Share (n,) in 0..1 of the irradiance, by luminance, that the object lets through, under the cube map `radiance` (6, N, N, 3)."""
-        cells = self._binned(radiance) @ LUMINANCE
-        return self._filtered(np.clip(1 - (self.kept @ cells) / np.maximum(self._whole(cells), 1e-9), 0, 1))
+    def visible_share(self, radiance: NDArray[Any]) -> Floats:
+        """Unoccluded share (n,) of the irradiance by luminance, 0..1, under the cube map `radiance` (6, N, N, 3)."""
+        cells = self._cell_radiance(radiance) @ LUMINANCE
+        return self._filter(np.clip(1 - (self.blocked @ cells) / np.maximum(self._unoccluded_irradiance(cells), 1e-9), 0, 1))
 
-    def bounced(self, irradiance: NDArray[Any], reflectance: NDArray[Any]) -> Floats:
-        """Irradiance / π (n, 3) that texels get from each other when the light itself gives `irradiance` / π (n, 3), shadows included."""
+    def indirect_irradiance(self, irradiance: NDArray[Any], reflectance: NDArray[Any]) -> Floats:
+        """Indirect irradiance / π (n, 3) of texels with diffuse `reflectance` (n, 3) under direct `irradiance` / π (n, 3), after
+        occlusion."""
         reflectance = np.asarray(reflectance, np.float32)
-        gained = np.zeros_like(reflectance)
+        indirect = np.zeros_like(reflectance)
         for _ in range(BOUNCES):
-            gained = self.met @ (reflectance * (irradiance + gained))
-        return np.stack([self._filtered(gained[:, c]) for c in range(3)], 1)
+            indirect = self.hits @ (reflectance * (irradiance + indirect))
+        return np.stack([self._filter(indirect[:, c]) for c in range(3)], 1)
 
-    def _binned(self, radiance: NDArray[Any]) -> Floats:
+    def _cell_radiance(self, radiance: NDArray[Any]) -> Floats:
+        """Radiance (ROTATIONS·count, 3) of each direction's cell."""
         return np.asarray(_cells(self.count, radiance.shape[1]) @ np.asarray(radiance, np.float32).reshape(-1, 3))
 
-    def _whole(self, cells: Floats) -> Floats:
-        """Irradiance / π (n,) of texels in the open under the light of `cells` (TURNS·count,), by the same sum as what is kept."""
+    def _unoccluded_irradiance(self, cells: Floats) -> Floats:
+        """Irradiance / π (n,) of unoccluded texels under `cells` (ROTATIONS·count,), by the same quadrature as the blocked part."""
         out = np.zeros(len(self.normal), np.float32)
-        for turn, copy in enumerate(directions(self.count)):
-            mine = self.turn == turn
-            out[mine] = np.maximum(self.normal[mine] @ copy.T, 0) @ cells[turn * self.count : (turn + 1) * self.count]
+        for rotation, copy in enumerate(directions(self.count)):
+            mine = self.rotation == rotation
+            out[mine] = np.maximum(self.normal[mine] @ copy.T, 0) @ cells[rotation * self.count : (rotation + 1) * self.count]
         return out * np.float32(4 / self.count)
 
-    def _filtered(self, value: Floats) -> Floats:
-        return smoothed(self.texels, value, self.position, self.normal, self.reach)
+    def _filter(self, value: Floats) -> Floats:
+        """`value` (n,) averaged over neighbouring texels of the surface."""
+        return smooth_over_surface(self.texels, value, self.position, self.normal, self.radius)

@@ -1,11 +1,11 @@
-"""The kernel of depth-map fusion: one view into the samples of many blocks.
+"""Numba kernel of TSDF fusion: integrates one depth view into the samples of many blocks.
 
 Curless & Levoy, *A volumetric method for building complex models from range images*, SIGGRAPH 1996, with three changes:
 distances are measured to the tangent plane where the view's normals are known (Bylow et al. 2013), the weight falls off behind the
-surface so that both sides of thin things survive, and pixels outside the object's mask vote for emptiness (the visual hull).
+surface so that thin parts keep both sides, and pixels outside the mask count as free space (the visual hull).
 
-Numba, single precision, without the interpreter lock, so that a thread pool can share the blocks; each sample is written by one thread
-and hears the views in order, so the result does not depend on the threads.
+Single precision, without the interpreter lock. Each sample is written by one thread and takes the views in order, so the result does not
+depend on the number of threads.
 """
 
 from __future__ import annotations
@@ -17,34 +17,33 @@ import numpy as np
 
 from gsbake.meshing.sparse_lattice import EDGE
 
-#: Bits of `seen`: a depth saw the sample (in front of or near a surface); a mask excluded it.
-BY_DEPTH, BY_MASK = 1, 2
+#: Bits of `observed`: the sample lies in front of or near a measured depth; the sample projects outside a mask.
+OBSERVED_BY_DEPTH, OBSERVED_BY_MASK = 1, 2
 
-
-#: What a view says about a block.
-LOOK, NOTHING, BEHIND = 0, 1, 2
-#: Edge of the tiles in which a view's reach is summed up, in pixels.
+#: Relation of a block to a view: inside its depth range, outside the image or without depth, behind all depths.
+BLOCK_VISIBLE, BLOCK_UNOBSERVED, BLOCK_OCCLUDED = 0, 1, 2
+#: Edge of the tiles that store a view's maximum depth, in pixels.
 TILE = 8
 
 
 @nb.njit(cache=True, nogil=True)
-def reach_tiles(inverse_depth: Any, outside: Any, truncation: Any) -> Any:
-    """Per tile of 8 x 8 pixels the z-depth behind which the view has nothing to say: -1 = nothing at all, inf = a mask speaks."""
+def max_depth_tiles(inverse_depth: Any, mask_distance: Any, truncation: Any) -> Any:
+    """Maximum z-depth that each tile of 8 x 8 pixels affects: -1 = no depth, inf = the tile has pixels outside the mask."""
     height, width = inverse_depth.shape
     out = np.full((-(-height // TILE), -(-width // TILE)), np.float32(-1))
     for v in range(height):
         for u in range(width):
-            if outside[v, u] > 0:
+            if mask_distance[v, u] > 0:
                 out[v // TILE, u // TILE] = np.inf
             elif inverse_depth[v, u] > 0:
-                # One truncation behind the surface, one for interpolation between pixels.
-                far = np.float32(1) / inverse_depth[v, u] + np.float32(2) * truncation
-                out[v // TILE, u // TILE] = max(out[v // TILE, u // TILE], far)
+                # One truncation distance behind the surface and one for interpolation between pixels.
+                farthest = np.float32(1) / inverse_depth[v, u] + np.float32(2) * truncation
+                out[v // TILE, u // TILE] = max(out[v // TILE, u // TILE], farthest)
     return out
 
 
 @nb.njit(cache=True, nogil=True, inline="always")
-def _glance(
+def _classify_block(
     x0: Any,
     y0: Any,
     z0: Any,
@@ -57,9 +56,9 @@ def _glance(
     cy: Any,
     width: int,
     height: int,
-    reach: Any,
+    max_depth: Any,
 ) -> Any:
-    """What a view says about a block (first sample x0, y0, z0): LOOK at its samples, NOTHING, or it lies BEHIND all that is shown."""
+    """Relation of the block with first sample (x0, y0, z0) to a view: BLOCK_VISIBLE, BLOCK_UNOBSERVED or BLOCK_OCCLUDED."""
     half = np.float32((EDGE - 1) / 2) * cell
     x, y, z = x0 + half, y0 + half, z0 + half
     px = rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2] * z + translation[0]
@@ -67,22 +66,22 @@ def _glance(
     pz = rotation[2, 0] * x + rotation[2, 1] * y + rotation[2, 2] * z + translation[2]
     radius = np.float32(1.7320508) * half
     if pz + radius <= 0:
-        return NOTHING
+        return BLOCK_UNOBSERVED
     if pz <= np.float32(1.5) * radius:
-        return LOOK
+        return BLOCK_VISIBLE
     rx, ry = px / pz, py / pz
-    spread = radius / (pz - radius)
-    du, dv = fx * spread * np.sqrt(1 + rx * rx), fy * spread * np.sqrt(1 + ry * ry)
+    angular_radius = radius / (pz - radius)
+    du, dv = fx * angular_radius * np.sqrt(1 + rx * rx), fy * angular_radius * np.sqrt(1 + ry * ry)
     u, v = fx * rx + cx, fy * ry + cy
     if u + du < 0 or v + dv < 0 or u - du >= width or v - dv >= height:
-        return NOTHING
-    far = np.float32(-1)
-    for row in range(max(0, int(v - dv) // TILE), min(reach.shape[0] - 1, int(v + dv) // TILE) + 1):
-        for col in range(max(0, int(u - du) // TILE), min(reach.shape[1] - 1, int(u + du) // TILE) + 1):
-            far = max(far, reach[row, col])
-    if far < 0:
-        return NOTHING
-    return BEHIND if pz - radius > far else LOOK
+        return BLOCK_UNOBSERVED
+    farthest = np.float32(-1)
+    for row in range(max(0, int(v - dv) // TILE), min(max_depth.shape[0] - 1, int(v + dv) // TILE) + 1):
+        for col in range(max(0, int(u - du) // TILE), min(max_depth.shape[1] - 1, int(u + du) // TILE) + 1):
+            farthest = max(farthest, max_depth[row, col])
+    if farthest < 0:
+        return BLOCK_UNOBSERVED
+    return BLOCK_OCCLUDED if pz - radius > farthest else BLOCK_VISIBLE
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
@@ -99,22 +98,22 @@ def fuse_view(
     inverse_depth: Any,
     weight: Any,
     cosine: Any,
-    outside: Any,
-    reach: Any,
-    hull_weight: Any,
-    free_weight: Any,
+    mask_distance: Any,
+    max_depth: Any,
+    mask_weight: Any,
+    free_space_weight: Any,
     values: Any,
-    totals: Any,
-    seen: Any,
-    hidden: Any,
-    hidden_blocks: Any,
+    weights: Any,
+    observed: Any,
+    occluded: Any,
+    occluded_blocks: Any,
 ) -> None:
-    """Add one view to blocks start..stop of the running means `values` (n, 8, 8, 8) with weights `totals` and flags `seen`.
+    """Integrate one view into blocks start..stop: running means `values` (n, 8, 8, 8), their `weights` and the bits `observed`.
 
-    `hidden` and, for whole blocks, `hidden_blocks` (n,) count the views whose surface lies before the sample.
+    `occluded` and, for whole blocks, `occluded_blocks` (n,) count the views whose surface lies in front of the sample.
 
-    `inverse_depth` (h, w) holds 1/z, 0 = none; `cosine` (h, w) the cosine between normal and ray; `outside` (h, w) the distance
-    in pixels outside the object's mask (0 inside); `reach` is `reach_tiles` of the view; `intrinsics` is (fx, fy, cx, cy),
+    `inverse_depth` (h, w) holds 1/z, 0 = none; `cosine` (h, w) the cosine between normal and ray; `mask_distance` (h, w) the distance
+    in pixels outside the mask (0 inside); `max_depth` is `max_depth_tiles` of the view; `intrinsics` is (fx, fy, cx, cy),
     pixel centres at +.5.
     """
     height, width = inverse_depth.shape
@@ -125,10 +124,10 @@ def fuse_view(
         x0 = np.float32(lower[0] + cell * coords[n, 0] * EDGE)
         y0 = np.float32(lower[1] + cell * coords[n, 1] * EDGE)
         z0 = np.float32(lower[2] + cell * coords[n, 2] * EDGE)
-        glance = _glance(x0, y0, z0, cell, rotation, translation, fx, fy, cx, cy, width, height, reach)
-        if glance == BEHIND:
-            hidden_blocks[n] += 1
-        if glance != LOOK:
+        block_class = _classify_block(x0, y0, z0, cell, rotation, translation, fx, fy, cx, cy, width, height, max_depth)
+        if block_class == BLOCK_OCCLUDED:
+            occluded_blocks[n] += 1
+        if block_class != BLOCK_VISIBLE:
             continue
         for i in range(EDGE):
             px = x0 + np.float32(i) * cell
@@ -149,57 +148,57 @@ def fuse_view(
                     if u < 0 or v < 0 or u >= width or v >= height:
                         continue
                     iu, iv = int(u), int(v)
-                    slant = np.sqrt(one + rx * rx + ry * ry)
-                    gap = outside[iv, iu]
-                    if gap > 0:
-                        vote = min(one, gap * z / (fx * truncation))
-                        total = totals[n, i, j, k] + hull_weight
-                        values[n, i, j, k] += (vote - values[n, i, j, k]) * hull_weight / total
-                        totals[n, i, j, k] = total
-                        seen[n, i, j, k] |= BY_MASK
+                    ray_length = np.sqrt(one + rx * rx + ry * ry)
+                    pixels_outside = mask_distance[iv, iu]
+                    if pixels_outside > 0:
+                        bound = min(one, pixels_outside * z / (fx * truncation))
+                        total = weights[n, i, j, k] + mask_weight
+                        values[n, i, j, k] += (bound - values[n, i, j, k]) * mask_weight / total
+                        weights[n, i, j, k] = total
+                        observed[n, i, j, k] |= OBSERVED_BY_MASK
                         continue
-                    # Planes are linear in 1/z: interpolate that, unless the four pixels lie on both sides of a step.
+                    # Planes are linear in 1/z: interpolate that, unless the four pixels span a depth discontinuity.
                     s, t = u - half, v - half
                     iu0, iv0 = int(np.floor(s)), int(np.floor(t))
-                    inv = inverse_depth[iv, iu]
+                    inverse = inverse_depth[iv, iu]
                     if iu0 >= 0 and iv0 >= 0 and iu0 + 1 < width and iv0 + 1 < height:
                         a, b = inverse_depth[iv0, iu0], inverse_depth[iv0, iu0 + 1]
                         c, d = inverse_depth[iv0 + 1, iu0], inverse_depth[iv0 + 1, iu0 + 1]
                         low, high = min(min(a, b), min(c, d)), max(max(a, b), max(c, d))
                         if low > 0 and (high - low) < truncation * low * high:
                             fu, fv = s - iu0, t - iv0
-                            inv = (a * (one - fu) + b * fu) * (one - fv) + (c * (one - fu) + d * fu) * fv
-                    share = weight[iv, iu]
-                    if inv <= 0 or share <= 0:
+                            inverse = (a * (one - fu) + b * fu) * (one - fv) + (c * (one - fu) + d * fu) * fv
+                    sample_weight = weight[iv, iu]
+                    if inverse <= 0 or sample_weight <= 0:
                         continue
-                    # Behind the surface the length along the ray counts: a grazing ray leaves a convex body soon after it
-                    # entered, and what it says about the far side would swell the body.
-                    along = (one / inv - z) * slant / truncation
-                    if along < -one:
-                        hidden[n, i, j, k] += 1
+                    # Behind the surface the distance along the ray decides: a grazing ray soon leaves a convex body, and
+                    # a negative value on the far side would inflate the body.
+                    ray_distance = (one / inverse - z) * ray_length / truncation
+                    if ray_distance < -one:
+                        occluded[n, i, j, k] += 1
                         continue
-                    distance = along * cosine[iv, iu]
+                    distance = ray_distance * cosine[iv, iu]
                     if distance > one:
                         distance = one
-                        share *= free_weight
-                    elif along < -np.float32(0.25):
-                        share *= np.float32(4.0 / 3.0) * (one + along)
-                    total = totals[n, i, j, k] + share
+                        sample_weight *= free_space_weight
+                    elif ray_distance < -np.float32(0.25):
+                        sample_weight *= np.float32(4.0 / 3.0) * (one + ray_distance)
+                    total = weights[n, i, j, k] + sample_weight
                     if total > 0:
-                        values[n, i, j, k] += (distance - values[n, i, j, k]) * share / total
-                        totals[n, i, j, k] = total
-                        # Farther behind, "inside" is a guess along this ray (below a rim it is wrong): left to the filling.
-                        if along > -half:
-                            seen[n, i, j, k] |= BY_DEPTH
+                        values[n, i, j, k] += (distance - values[n, i, j, k]) * sample_weight / total
+                        weights[n, i, j, k] = total
+                        # Farther behind, "inside" is not observed (wrong below an overhang): left to hole filling.
+                        if ray_distance > -half:
+                            observed[n, i, j, k] |= OBSERVED_BY_DEPTH
 
 
 @nb.njit(cache=True, nogil=True)
-def mark_depth(
-    inverse_depth: Any, outside: Any, to_lattice: Any, origin: Any, intrinsics: Any, reach: float, wanted: Any
+def mark_blocks_near_depth(
+    inverse_depth: Any, mask_distance: Any, to_lattice: Any, origin: Any, intrinsics: Any, radius: float, marked: Any
 ) -> None:
-    """Mark in `wanted` (blocks) those within `reach` samples of the points that a depth map shows.
+    """Mark in `marked` (per block) the blocks within `radius` samples of the points of a depth map.
 
-    `to_lattice` (3, 3) turns camera directions into lattice samples, `origin` (3,) is the camera there.
+    `to_lattice` (3, 3) maps camera directions to lattice samples; `origin` (3,) is the camera centre in lattice samples.
     """
     height, width = inverse_depth.shape
     fx, fy, cx, cy = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]
@@ -207,16 +206,16 @@ def mark_depth(
     hi = np.zeros(3, np.int64)
     for v in range(height):
         for u in range(width):
-            if inverse_depth[v, u] <= 0 or outside[v, u] > 0:
+            if inverse_depth[v, u] <= 0 or mask_distance[v, u] > 0:
                 continue
             z = 1.0 / inverse_depth[v, u]
             x = (u + 0.5 - cx) / fx * z
             y = (v + 0.5 - cy) / fy * z
             for a in range(3):
                 p = to_lattice[a, 0] * x + to_lattice[a, 1] * y + to_lattice[a, 2] * z + origin[a]
-                lo[a] = max(0, int(np.floor((p - reach) / EDGE)))
-                hi[a] = min(wanted.shape[a] - 1, int(np.floor((p + reach) / EDGE)))
+                lo[a] = max(0, int(np.floor((p - radius) / EDGE)))
+                hi[a] = min(marked.shape[a] - 1, int(np.floor((p + radius) / EDGE)))
             for a in range(lo[0], hi[0] + 1):
                 for b in range(lo[1], hi[1] + 1):
                     for c in range(lo[2], hi[2] + 1):
-                        wanted[a, b, c] = True
+                        marked[a, b, c] = True

@@ -1,7 +1,6 @@
-"""How fine the field must be: from what the surfels and the photos can resolve, never from a guess.
+"""Resolution of the distance field, derived from surfel spacing and pixel footprint.
 
-A depth map of surfels shows nothing smaller than the surfels' spacing; a photo shows nothing smaller than its pixels' footprint on
-the object. A few samples per surfel spacing, no finer than most of a pixel, is all there is to gain.
+Rendered depth holds no detail below the surfel spacing; photos hold no detail below the pixel footprint on the object.
 """
 
 from __future__ import annotations
@@ -15,18 +14,18 @@ from scipy.spatial import cKDTree
 
 from gsbake.geometry.cameras import Camera
 
-#: Samples per surfel spacing. Surfels overlap, so what they render is smooth at their spacing: more samples only cost (measured: 64, 97
-#: and 140 cells on one trained model differ by less than 0.05 % of the object in distance).
-PER_SPACING = 1.5
-#: A sample is at least this share of a pixel's footprint: views overlap, so fusion resolves a little below the pixel.
-FOOTPRINT_SHARE = 0.75
-#: Fewer cells than this lose the object's shape, however coarse the evidence.
+#: Cells per surfel spacing. Surfels overlap, so their depth is smooth at that scale and more cells gain nothing (measured: 64, 97 and 140
+#: cells on one trained model differ by less than 0.05 % of the object in distance).
+SAMPLES_PER_SPACING = 1.5
+#: Minimum cell size in pixel footprints: views overlap, so fusion resolves slightly less than a pixel.
+CELL_PER_PIXEL = 0.75
+#: Minimum number of cells; fewer lose the object's shape.
 MIN_CELLS = 48
 
 
 @dataclass(frozen=True)
 class Resolution:
-    """The chosen `cell` (unit frame), `cells` along the longest side, and the sentence that says why."""
+    """Cell size `cell` (unit frame), number of `cells` along the longest side, and the `reason` for the log."""
 
     cell: float
     cells: int
@@ -34,9 +33,9 @@ class Resolution:
 
 
 def surfel_spacing(positions: NDArray[np.floating], limit: int = 20_000) -> float:
-    """Median spacing of neighbouring surfels, as if they lay on an even layer.
+    """Median spacing of neighbouring surfels on a surface.
 
-    n neighbours within radius r on a surface of spacing s (one per s²) means n s² = π r²; with n = 4 that is s = r √(π/4).
+    n neighbours within radius r at spacing s (one per s²) give n s² = π r²; n = 4 gives s = r √(π/4).
     """
     points = np.asarray(positions, np.float64)
     if len(points) < 6:
@@ -47,7 +46,7 @@ def surfel_spacing(positions: NDArray[np.floating], limit: int = 20_000) -> floa
 
 
 def pixel_footprint(cameras: Sequence[Camera], centre: NDArray[np.float64]) -> float:
-    """Median size of a pixel (world units) at `centre` (3,) over the cameras that look towards it."""
+    """Median size of a pixel (world units) at `centre` (3,) over the cameras that have it in front."""
     sizes = []
     for camera in cameras:
         depth = float(camera.R[2] @ centre + camera.t[2])
@@ -56,18 +55,18 @@ def pixel_footprint(cameras: Sequence[Camera], centre: NDArray[np.float64]) -> f
     return float(np.median(sizes)) if sizes else float("inf")
 
 
-def choose(extent: float, spacing: float, footprint: float, fixed: int, upper: int) -> Resolution:
-    """The cell for an object `extent` long: `fixed` cells when that is not 0, else derived, at most `upper` cells."""
+def choose_resolution(extent: float, spacing: float, footprint: float, fixed: int, maximum: int) -> Resolution:
+    """Cell size for an object of length `extent`: `fixed` cells unless 0, else derived, at most `maximum` cells."""
     if fixed:
-        return Resolution(extent / fixed, fixed, f"{fixed} cells asked for by the profile")
-    by_surfels, by_pixels = spacing / PER_SPACING, footprint * FOOTPRINT_SHARE
+        return Resolution(extent / fixed, fixed, f"{fixed} cells set by the profile")
+    by_surfels, by_pixels = spacing / SAMPLES_PER_SPACING, footprint * CELL_PER_PIXEL
     cell = max(by_surfels, by_pixels)
-    why = f"1/{PER_SPACING} of the surfel spacing" if by_surfels >= by_pixels else f"{FOOTPRINT_SHARE} of a pixel's footprint"
-    wanted = extent / cell
-    cells = int(np.clip(np.ceil(wanted), MIN_CELLS, upper))
-    if wanted > upper:
-        why += f", bounded to {upper} cells"
-    elif wanted < MIN_CELLS:
-        why += f", raised to {MIN_CELLS} cells"
-    reason = f"{why}: surfel spacing {spacing:.4g}, pixel footprint {footprint:.4g}, object {extent:.3g} long"
+    evidence = f"1/{SAMPLES_PER_SPACING} of the surfel spacing" if by_surfels >= by_pixels else f"{CELL_PER_PIXEL} of the pixel footprint"
+    derived = extent / cell
+    cells = int(np.clip(np.ceil(derived), MIN_CELLS, maximum))
+    if derived > maximum:
+        evidence += f", limited to {maximum} cells"
+    elif derived < MIN_CELLS:
+        evidence += f", raised to {MIN_CELLS} cells"
+    reason = f"{evidence}: surfel spacing {spacing:.4g}, pixel footprint {footprint:.4g}, object length {extent:.3g}"
     return Resolution(extent / cells, cells, reason)

@@ -1,11 +1,11 @@
-"""A sparse lattice: blocks of 8³ samples, allocated where something happens.
+"""Sparse lattice of blocks of 8³ samples.
 
-Sample (i, j, k) lies at `lower + cell * (i, j, k)`; block (a, b, c) holds the samples 8a … 8a+7 and so on. Values live with their
-owner as arrays of shape (n, 8, 8, 8), in the order in which the blocks were allocated; the lattice only knows which block is where.
-Memory grows with the number of blocks (so with the surface), besides one 4-byte index per possible block.
+Sample (i, j, k) lies at `lower + cell * (i, j, k)`; block (a, b, c) contains the samples 8a … 8a+7 along each axis. Values are separate
+arrays of shape (n, 8, 8, 8) in the order of allocation; the lattice only stores where each block lies.
+Memory grows with the number of blocks (with the surface), plus one 4-byte index per possible block.
 
-Nießner et al., *Real-time 3D reconstruction at scale using voxel hashing*, SIGGRAPH Asia 2013 (a table here instead of a hash:
-the object fills its box, so a table is smaller and free of collisions).
+Nießner et al., *Real-time 3D reconstruction at scale using voxel hashing*, SIGGRAPH Asia 2013 (here with a table instead of a
+hash: the object fills its box, so a table is smaller and has no collisions).
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ EDGE = 8
 
 
 class BlockLattice:
-    """Blocks between `lower` and `upper` (3,), samples `cell` apart; nothing is allocated at first.
+    """Blocks between `lower` and `upper` (3,) with sample spacing `cell`; initially none is allocated.
 
     `shape` is the number of possible blocks per axis, `coords` (n, 3) int32 the allocated ones, `index` the table from block to row
-    of `coords` (-1: none).
+    of `coords` (-1 = not allocated). Raises ValueError for an empty box.
     """
 
     def __init__(self, lower: ArrayLike, upper: ArrayLike, cell: float) -> None:
@@ -35,7 +35,7 @@ class BlockLattice:
         self.cell = float(cell)
         samples = np.ceil((np.asarray(upper, np.float64).reshape(3) - self.lower) / self.cell).astype(int) + 1
         if not (samples > 1).all():
-            raise ValueError("the upper corner must lie above the lower one on every axis")
+            raise ValueError("the upper corner must exceed the lower one on every axis")
         blocks = -(-samples // EDGE)
         self.shape: tuple[int, int, int] = (int(blocks[0]), int(blocks[1]), int(blocks[2]))
         self.index = np.full(self.shape, -1, np.int32)
@@ -46,12 +46,12 @@ class BlockLattice:
 
     @property
     def samples(self) -> tuple[int, int, int]:
-        """Number of samples per axis, all blocks counted."""
+        """Number of samples per axis over all possible blocks."""
         return self.shape[0] * EDGE, self.shape[1] * EDGE, self.shape[2] * EDGE
 
-    def allocate(self, wanted: NDArray[np.bool_]) -> None:
-        """Allocate every block marked in `wanted` (of `shape`) that is not allocated yet, in a fixed order."""
-        new = np.argwhere(wanted & (self.index < 0)).astype(np.int32)
+    def allocate(self, marked: NDArray[np.bool_]) -> None:
+        """Allocate every block marked in `marked` (of `shape`) that is not allocated yet, in a fixed order."""
+        new = np.argwhere(marked & (self.index < 0)).astype(np.int32)
         start = len(self.coords)
         self.index[tuple(new.T)] = np.arange(start, start + len(new), dtype=np.int32)
         self.coords = np.concatenate([self.coords, new])
@@ -60,45 +60,45 @@ class BlockLattice:
         """Allocate every block: a dense lattice."""
         self.allocate(np.ones(self.shape, np.bool_))
 
-    def mark_near(self, points: ArrayLike, reach: float, wanted: NDArray[np.bool_]) -> None:
-        """Mark in `wanted` (of `shape`) the blocks that hold samples within `reach` (per axis) of any of `points` (n, 3)."""
+    def mark_blocks_near(self, points: ArrayLike, radius: float, marked: NDArray[np.bool_]) -> None:
+        """Mark in `marked` (of `shape`) the blocks with samples within `radius` (per axis) of any of `points` (n, 3)."""
         scaled = np.ascontiguousarray((np.asarray(points, np.float64).reshape(-1, 3) - self.lower) / self.cell, np.float64)
-        _mark(scaled, reach / self.cell, wanted)
+        _mark_blocks(scaled, radius / self.cell, marked)
 
     def positions(self, blocks: slice) -> Floats:
-        """Sample positions (m, 8, 8, 8, 3) of a run of allocated blocks."""
+        """Sample positions (m, 8, 8, 8, 3) of a slice of the allocated blocks."""
         steps = np.arange(EDGE)
-        local = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), -1)
-        whole = self.coords[blocks, None, None, None].astype(np.int64) * EDGE + local
-        return (self.lower + self.cell * whole).astype(np.float32)
+        offsets = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), -1)
+        sample_index = self.coords[blocks, None, None, None].astype(np.int64) * EDGE + offsets
+        return (self.lower + self.cell * sample_index).astype(np.float32)
 
     def dense(self, values: Floats) -> Floats:
-        """The values (n, 8, 8, 8) laid out as one array of `samples`; not a number where no block is. For small lattices."""
+        """The values (n, 8, 8, 8) as one array of shape `samples`; NaN where no block is allocated. For small lattices."""
         start = np.zeros(3, np.int64)
         out = np.full(self.samples, np.nan, np.float32)
-        gather(self.index, values, start, out)
+        gather_samples(self.index, values, start, out)
         return out
 
 
 @nb.njit(cache=True)
-def _mark(scaled: Any, reach: float, wanted: Any) -> None:
-    """Blocks whose samples lie within `reach` of `scaled` (n, 3), all in units of cells."""
+def _mark_blocks(scaled: Any, radius: float, marked: Any) -> None:
+    """Mark blocks with samples within `radius` of `scaled` (n, 3); lengths in cells."""
     for p in range(scaled.shape[0]):
-        lo0 = max(0, int(np.floor((scaled[p, 0] - reach) / EDGE)))
-        lo1 = max(0, int(np.floor((scaled[p, 1] - reach) / EDGE)))
-        lo2 = max(0, int(np.floor((scaled[p, 2] - reach) / EDGE)))
-        hi0 = min(wanted.shape[0] - 1, int(np.floor((scaled[p, 0] + reach) / EDGE)))
-        hi1 = min(wanted.shape[1] - 1, int(np.floor((scaled[p, 1] + reach) / EDGE)))
-        hi2 = min(wanted.shape[2] - 1, int(np.floor((scaled[p, 2] + reach) / EDGE)))
+        lo0 = max(0, int(np.floor((scaled[p, 0] - radius) / EDGE)))
+        lo1 = max(0, int(np.floor((scaled[p, 1] - radius) / EDGE)))
+        lo2 = max(0, int(np.floor((scaled[p, 2] - radius) / EDGE)))
+        hi0 = min(marked.shape[0] - 1, int(np.floor((scaled[p, 0] + radius) / EDGE)))
+        hi1 = min(marked.shape[1] - 1, int(np.floor((scaled[p, 1] + radius) / EDGE)))
+        hi2 = min(marked.shape[2] - 1, int(np.floor((scaled[p, 2] + radius) / EDGE)))
         for a in range(lo0, hi0 + 1):
             for b in range(lo1, hi1 + 1):
                 for c in range(lo2, hi2 + 1):
-                    wanted[a, b, c] = True
+                    marked[a, b, c] = True
 
 
 @nb.njit(cache=True)
-def gather(index: Any, values: Any, start: Any, out: Any) -> None:
-    """Copy the samples from lattice position `start` (3,) on into the dense `out`; samples of missing blocks stay as they are."""
+def gather_samples(index: Any, values: Any, start: Any, out: Any) -> None:
+    """Copy the samples from lattice sample `start` (3,) on into the dense `out`; samples of missing blocks are not written."""
     for i in range(out.shape[0]):
         gi = start[0] + i
         if gi < 0 or gi >= index.shape[0] * EDGE:

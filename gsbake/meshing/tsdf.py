@@ -1,13 +1,12 @@
-"""Depth maps to a surface: a sparse truncated signed distance field, closed where nothing was seen.
+"""Sparse truncated signed distance field (TSDF) of depth maps, closed by hole filling.
 
-Two passes over the views, one view in memory at a time:
-`survey` looks where the surface is: it marks the blocks each depth map touches and fuses the view into a small dense lattice;
-`allocate` then fills what no view saw in that lattice (`gsbake.meshing.hole_filling`: a film of least area between what is known to be
-inside and what is known to be empty) and adds the blocks where the closing surface runs; `integrate` fuses the views into the fine
-blocks; `mesh` marches them.
+Two passes over the views, one view in memory at a time. `fuse_coarse` marks the blocks near each depth map and fuses the view into a small
+dense lattice. `allocate` fills the unobserved samples of that lattice (`gsbake.meshing.hole_filling`: the minimal surface between known
+inside and known free space) and allocates the marked blocks and those that the filled surface crosses. `integrate` fuses the views into
+these blocks; `mesh` extracts the surface.
 
-Every block exists before the first view is integrated, so each sample hears every view: what one view puts in mid-air the others
-carve away.
+All blocks are allocated before the first view is integrated, so each sample takes every view: free space in other views removes outliers
+of one view.
 """
 
 from __future__ import annotations
@@ -18,49 +17,49 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from gsbake.meshing.depth_views import DepthView, Floats
-from gsbake.meshing.fusion_kernel import BY_DEPTH, BY_MASK, fuse_view, mark_depth, reach_tiles
-from gsbake.meshing.hole_filling import crossing_blocks, diffuse, span
-from gsbake.meshing.marching_cubes import coarse_values, march
+from gsbake.meshing.fusion_kernel import OBSERVED_BY_DEPTH, OBSERVED_BY_MASK, fuse_view, mark_blocks_near_depth, max_depth_tiles
+from gsbake.meshing.hole_filling import minimise_area, sign_change_blocks, solve_laplace
+from gsbake.meshing.marching_cubes import extract_isosurface, upsample_coarse
 from gsbake.meshing.sparse_lattice import EDGE, BlockLattice
-from gsbake.meshing.support_plane import Support
+from gsbake.meshing.support_plane import SupportPlane
 from gsbake.surfels.raster.threads import run_chunks
 
-#: The dense survey lattice has at most this many samples per axis.
-SURVEY_SAMPLES = 128
-#: Weight of a mask's vote against a head-on depth's (1): a hull is sharper than a splat's depth.
-HULL_WEIGHT = 2.0
-#: Weight of "empty here, far before the surface" against "the surface is near": one stray ray must not erode a thin part.
-FREE_WEIGHT = 0.5
-#: Emptiness that is seen with less than this weight per view that finds the place hidden is doubted.
-DOUBT = 0.03
-#: Fine sweeps that smooth the seam between what was seen and what was filled.
+#: Maximum samples per axis of the dense coarse lattice.
+COARSE_SAMPLES = 128
+#: Weight of free space from a mask; a depth at normal incidence has 1. Masks are sharper than rendered depth.
+MASK_WEIGHT = 2.0
+#: Relative weight of free space far in front of a surface, so that single outlier rays do not erode thin parts.
+FREE_SPACE_WEIGHT = 0.5
+#: Minimum weight of observed free space per view in which the sample is occluded.
+MIN_FREE_SPACE_RATIO = 0.03
+#: Sweeps and rounds on the fine lattice that smooth the seam between observed and filled samples.
 SEAM_SWEEPS, SEAM_ROUNDS = 12, 3
-#: Steepness that turns the survey's known distances into sides before filling.
-SIDE = 4.0
-#: Rounds of reweighting on the survey lattice; the area hardly changes after these.
-ROUNDS = 10
+#: Factor before clamping that turns the coarse distances into signs for hole filling.
+SIGN_SLOPE = 4.0
+#: Reweighting rounds on the coarse lattice; the area hardly changes after these.
+AREA_ROUNDS = 10
 
 
-class FusedBlocks:
-    """Running means of the distance (in units of `truncation`, negative inside) on a lattice's blocks."""
+class TsdfBlocks:
+    """Weighted means of the signed distance (in units of `truncation`, negative inside) on a lattice's blocks."""
 
     def __init__(self, lattice: BlockLattice, truncation: float) -> None:
         self.lattice = lattice
         self.truncation = truncation
         shape = (len(lattice), EDGE, EDGE, EDGE)
         self.values = np.zeros(shape, np.float32)
-        self.totals = np.zeros(shape, np.float32)
-        self.seen = np.zeros(shape, np.uint8)
-        self.hidden = np.zeros(shape, np.uint16)
-        self.hidden_blocks = np.zeros(len(lattice), np.int32)
+        self.weights = np.zeros(shape, np.float32)
+        self.observed = np.zeros(shape, np.uint8)
+        self.occluded = np.zeros(shape, np.uint16)
+        self.occluded_blocks = np.zeros(len(lattice), np.int32)
 
     @property
     def nbytes(self) -> int:
         """Memory of the samples in bytes."""
-        return self.values.nbytes + self.totals.nbytes + self.seen.nbytes + self.hidden.nbytes
+        return self.values.nbytes + self.weights.nbytes + self.observed.nbytes + self.occluded.nbytes
 
     def add(self, view: DepthView) -> None:
-        """Fuse one view."""
+        """Integrate one view."""
         camera = view.camera
         fixed: tuple[Any, ...] = (
             self.lattice.coords,
@@ -73,32 +72,33 @@ class FusedBlocks:
             view.inverse,
             view.weight,
             view.cosine,
-            view.outside,
-            reach_tiles(view.inverse, view.outside, np.float32(self.truncation)),
-            np.float32(HULL_WEIGHT),
-            np.float32(FREE_WEIGHT),
+            view.mask_distance,
+            max_depth_tiles(view.inverse, view.mask_distance, np.float32(self.truncation)),
+            np.float32(MASK_WEIGHT),
+            np.float32(FREE_SPACE_WEIGHT),
             self.values,
-            self.totals,
-            self.seen,
-            self.hidden,
-            self.hidden_blocks,
+            self.weights,
+            self.observed,
+            self.occluded,
+            self.occluded_blocks,
         )
         run_chunks(lambda start, stop: fuse_view(start, stop, *fixed), len(self.lattice))
 
-    def doubt(self) -> None:
-        """Forget "empty" where hardly any view says so and many say that it is hidden: rays that slipped through a gap.
+    def reject_weak_free_space(self) -> None:
+        """Mark free space as unobserved where few views observe it and many find it occluded: rays through gaps in the surface.
 
-        A mask's word stands. Without this, single rays hollow the inside out, where nothing speaks against them.
+        Free space from masks is kept. Without this step single rays carve the interior, which no other view observes.
         """
-        against = self.hidden + self.hidden_blocks[:, None, None, None]
-        self.seen[(self.values > 0) & (self.totals < DOUBT * against) & (self.seen & BY_MASK == 0)] = 0
+        occlusions = self.occluded + self.occluded_blocks[:, None, None, None]
+        self.observed[(self.values > 0) & (self.weights < MIN_FREE_SPACE_RATIO * occlusions) & (self.observed & OBSERVED_BY_MASK == 0)] = 0
 
 
 class SparseTsdf:
-    """A field over the box `lower`..`upper` (3,), samples `cell` apart, distances truncated at `truncation` (same units).
+    """TSDF over the box `lower`..`upper` (3,) with sample spacing `cell` and truncation distance `truncation` (same units).
 
-    `ball` is the radius around the origin that holds the object: with `solid` (masks tell the object apart, so everything outside
-    the ball is empty) the surface closes inside it; without, the surface is cut open there. Below the cut of a `support` all is empty.
+    `ball` is the radius around the origin that contains the object. With `empty_outside` (there are masks or a support plane) all outside
+    the ball is free space and the surface is closed inside it; without, the surface is cut open there. All below the cut of `support` is
+    free space.
     """
 
     def __init__(
@@ -108,133 +108,134 @@ class SparseTsdf:
         cell: float,
         truncation: float,
         ball: float | None = None,
-        solid: bool = True,
-        support: Support | None = None,
+        empty_outside: bool = True,
+        support: SupportPlane | None = None,
     ) -> None:
         self.lattice = BlockLattice(lower, upper, cell)
         self.truncation = float(truncation)
         self.ball = ball
-        self.solid = solid
+        self.empty_outside = empty_outside
         self.support = support
-        self.ratio = max(4, -(-max(self.lattice.samples) // SURVEY_SAMPLES))
+        self.ratio = max(4, -(-max(self.lattice.samples) // COARSE_SAMPLES))
         coarse_cell = self.ratio * cell
         extent = np.array(self.lattice.samples) * cell
         coarse = BlockLattice(self.lattice.lower, self.lattice.lower + extent, coarse_cell)
         coarse.allocate_all()
-        self.survey_field = FusedBlocks(coarse, max(self.truncation, 2 * coarse_cell))
-        self._wanted = np.zeros(self.lattice.shape, np.bool_)
-        self.near_share = 1.0  # of all blocks, those the surface may run through; known once allocated
+        self.coarse_field = TsdfBlocks(coarse, max(self.truncation, 2 * coarse_cell))
+        self._marked = np.zeros(self.lattice.shape, np.bool_)
+        self.near_share = 1.0  # share of the blocks near the surface, set by `allocate`
         self._filled: Floats | None = None
-        self._fused: FusedBlocks | None = None
+        self._fused: TsdfBlocks | None = None
 
     @property
     def nbytes(self) -> int:
         """Memory of the fine samples in bytes."""
         return 0 if self._fused is None else self._fused.nbytes
 
-    def survey(self, view: DepthView) -> None:
-        """First pass: note where this view sees the surface. Every view goes through here before `allocate`."""
-        self.survey_field.add(view)
+    def fuse_coarse(self, view: DepthView) -> None:
+        """First pass: mark the blocks near this view's depths and fuse it coarsely. Call it for every view before `allocate`."""
+        self.coarse_field.add(view)
         camera, lattice = view.camera, self.lattice
-        mark_depth(
+        mark_blocks_near_depth(
             view.inverse,
-            view.outside,
+            view.mask_distance,
             camera.R.T / lattice.cell,
             (camera.centre - lattice.lower) / lattice.cell,
             _intrinsics(view).astype(np.float64),
             self.truncation / lattice.cell,
-            self._wanted,
+            self._marked,
         )
 
-    def allocate(self, everywhere: bool = False) -> None:
-        """Between the passes: fill what no view saw (coarsely), and allocate the blocks the surface runs through, or all of them."""
-        field = self.survey_field
-        field.doubt()
-        unknown = field.seen == 0
-        field.values[field.seen == BY_MASK] = 1
-        if self.solid:
-            empty = self._outside(field.lattice)
+    def allocate(self, all_blocks: bool = False) -> None:
+        """Between the passes: fill unobserved coarse samples, and allocate the blocks near the surface, or `all_blocks`."""
+        field = self.coarse_field
+        field.reject_weak_free_space()
+        unknown = field.observed == 0
+        field.values[field.observed == OBSERVED_BY_MASK] = 1
+        if self.empty_outside:
+            empty = self._outside_ball(field.lattice)
             field.values[empty] = 1
             unknown &= ~empty
         if self.support is not None:
-            below = self._below(field.lattice, slice(None), field.truncation)
+            below = self._support_distance(field.lattice, slice(None), field.truncation)
             field.values[:] = np.maximum(field.values, below)
             unknown &= below < 0
-        # The filling asks on which side a sample lies, not how far: a thin layer of "inside" must weigh as much as the wide empty space.
-        np.clip(SIDE * field.values, -1, 1, out=field.values)
+        # Hole filling uses signs, not distances: a thin layer of inside samples must weigh as much as wide free space.
+        np.clip(SIGN_SLOPE * field.values, -1, 1, out=field.values)
         longest = max(field.lattice.samples)
-        rate = 2 / (1 + np.sin(np.pi / longest))  # the best over-relaxation for Laplace's equation across the box
-        diffuse(field.lattice, field.values, unknown, longest, rate)
-        span(field.lattice, field.values, unknown, crossing_blocks(field.lattice, field.values, unknown), longest // 4, rate, ROUNDS)
+        rate = 2 / (1 + np.sin(np.pi / longest))  # optimal over-relaxation for Laplace's equation on the box
+        solve_laplace(field.lattice, field.values, unknown, longest, rate)
+        blocks = sign_change_blocks(field.lattice, field.values, unknown)
+        minimise_area(field.lattice, field.values, unknown, blocks, longest // 4, rate, AREA_ROUNDS)
         filled = field.lattice.dense(field.values)
         self._filled = filled
         self._mark_crossings(filled)
-        near = self._wanted & self._reachable()
-        self.near_share = float(near.mean())
-        self.lattice.allocate(near | everywhere)
-        self._fused = FusedBlocks(self.lattice, self.truncation)
+        near_surface = self._marked & self._blocks_in_ball()
+        self.near_share = float(near_surface.mean())
+        self.lattice.allocate(near_surface | all_blocks)
+        self._fused = TsdfBlocks(self.lattice, self.truncation)
 
     def integrate(self, view: DepthView) -> None:
-        """Second pass: fuse this view into the fine blocks."""
+        """Second pass: fuse this view into the fine blocks. Raises RuntimeError before `allocate`."""
         if self._fused is None:
-            raise RuntimeError("survey all views and allocate before integrating")
+            raise RuntimeError("call fuse_coarse for all views and allocate before integrate")
         self._fused.add(view)
 
     def set_field(self, field: Floats) -> None:
-        """Instead of integrating: a field (n, 8, 8, 8) on `lattice`'s blocks in units of the truncation, not a number where unknown."""
+        """Instead of integrating: a field (n, 8, 8, 8) on the lattice's blocks in units of the truncation; NaN = unknown."""
         if self._fused is None or field.shape != self._fused.values.shape:
             raise ValueError("the field must have one value per sample of the allocated blocks")
         known = np.isfinite(field)
         self._fused.values[:] = np.where(known, field, 0)
-        self._fused.seen[:] = np.where(known, BY_DEPTH, 0)
+        self._fused.observed[:] = np.where(known, OBSERVED_BY_DEPTH, 0)
 
     def mesh(self, close: bool = True) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
-        """The zero set as `vertices` (v, 3), `faces` (f, 3), outward winding; `close` fills what no view saw. Call it once, at the end."""
+        """Zero set as `vertices` (v, 3), `faces` (f, 3), outward winding; `close` fills holes. Call it once, at the end."""
         fused, filled = self._fused, self._filled
         if fused is None or filled is None:
-            raise RuntimeError("survey, allocate and integrate before meshing")
-        fused.doubt()
-        unknown = fused.seen == 0
+            raise RuntimeError("call fuse_coarse, allocate and integrate before mesh")
+        fused.reject_weak_free_space()
+        unknown = fused.observed == 0
         if close:
-            scale = self.survey_field.truncation / self.truncation
+            scale = self.coarse_field.truncation / self.truncation
             block = np.zeros((EDGE, EDGE, EDGE), np.float32)
             for row in np.flatnonzero(unknown.any(axis=(1, 2, 3))):
-                coarse_values(filled, self.lattice.coords[row].astype(np.int64) * EDGE, float(self.ratio), scale, block)
+                upsample_coarse(filled, self.lattice.coords[row].astype(np.int64) * EDGE, float(self.ratio), scale, block)
                 fused.values[row][unknown[row]] = block[unknown[row]]
-            # Only a mask speaks here: certainly empty, so the filling must not lean on the mask's ramp.
-            fused.values[fused.seen == BY_MASK] = np.maximum(fused.values[fused.seen == BY_MASK], 0.5)
-            shallow = np.flatnonzero((unknown & (np.abs(fused.values) < 1)).any(axis=(1, 2, 3)))
-            span(self.lattice, fused.values, unknown, shallow, SEAM_SWEEPS, 1.5, SEAM_ROUNDS)
-            self._cut()
-            vertices, faces = march(self.lattice, fused.values, filled, float(self.ratio), scale)
+            # Observed by masks only: certainly free space, so hole filling must not follow the ramp of the mask distance.
+            fused.values[fused.observed == OBSERVED_BY_MASK] = np.maximum(fused.values[fused.observed == OBSERVED_BY_MASK], 0.5)
+            unknown_near_surface = np.flatnonzero((unknown & (np.abs(fused.values) < 1)).any(axis=(1, 2, 3)))
+            minimise_area(self.lattice, fused.values, unknown, unknown_near_surface, SEAM_SWEEPS, 1.5, SEAM_ROUNDS)
+            self._apply_support_cut()
+            vertices, faces = extract_isosurface(self.lattice, fused.values, filled, float(self.ratio), scale)
         else:
-            fused.values[(fused.seen & BY_DEPTH) == 0] = np.nan
-            self._cut()
-            vertices, faces = march(self.lattice, fused.values)
-        if self.ball is not None and not self.solid:
+            fused.values[(fused.observed & OBSERVED_BY_DEPTH) == 0] = np.nan
+            self._apply_support_cut()
+            vertices, faces = extract_isosurface(self.lattice, fused.values)
+        if self.ball is not None and not self.empty_outside:
             keep = (np.linalg.norm(vertices, axis=1) <= self.ball)[faces].all(1)
             used, inverse = np.unique(faces[keep], return_inverse=True)
             vertices, faces = vertices[used], inverse.reshape(-1, 3).astype(np.int32)
         return vertices, faces
 
-    def _below(self, lattice: BlockLattice, rows: slice, truncation: float) -> Floats:
-        """Distance (n, 8, 8, 8) of the samples of some blocks below the support's cut, in units of `truncation`, kept in ±1."""
+    def _support_distance(self, lattice: BlockLattice, rows: slice, truncation: float) -> Floats:
+        """Distance (n, 8, 8, 8) of the samples of some blocks below the support's cut, in units of `truncation`, clamped to ±1."""
         assert self.support is not None
         height = self.support.height(lattice.positions(rows)) - self.support.cut
         return np.clip(-height / truncation, -1, 1).astype(np.float32)
 
-    def _cut(self) -> None:
-        """Empty the fine blocks below the support's cut, so that what stands on it ends there in a flat face."""
+    def _apply_support_cut(self) -> None:
+        """Set the fine samples below the support's cut to free space; the object ends there in a flat face."""
         assert self._fused is not None
         if self.support is None:
             return
-        step = 1024  # blocks: the positions of all at once would take more than the field itself
+        step = 1024  # blocks; all positions at once would need more memory than the field
         for start in range(0, len(self.lattice), step):
             rows = slice(start, start + step)
-            self._fused.values[rows] = np.maximum(self._fused.values[rows], self._below(self.lattice, rows, self.truncation))
+            self._fused.values[rows] = np.maximum(self._fused.values[rows], self._support_distance(self.lattice, rows, self.truncation))
 
-    def _outside(self, lattice: BlockLattice) -> NDArray[np.bool_]:
-        """Samples outside the ball, and the outermost layer of the box: empty when the object is solid."""
+    def _outside_ball(self, lattice: BlockLattice) -> NDArray[np.bool_]:
+        """Samples outside the ball, and the outermost layer of the box."""
         position = lattice.positions(slice(None))
         out = np.zeros(position.shape[:-1], np.bool_)
         if self.ball is not None:
@@ -243,12 +244,12 @@ class SparseTsdf:
         for axis in range(3):
             shape = [1, 1, 1]
             shape[axis] = EDGE
-            whole = lattice.coords[:, axis, None, None, None] * EDGE + steps.reshape(shape)
-            out |= (whole == 0) | (whole >= lattice.samples[axis] - 2)
+            sample_index = lattice.coords[:, axis, None, None, None] * EDGE + steps.reshape(shape)
+            out |= (sample_index == 0) | (sample_index >= lattice.samples[axis] - 2)
         return out
 
     def _mark_crossings(self, filled: Floats) -> None:
-        """Mark the fine blocks that the survey's zero set runs through."""
+        """Mark the fine blocks that the coarse zero set crosses."""
         crossing = np.zeros(filled.shape, np.bool_)
         inside = filled < 0
         for axis in range(3):
@@ -258,12 +259,12 @@ class SparseTsdf:
             step = inside[tuple(a)] != inside[tuple(b)]
             crossing[tuple(a)] |= step
             crossing[tuple(b)] |= step
-        coarse = self.survey_field.lattice
+        coarse = self.coarse_field.lattice
         points = coarse.lower + coarse.cell * np.argwhere(crossing)
-        self.lattice.mark_near(points, coarse.cell, self._wanted)
+        self.lattice.mark_blocks_near(points, coarse.cell, self._marked)
 
-    def _reachable(self) -> NDArray[np.bool_]:
-        """Blocks that touch the ball (all without one)."""
+    def _blocks_in_ball(self) -> NDArray[np.bool_]:
+        """Blocks that intersect the ball (all without one)."""
         if self.ball is None:
             return np.ones(self.lattice.shape, np.bool_)
         edge = EDGE * self.lattice.cell

@@ -1,9 +1,9 @@
-"""Which depths other photos confirm, which they contradict, and the mean of those that agree.
+"""Geometric consistency of depth maps: consistent views and free-space violations per pixel, and the mean of the consistent planes.
 
-A pixel's point is confirmed by a view whose own plane at the point's image gives the same depth there (to a share of it) and leads
-back to the pixel (to a pixel or so): Galliani et al. 2015; Schönberger et al., *Pixelwise view selection for unstructured multi-view
-stereo* (ECCV 2016). It is contradicted by a view that sees through it: that view's surface lies well behind the point. The planes that
-agree are averaged in the pixel's own frame: independent errors fall with the root of their number.
+A pixel is consistent with a view whose plane at the projected point has the same depth (relative error) and reprojects to the pixel
+(error of a pixel or so): Galliani et al. 2015; Schönberger et al., *Pixelwise view selection for unstructured multi-view stereo*
+(ECCV 2016). A free-space violation is a view whose surface lies well behind the point. Consistent planes are averaged in the pixel's
+camera frame: independent errors fall with the square root of their number.
 """
 
 from __future__ import annotations
@@ -17,47 +17,47 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsbake.geometry.cameras import Camera
-from gsbake.mvs.ncc import FAST
-from gsbake.mvs.pyramids import relative
+from gsbake.mvs.ncc import FASTMATH
+from gsbake.mvs.pyramids import relative_pose
 
 Floats = NDArray[np.float32]
 
-#: Agreement: share of the depth, pixels from where the point started, cosine between the normals.
-DEPTH_SHARE, PIXELS, COSINE = 0.006, 1.0, 0.64
-#: A view sees through a point when its surface lies behind it by more than this share of the depth.
-THROUGH = 0.015
+#: Thresholds of consistency: relative depth error, reprojection error in pixels, cosine between the normals.
+MAX_DEPTH_ERROR, MAX_REPROJECTION_ERROR, MIN_NORMAL_COSINE = 0.006, 1.0, 0.64
+#: A free-space violation: the view's surface lies behind the point by more than this share of the depth.
+VIOLATION_MARGIN = 0.015
 
 
 @dataclass(frozen=True)
-class Agreement:
-    """Per pixel (h, w): how many views agree and how many see through, the plane (h, w, 3) averaged over those that agree, and the
-    `scatter` of their depths (standard deviation about the photo's own, as a share of the depth)."""
+class Consistency:
+    """Per pixel (h, w): number of `consistent` views and of free-space `violations`, mean `plane` (h, w, 3) of the consistent views, and
+    `scatter` of their depths (standard deviation about the photo's own depth, as a share of it)."""
 
-    agreeing: NDArray[np.uint8]
-    through: NDArray[np.uint8]
+    consistent: NDArray[np.uint8]
+    violations: NDArray[np.uint8]
     plane: Floats
     scatter: Floats
 
 
-@nb.njit(fastmath=FAST, error_model="numpy", nogil=True, cache=True)
-def _agree(
-    plane: Any, good: Any, lens: Any, others: Any, sizes: Any, lenses: Any, rotations: Any, translations: Any,
-    other_planes: Any, other_good: Any, starts: Any, share: Any, pixels: Any, cosine: Any, behind: Any,
-    agreeing: Any, through: Any, mean: Any, scatter: Any,
+@nb.njit(fastmath=FASTMATH, error_model="numpy", nogil=True, cache=True)
+def _check(
+    plane: Any, valid: Any, intrinsics: Any, others: Any, sizes: Any, other_intrinsics: Any, rotations: Any, translations: Any,
+    other_planes: Any, other_valid: Any, starts: Any, share: Any, pixels: Any, cosine: Any, violation_margin: Any,
+    consistent: Any, violations: Any, mean: Any, scatter: Any,
 ) -> None:  # fmt: skip
-    """Kernel of `agreement`: all views one after another in `other_planes` (n, 3) and `other_good` (n,)."""
-    height, width = good.shape
-    fx, fy, cx, cy = lens[0], lens[1], lens[2], lens[3]
+    """Kernel of `check_consistency`: all views concatenated in `other_planes` (n, 3) and `other_valid` (n,)."""
+    height, width = valid.shape
+    fx, fy, cx, cy = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]
     half, one = np.float32(0.5), np.float32(1)
     for v in range(height):
         y = (np.float32(v) + half - cy) / fy
         for u in range(width):
-            agreeing[v, u] = 0
-            through[v, u] = 0
+            consistent[v, u] = 0
+            violations[v, u] = 0
             scatter[v, u] = 0
             for k in range(3):
                 mean[v, u, k] = plane[v, u, k]
-            if good[v, u] == 0:
+            if valid[v, u] == 0:
                 continue
             x = (np.float32(u) + half - cx) / fx
             m0, m1, m2 = plane[v, u, 0], plane[v, u, 1], plane[v, u, 2]
@@ -69,7 +69,7 @@ def _agree(
             px, py = x * z, y * z
             sum0, sum1, sum2, total, second = m0, m1, m2, one, np.float32(0)
             for j in range(others):
-                r, t, l = rotations[j], translations[j], lenses[j]
+                r, t, l = rotations[j], translations[j], other_intrinsics[j]
                 qx = r[0, 0] * px + r[0, 1] * py + r[0, 2] * z + t[0]
                 qy = r[1, 0] * px + r[1, 1] * py + r[1, 2] * z + t[1]
                 qz = r[2, 0] * px + r[2, 1] * py + r[2, 2] * z + t[2]
@@ -80,19 +80,19 @@ def _agree(
                 if not (pu >= 0 and pv >= 0 and pu < sizes[j, 0] and pv < sizes[j, 1]):
                     continue
                 index = np.uint64(starts[j] + np.int64(pv) * sizes[j, 0] + np.int64(pu))
-                if other_good[index] == 0:
+                if other_valid[index] == 0:
                     continue
                 n0, n1, n2 = other_planes[index, 0], other_planes[index, 1], other_planes[index, 2]
                 there = n0 * ax + n1 * ay + n2
                 if not there > np.float32(1e-6):
                     continue
                 depth = one / there
-                if depth > qz * (one + behind):
-                    through[v, u] += 1
+                if depth > qz * (one + violation_margin):
+                    violations[v, u] += 1
                     continue
                 if not abs(depth - qz) < share * qz:
                     continue
-                # Back into the reference, from the other view's surface.
+                # Reproject the other view's surface into the reference.
                 bx, by, bz = ax * depth - t[0], ay * depth - t[1], depth - t[2]
                 wx = r[0, 0] * bx + r[1, 0] * by + r[2, 0] * bz
                 wy = r[0, 1] * bx + r[1, 1] * by + r[2, 1] * bz
@@ -115,7 +115,7 @@ def _agree(
                 gap = (k0 * x + k1 * y + k2) / rho - one
                 if not abs(gap) < np.float32(2) * share:
                     continue
-                agreeing[v, u] += 1
+                consistent[v, u] += 1
                 sum0 += k0
                 sum1 += k1
                 sum2 += k2
@@ -127,40 +127,40 @@ def _agree(
             scatter[v, u] = np.sqrt(second / total)
 
 
-def agreement(
-    camera: Camera, plane: Floats, good: NDArray[np.uint8], others: Sequence[tuple[Camera, Floats, NDArray[np.uint8]]]
-) -> Agreement:
-    """Ask `others` (camera, planes (h, w, 3), which of them count (h, w)) about the planes of one photo; `good` (h, w) selects pixels.
+def check_consistency(
+    camera: Camera, plane: Floats, valid: NDArray[np.uint8], others: Sequence[tuple[Camera, Floats, NDArray[np.uint8]]]
+) -> Consistency:
+    """Check the planes (h, w, 3) of one photo against `others` (camera, planes (h, w, 3), valid (h, w)) where `valid` (h, w).
 
-    The mean plane weighs the photo's own and each that agrees the same; where nobody agrees it is the photo's own.
+    The mean weighs the photo's own plane and each consistent one equally; without consistent views it is the photo's own.
     """
-    shape = good.shape
-    out = Agreement(np.zeros(shape, np.uint8), np.zeros(shape, np.uint8), np.zeros((*shape, 3), np.float32), np.zeros(shape, np.float32))
+    shape = valid.shape
+    out = Consistency(np.zeros(shape, np.uint8), np.zeros(shape, np.uint8), np.zeros((*shape, 3), np.float32), np.zeros(shape, np.float32))
     cameras = [c for c, _, _ in others]
-    pairs = [relative(camera, c) for c in cameras]
-    _agree(
+    pairs = [relative_pose(camera, c) for c in cameras]
+    _check(
         plane,
-        good,
-        _lens(camera),
+        valid,
+        _intrinsics(camera),
         len(others),
         np.array([(c.width, c.height) for c in cameras], np.int64).reshape(-1, 2),
-        np.array([_lens(c) for c in cameras], np.float32).reshape(-1, 4),
+        np.array([_intrinsics(c) for c in cameras], np.float32).reshape(-1, 4),
         np.array([r for r, _ in pairs], np.float32).reshape(-1, 3, 3),
         np.array([t for _, t in pairs], np.float32).reshape(-1, 3),
         np.concatenate([p.reshape(-1, 3) for _, p, _ in others]) if others else np.zeros((0, 3), np.float32),
         np.concatenate([g.ravel() for _, _, g in others]) if others else np.zeros(0, np.uint8),
         np.concatenate([[0], np.cumsum([g.size for _, _, g in others])[:-1]]).astype(np.int64) if others else np.zeros(0, np.int64),
-        np.float32(DEPTH_SHARE),
-        np.float32(PIXELS),
-        np.float32(COSINE),
-        np.float32(THROUGH),
-        out.agreeing,
-        out.through,
+        np.float32(MAX_DEPTH_ERROR),
+        np.float32(MAX_REPROJECTION_ERROR),
+        np.float32(MIN_NORMAL_COSINE),
+        np.float32(VIOLATION_MARGIN),
+        out.consistent,
+        out.violations,
         out.plane,
         out.scatter,
     )
     return out
 
 
-def _lens(camera: Camera) -> Floats:
+def _intrinsics(camera: Camera) -> Floats:
     return np.array([camera.fx, camera.fy, camera.cx, camera.cy], np.float32)

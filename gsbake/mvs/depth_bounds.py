@@ -1,4 +1,4 @@
-"""Where along its ray a pixel's surface can be: between the visual hull's first and last crossing, or inside the object's ball."""
+"""Depth search range of a pixel: between the ray's first and last crossing of the visual hull, or inside the unit ball."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ from numpy.typing import NDArray
 
 from gsbake.capture.hull.visual_hull import Hull
 from gsbake.geometry.cameras import Array, Camera
-from gsbake.mvs.ncc import FAST
+from gsbake.mvs.ncc import FASTMATH
 
 Floats = NDArray[np.float32]
 
-#: The object lives in the unit ball; a little more, so that its outermost point is found.
+#: Radius of the search ball: the unit ball with a margin.
 BALL = 1.05
-#: The hull is widened by this many cells (masks and poses are that uncertain).
+#: The hull is dilated by this many cells: the uncertainty of masks and poses.
 MARGIN = 1.0
 
 
-@nb.njit(fastmath=FAST, error_model="numpy", nogil=True, cache=True)
+@nb.njit(fastmath=FASTMATH, error_model="numpy", nogil=True, cache=True)
 def _field(field: Any, x: Any, y: Any, z: Any) -> Any:
-    """Trilinear value at lattice coordinates; far outside beyond the grid."""
+    """Trilinear value at lattice coordinates; 1000 beyond the grid."""
     n0, n1, n2 = field.shape
     if not (x >= 0 and y >= 0 and z >= 0 and x < n0 - 1 and y < n1 - 1 and z < n2 - 1):
         return np.float32(1e3)
@@ -37,17 +37,17 @@ def _field(field: Any, x: Any, y: Any, z: Any) -> Any:
     return p * (one - a) + q * a
 
 
-@nb.njit(fastmath=FAST, error_model="numpy", nogil=True, cache=True)
-def _crossing(field: Any, origin: Any, way: Any, start: float, stop: float, margin: float) -> float:
-    """First parameter from `start` towards `stop` where the field, in cells, falls below `margin`; NaN-free: −1 when it never does."""
+@nb.njit(fastmath=FASTMATH, error_model="numpy", nogil=True, cache=True)
+def _crossing(field: Any, origin: Any, direction: Any, start: float, stop: float, margin: float) -> float:
+    """First parameter from `start` towards `stop` where the field, in cells, falls below `margin`; −1 when it never does."""
     t = start
     sign = 1.0 if stop > start else -1.0
-    speed = np.sqrt(way[0] ** 2 + way[1] ** 2 + way[2] ** 2)
+    speed = np.sqrt(direction[0] ** 2 + direction[1] ** 2 + direction[2] ** 2)
     while (stop - t) * sign > 0:
-        value = _field(field, origin[0] + t * way[0], origin[1] + t * way[1], origin[2] + t * way[2])
+        value = _field(field, origin[0] + t * direction[0], origin[1] + t * direction[1], origin[2] + t * direction[2])
         if value < margin:
             return t
-        # The field is a lower bound of the distance; beyond the grid nothing is known, so steps stay short there too.
+        # The field is a lower bound of the distance; beyond the grid it is unknown, so steps are limited there too.
         t += sign * max(0.5, 0.8 * min(value - margin, 4.0)) / speed
     return -1.0
 
@@ -56,8 +56,8 @@ def _crossing(field: Any, origin: Any, way: Any, start: float, stop: float, marg
 def _bounds(
     inside: Any, rays: Any, centre: Any, ball: float, field: Any, lower: Any, cell: float, margin: float, near: Any, far: Any
 ) -> None:
-    """Fill `near`, `far` (h, w) z-depths; 0 where the ray misses. `field` in cells; an empty one leaves the ball."""
-    way = np.zeros(3)
+    """Fill `near`, `far` (h, w) z-depths; 0 where the ray misses. `field` is in cells; when it is empty the ball is the bound."""
+    direction = np.zeros(3)
     origin = np.zeros(3)
     for v in range(inside.shape[0]):
         for u in range(inside.shape[1]):
@@ -80,11 +80,11 @@ def _bounds(
             if field.shape[0] > 0:
                 for k in range(3):
                     origin[k] = (centre[k] - lower[k]) / cell - 0.5
-                    way[k] = rays[v, u, k] / cell
-                start = _crossing(field, origin, way, first, last, margin)
+                    direction[k] = rays[v, u, k] / cell
+                start = _crossing(field, origin, direction, first, last, margin)
                 if start < 0:
                     continue
-                last = _crossing(field, origin, way, last, first, margin)
+                last = _crossing(field, origin, direction, last, first, margin)
                 first = start
                 if not last > first:
                     continue
@@ -93,9 +93,9 @@ def _bounds(
 
 
 def depth_bounds(camera: Camera, inside: NDArray[np.uint8], hull: Hull | None) -> tuple[Floats, Floats]:
-    """Least and greatest inverse z-depth (h, w) of each pixel's surface, both 0 where there can be none.
+    """Minimum and maximum inverse z-depth (h, w) of each pixel, both 0 where there is no surface.
 
-    `inside` (h, w) is non-zero where the object may be; without a hull the bound is the ball.
+    `inside` (h, w) is the mask, non-zero where the object may be; without a hull the bound is the ball.
     """
     near, far = np.zeros(inside.shape), np.zeros(inside.shape)
     if hull is None:
@@ -110,7 +110,7 @@ def depth_bounds(camera: Camera, inside: NDArray[np.uint8], hull: Hull | None) -
 
 
 def seed_depths(camera: Camera, points: Array, reach: int) -> Floats:
-    """Inverse z-depth (h, w) of the nearest of `points` (k, 3) in each pixel, spread to pixels up to `reach` away; 0 = none."""
+    """Inverse z-depth (h, w) of the nearest of `points` (k, 3) in each pixel, extended to pixels up to `reach` away; 0 = none."""
     import cv2
 
     out = np.zeros((camera.height, camera.width), np.float32)
@@ -118,8 +118,8 @@ def seed_depths(camera: Camera, points: Array, reach: int) -> Floats:
         return out
     pixel, z = camera.project(points)
     column, row = np.floor(pixel).astype(np.int64).T
-    seen = (z > 1e-3) & (column >= 0) & (row >= 0) & (column < camera.width) & (row < camera.height)
-    np.maximum.at(out, (row[seen], column[seen]), (1 / z[seen]).astype(np.float32))
+    visible = (z > 1e-3) & (column >= 0) & (row >= 0) & (column < camera.width) & (row < camera.height)
+    np.maximum.at(out, (row[visible], column[visible]), (1 / z[visible]).astype(np.float32))
     if not out.any():
         return out
     distance, label = cv2.distanceTransformWithLabels((out == 0).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)

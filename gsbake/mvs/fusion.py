@@ -1,7 +1,7 @@
-"""From depth maps to one point per place: a pixel becomes a point unless an earlier photo already showed that point.
+"""Depth map fusion: one point per surface location, without the duplicates that later photos see.
 
-Merrell et al., *Real-time visibility-based fusion of depth maps* (ICCV 2007), in the short form of Galliani et al. 2015: depths were
-averaged over the views that agree before, so a point stands for all pixels that see it, and those are crossed off.
+Merrell et al., *Real-time visibility-based fusion of depth maps* (ICCV 2007), in the short form of Galliani et al. 2015: depths are
+already averaged over consistent views, so a point represents all pixels that see it, and those produce no further points.
 """
 
 from __future__ import annotations
@@ -14,16 +14,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsbake.mvs.depth_maps import DepthMap
-from gsbake.mvs.ncc import FAST
+from gsbake.mvs.ncc import FASTMATH
 from gsbake.mvs.point_cloud import StereoCloud
-from gsbake.mvs.pyramids import relative
+from gsbake.mvs.pyramids import relative_pose
 
-#: A pixel shows the same point when its depth there differs by less than this share.
-SAME = 0.006
+#: A pixel sees the same point when its depth differs by less than this share.
+SAME_POINT_TOLERANCE = 0.006
 
 
-@nb.njit(fastmath=FAST, error_model="numpy", nogil=True, cache=True)
-def _cross_off(points: Any, lens: Any, rotation: Any, translation: Any, depth: Any, used: Any, share: Any) -> None:
+@nb.njit(fastmath=FASTMATH, error_model="numpy", nogil=True, cache=True)
+def _mark_visible(points: Any, intrinsics: Any, rotation: Any, translation: Any, depth: Any, used: Any, share: Any) -> None:
     """Mark in `used` (h, w) the pixels that see one of `points` (n, 3) of another camera's frame."""
     height, width = depth.shape
     for i in range(points.shape[0]):
@@ -31,11 +31,11 @@ def _cross_off(points: Any, lens: Any, rotation: Any, translation: Any, depth: A
         pz = rotation[2, 0] * x + rotation[2, 1] * y + rotation[2, 2] * z + translation[2]
         if not pz > np.float32(1e-6):
             continue
-        u = lens[0] * (rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2] * z + translation[0]) / pz + lens[2]
-        v = lens[1] * (rotation[1, 0] * x + rotation[1, 1] * y + rotation[1, 2] * z + translation[1]) / pz + lens[3]
+        u = intrinsics[0] * (rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2] * z + translation[0]) / pz + intrinsics[2]
+        v = intrinsics[1] * (rotation[1, 0] * x + rotation[1, 1] * y + rotation[1, 2] * z + translation[1]) / pz + intrinsics[3]
         if not (u >= 0 and v >= 0 and u < width and v < height):
             continue
-        # The nearest four pixels: neighbouring points of one view then leave no gaps in another that looks more closely.
+        # The nearest four pixels: a view with a higher resolution is then covered without gaps.
         for row in range(max(0, int(v - np.float32(0.5))), min(height, int(v + np.float32(0.5)) + 1)):
             for column in range(max(0, int(u - np.float32(0.5))), min(width, int(u + np.float32(0.5)) + 1)):
                 if abs(depth[row, column] - pz) < share * pz:
@@ -45,9 +45,9 @@ def _cross_off(points: Any, lens: Any, rotation: Any, translation: Any, depth: A
 def fuse(
     maps: Sequence[DepthMap], neighbours: Sequence[Sequence[int]], colour: Callable[[int], NDArray[np.uint8]], tick: Callable[[int], None]
 ) -> StereoCloud:
-    """Points of all maps, each place once.
+    """Fuse all depth maps into one point cloud.
 
-    `neighbours[i]` are the views that may see what view i sees, `colour(i)` the photo (h, w, 3) 8-bit sRGB at the map's size;
+    `neighbours[i]` are the views that may see the same surface as view i, `colour(i)` the photo (h, w, 3) 8-bit sRGB at the map's size;
     `tick(i)` is called after each view.
     """
     depths = [m.depth() for m in maps]
@@ -65,9 +65,10 @@ def fuse(
         for j in neighbours[i]:
             if j > i:
                 other = maps[j].camera
-                rotation, translation = relative(camera, other)
-                lens = np.array([other.fx, other.fy, other.cx, other.cy], np.float32)
-                _cross_off(points, lens, rotation.astype(np.float32), translation.astype(np.float32), depths[j], used[j], np.float32(SAME))
+                rotation, translation = relative_pose(camera, other)
+                intrinsics = np.array([other.fx, other.fy, other.cx, other.cy], np.float32)
+                pose = rotation.astype(np.float32), translation.astype(np.float32)
+                _mark_visible(points, intrinsics, *pose, depths[j], used[j], np.float32(SAME_POINT_TOLERANCE))
         parts.append(
             (
                 (local - camera.t) @ camera.R,

@@ -1,4 +1,4 @@
-"""The stereo of one capture: every photo matched on its own thread, kept on disk as it is done, then confirmed and fused."""
+"""Stereo of one capture: parallel matching per photo with results on disk, consistency checks, fusion and hull carving."""
 
 from __future__ import annotations
 
@@ -14,31 +14,32 @@ from numpy.typing import NDArray
 from gsbake.capture.hull.visual_hull import Hull
 from gsbake.capture.posed_photos import PosedPhotos
 from gsbake.geometry.cameras import Array
-from gsbake.mvs.carving import Opened, open_hull
+from gsbake.mvs.carving import CarvedHull, carve_hull
 from gsbake.mvs.coarse_to_fine import Planes, find_planes
-from gsbake.mvs.consistency import agreement
+from gsbake.mvs.consistency import check_consistency
 from gsbake.mvs.depth_bounds import depth_bounds, seed_depths
-from gsbake.mvs.depth_maps import DepthMap, candidates, confirmed, trusted, z_depth
+from gsbake.mvs.depth_maps import DepthMap, consistent_pixels, filter_depth_map, matched_pixels, z_depth
 from gsbake.mvs.fusion import fuse
 from gsbake.mvs.point_cloud import StereoCloud
-from gsbake.mvs.pyramids import Photo, levels, load_photo
-from gsbake.mvs.view_selection import choose
+from gsbake.mvs.pyramids import Photo, image_pyramid, load_photo
+from gsbake.mvs.view_selection import select_views
 
-#: Points of the hull that tell which photos see the same surface.
-SAMPLES = 2000
-#: Tie points are used as samples of the surface from this many on.
-LEAST_POINTS = 200
-#: Tie points seed pixels up to this share of the photo's width away.
+#: Number of surface samples for view selection.
+SURFACE_SAMPLES = 2000
+#: Minimum number of tie points that serve as surface samples.
+MIN_TIE_POINTS = 200
+#: Radius around a tie point, as a share of the photo's width, in which pixels are initialised with its depth.
 SEED_REACH = 0.08
-#: Threads that ask photos about one another: each holds the planes of a dozen.
-MOST_ASKING = 6
+#: Threads of the consistency check: each holds the planes of a dozen photos in memory.
+MAX_CONSISTENCY_THREADS = 6
 
 
 @dataclass
 class StereoRun:
-    """State of one run; `parallel` runs a call per photo on the threads and reports progress.
+    """State of one run. `settings` is the section [stereo]; matched planes go into the folder `planes_folder`.
 
-    `step(i, text)` is called in the main thread after each photo and may raise to stop.
+    `report(i, text)` is called in the main thread after each photo and may raise to stop. Per photo: the image pyramid, the source views,
+    the views of the consistency check, and the depths (h, w; 0 = none) that were consistent in the first check.
     """
 
     posed: PosedPhotos
@@ -46,36 +47,36 @@ class StereoRun:
     hull: Hull | None
     seed: int
     threads: int
-    keep: Path
-    step: Callable[[int, str], None]
-    photos: list[list[Photo]] = field(default_factory=list)
-    matched: list[list[int]] = field(default_factory=list)
-    asked: list[list[int]] = field(default_factory=list)
-    shared: list[NDArray[np.float32]] = field(default_factory=list)
+    planes_folder: Path
+    report: Callable[[int, str], None]
+    pyramids: list[list[Photo]] = field(default_factory=list)
+    sources: list[list[int]] = field(default_factory=list)
+    consistency_views: list[list[int]] = field(default_factory=list)
+    consistent_depths: list[NDArray[np.float32]] = field(default_factory=list)
 
     def prepare(self) -> None:
-        """Load the photos and choose their neighbours."""
-        self.photos = self.parallel(lambda i: levels(load_photo(self.posed, i, self.settings.max_size)), "photos")
-        points, normals = self._surface()
+        """Load the photos and select their views."""
+        self.pyramids = self.parallel(lambda i: image_pyramid(load_photo(self.posed, i, self.settings.max_size)), "photos")
+        points, normals = self._surface_samples()
         cameras, settings = self.posed.cameras.cameras, self.settings
-        self.matched, self.asked = choose(cameras, points, normals, settings.neighbours, settings.consistency_views)
+        self.sources, self.consistency_views = select_views(cameras, points, normals, settings.neighbours, settings.consistency_views)
 
-    def _surface(self) -> tuple[Array, Array | None]:
-        """Sample points of the object, with normals where they are known."""
+    def _surface_samples(self) -> tuple[Array, Array | None]:
+        """Sample points (n, 3) of the surface, with normals where they are known."""
         if self.hull is not None:
-            return self.hull.surface_points(SAMPLES, self.seed)
+            return self.hull.surface_points(SURFACE_SAMPLES, self.seed)
         cloud = self.posed.points()
-        if cloud is not None and len(cloud[0]) >= LEAST_POINTS:
+        if cloud is not None and len(cloud[0]) >= MIN_TIE_POINTS:
             inside = cloud[0][np.linalg.norm(cloud[0], axis=1) < 1]
-            if len(inside) >= LEAST_POINTS:
-                return inside[:: max(1, len(inside) // SAMPLES)], None
+            if len(inside) >= MIN_TIE_POINTS:
+                return inside[:: max(1, len(inside) // SURFACE_SAMPLES)], None
         return np.zeros((1, 3)), None
 
-    def parallel(self, call: Callable[[int], Any], text: str, most: int = 64) -> list[Any]:
-        """`call(i)` for every photo on at most `most` threads, results in order."""
+    def parallel(self, call: Callable[[int], Any], text: str, max_threads: int = 64) -> list[Any]:
+        """`call(i)` for every photo on at most `max_threads` threads, results in order."""
         count = len(self.posed)
         results: list[Any] = [None] * count
-        pool = ThreadPoolExecutor(max(1, min(self.threads, count, most)), thread_name_prefix="gsbake-stereo")
+        pool = ThreadPoolExecutor(max(1, min(self.threads, count, max_threads)), thread_name_prefix="gsbake-stereo")
         try:
             waiting: dict[Future[Any], int] = {pool.submit(call, i): i for i in range(count)}
             done = 0
@@ -83,82 +84,80 @@ class StereoRun:
                 for future in wait(waiting, return_when=FIRST_COMPLETED).done:
                     results[waiting.pop(future)] = future.result()
                     done += 1
-                    self.step(done, text)
+                    self.report(done, text)
         finally:
             pool.shutdown(wait=True, cancel_futures=True)
         return results
 
     def match(self) -> None:
-        """Find the planes of every photo that is not on disk yet."""
-        self.keep.mkdir(parents=True, exist_ok=True)
+        """Match every photo whose planes are not on disk yet."""
+        self.planes_folder.mkdir(parents=True, exist_ok=True)
         cloud = self.posed.points()
         ties = np.zeros((0, 3)) if cloud is None else cloud[0]
 
-        def one(index: int) -> None:
-            target = self._file(index)
+        def match_photo(index: int) -> None:
+            target = self._planes_path(index)
             if target.exists():
                 return
-            sizes = self.photos[index]
+            sizes = self.pyramids[index]
             coarse = sizes[0]
             low, high = depth_bounds(coarse.camera, coarse.inside, self.hull)
             seeds = seed_depths(coarse.camera, ties, max(2, round(SEED_REACH * coarse.camera.width)))
-            others = [self._at_sizes(j, len(sizes)) for j in self.matched[index]]
+            others = [self._pyramid(j, len(sizes)) for j in self.sources[index]]
             planes = find_planes(sizes, others, (low, high), seeds, self.settings.best_views, self.seed + index)
             partial = target.with_suffix(".tmp.npy")
             np.save(partial, np.concatenate([planes.plane, planes.cost[..., None]], -1))
             partial.replace(target)
 
-        self.parallel(one, "matching")
+        self.parallel(match_photo, "matching")
 
-    def _at_sizes(self, index: int, count: int) -> list[Photo]:
-        """Photo `index` at its `count` finest sizes; photos of other proportions may have fewer: then the coarsest repeats halved."""
-        sizes = self.photos[index][-count:]
+    def _pyramid(self, index: int, count: int) -> list[Photo]:
+        """Photo `index` at `count` sizes; where its own pyramid is shorter (other proportions), the coarsest size is halved further."""
+        sizes = self.pyramids[index][-count:]
         while len(sizes) < count:
             sizes = [sizes[0].halved(), *sizes]
         return sizes
 
-    def _file(self, index: int) -> Path:
-        return self.keep / f"{self.posed.cameras.cameras[index].name}.npy"
+    def _planes_path(self, index: int) -> Path:
+        return self.planes_folder / f"{self.posed.cameras.cameras[index].name}.npy"
 
     def _planes(self, index: int) -> Planes:
-        """Of photo `index`, as views of the file: read only where and when they are looked at."""
-        body = np.load(self._file(index), mmap_mode="r")
+        """Planes of photo `index`, memory-mapped."""
+        body = np.load(self._planes_path(index), mmap_mode="r")
         return Planes(body[..., :3], body[..., 3])
 
-    def confirm(self) -> list[DepthMap]:
-        """Ask the photos about one another twice: about all that match, then about what the first round left.
+    def filter_depths(self) -> list[DepthMap]:
+        """Check consistency twice: of all matched pixels, then of those that passed the first check. Fills `consistent_depths`."""
+        min_views = self.settings.min_consistent_views
 
-        `shared` keeps the depths (h, w; 0 = none) of each photo that others agreed with in the first round.
-        """
-        least = self.settings.min_consistent_views
-
-        def ask(index: int, good: Sequence[NDArray[np.uint8]]) -> Any:
-            others = [(self.photos[j][-1].camera, self._planes(j).plane, good[j]) for j in self.asked[index]]
+        def check(index: int, valid: Sequence[NDArray[np.uint8]]) -> Any:
+            others = [(self.pyramids[j][-1].camera, self._planes(j).plane, valid[j]) for j in self.consistency_views[index]]
             own = np.ascontiguousarray(self._planes(index).plane)
-            return agreement(self.photos[index][-1].camera, own, good[index], others)
+            return check_consistency(self.pyramids[index][-1].camera, own, valid[index], others)
 
-        first = self.parallel(lambda i: candidates(self._planes(i).cost), "confirming")
+        matched = self.parallel(lambda i: matched_pixels(self._planes(i).cost), "consistency")
 
-        def again(index: int) -> Any:
-            found = ask(index, first)
-            shared = z_depth(self.photos[index][-1].camera, self._planes(index).plane, found.agreeing >= least)
-            return confirmed(found, least), shared
+        def first_check(index: int) -> Any:
+            found = check(index, matched)
+            depth = z_depth(self.pyramids[index][-1].camera, self._planes(index).plane, found.consistent >= min_views)
+            return consistent_pixels(found, min_views), depth
 
-        answers = self.parallel(again, "confirming", MOST_ASKING)
-        second, self.shared = [good for good, _ in answers], [shared for _, shared in answers]
+        checked = self.parallel(first_check, "consistency", MAX_CONSISTENCY_THREADS)
+        consistent, self.consistent_depths = [pixels for pixels, _ in checked], [depth for _, depth in checked]
 
-        def last(index: int) -> DepthMap:
-            return trusted(self.photos[index][-1].camera, self._planes(index).cost, ask(index, second), least, self.hull)
+        def final_check(index: int) -> DepthMap:
+            camera, cost = self.pyramids[index][-1].camera, self._planes(index).cost
+            return filter_depth_map(camera, cost, check(index, consistent), min_views, self.hull)
 
-        return self.parallel(last, "confirming", MOST_ASKING)
+        return self.parallel(final_check, "consistency", MAX_CONSISTENCY_THREADS)
 
-    def opened(self) -> Opened | None:
-        """The hull without what the shared depths see through; None without a hull. After `confirm`."""
+    def carved_hull(self) -> CarvedHull | None:
+        """The hull carved by `consistent_depths`; None without a hull. Call after `filter_depths`."""
         if self.hull is None:
             return None
-        return open_hull(self.hull, [sizes[-1].camera for sizes in self.photos], self.shared)
+        return carve_hull(self.hull, [sizes[-1].camera for sizes in self.pyramids], self.consistent_depths)
 
-    def points(self, maps: Sequence[DepthMap]) -> StereoCloud:
+    def fuse(self, maps: Sequence[DepthMap]) -> StereoCloud:
         """Fuse the depth maps."""
         size = self.settings.max_size
-        return fuse(maps, self.asked, lambda i: self.posed.view(i, size).rgb, lambda i: self.step(i + 1, "fusing"))
+        return fuse(maps, self.consistency_views, lambda i: self.posed.view(i, size).rgb, lambda i: self.report(i + 1, "fusing"))

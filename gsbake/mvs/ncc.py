@@ -1,15 +1,15 @@
-"""What a plane costs at a pixel: 1 − NCC of a patch against its image in another view, seen through the plane.
+"""Matching cost of a plane hypothesis at a pixel: 1 − NCC of a patch against its plane-induced warp in another view.
 
 A plane is three numbers m with m·(x, y, 1) = 1/z, where (x, y) are normalised pixels ((u − cx)/fx, (v − cy)/fy) of the reference view; with
 unit normal n and distance d (nᵀX = d) it is m = n/d. It maps the reference to view j by the homography K_j (R + t mᵀ) K_r⁻¹ (Hartley &
-Zisserman, *Multiple View Geometry*, 13.1). A patch moves by that map's value and derivative at its middle: over five pixels what is left
-out is quadratic and even, hence no bias.
+Zisserman, *Multiple View Geometry*, 13.1). The homography is linearised at the patch centre: over five pixels the neglected term is
+quadratic and even, hence no bias.
 
 Patch weights are bilateral (Yoon & Kweon, PAMI 2006) and zero outside the mask. They depend on the reference only, so mean, variance and
-weights of a patch are found once, and a plane costs one bilinear look-up per sample and view. Four 8-bit neighbours share one
+weights of a patch are computed once, and a plane costs one bilinear look-up per sample and view. Four 8-bit neighbours share one
 32-bit word: one load instead of four.
 
-The kernels keep NaN apart by guards in the positive form and so do without the flags "nnan" and "ninf".
+The kernels reject NaN by guards in the positive form, so the fastmath flags "nnan" and "ninf" stay off.
 """
 
 from __future__ import annotations
@@ -24,60 +24,68 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.float32]
 
-FAST = {"nsz", "arcp", "contract", "afn", "reassoc"}
-#: Pixels from the middle of the patch to its farthest samples.
+#: LLVM fast-math flags of all stereo kernels.
+FASTMATH = {"nsz", "arcp", "contract", "afn", "reassoc"}
+#: Patch radius in pixels.
 RADIUS = 9
-#: Samples of a patch: a whole number of vector registers.
+#: Samples per patch: a whole number of vector registers.
 SAMPLES = 32
-#: Added to variances (grey levels squared): what rounding to 8 bits and the camera's noise make up.
-NOISE = np.float32(1.5)
-#: Cost of a view that cannot see the patch.
-UNSEEN = np.float32(2.0)
-#: Scales of the bilateral weights: grey levels, and pixels.
+#: Added to variances (grey levels squared): quantisation to 8 bits and sensor noise.
+NOISE_VARIANCE = np.float32(1.5)
+#: Cost where the warped patch leaves the source view.
+OUT_OF_VIEW_COST = np.float32(2.0)
+#: Standard deviations of the bilateral weights: grey levels, and pixels.
 SIGMA_GREY, SIGMA_PIXELS = 12.0, 9.0
 
 
 @dataclass(frozen=True)
-class Pattern:
-    """Where a patch is sampled: offsets `du`, `dv` (s,) in pixels, and tables of the weights by place (s,) and grey difference (256,)."""
+class SamplingPattern:
+    """Sample offsets `du`, `dv` (s,) of a patch in pixels and bilateral weights: spatial (s,) and by grey difference (256,)."""
 
     du: Floats
     dv: Floats
-    near: Floats
-    alike: Floats
+    spatial_weight: Floats
+    range_weight: Floats
+
+    @property
+    def arrays(self) -> tuple[Floats, Floats, Floats, Floats]:
+        """The fields as the tuple that kernels take."""
+        return self.du, self.dv, self.spatial_weight, self.range_weight
 
     @staticmethod
-    def make() -> Pattern:
-        """A sunflower of SAMPLES whole pixels within RADIUS: as wide as 19 x 19 pixels at a tenth of the samples (Vogel 1979)."""
+    def make() -> SamplingPattern:
+        """A sunflower (Vogel 1979) of SAMPLES whole pixels within RADIUS: a patch of 19 x 19 at a tenth of the samples."""
         k = np.arange(SAMPLES) + 0.5
         angle, length = k * math.pi * (3 - math.sqrt(5)), (RADIUS + 0.3) * np.sqrt(k / SAMPLES)
-        places = np.stack([length * np.cos(angle), length * np.sin(angle)], 1).round().clip(-RADIUS, RADIUS).astype(np.float32)
-        near = np.exp(-(places**2).sum(1) / (2 * SIGMA_PIXELS**2))
-        alike = np.exp(-(np.arange(256) ** 2) / (2 * SIGMA_GREY**2))
-        return Pattern(places[:, 0].copy(), places[:, 1].copy(), near.astype(np.float32), alike.astype(np.float32))
+        circle = np.stack([np.cos(angle), np.sin(angle)], 1)
+        offsets = (length[:, None] * circle).round().clip(-RADIUS, RADIUS).astype(np.float32)
+        spatial_weight = np.exp(-(offsets**2).sum(1) / (2 * SIGMA_PIXELS**2))
+        range_weight = np.exp(-(np.arange(256) ** 2) / (2 * SIGMA_GREY**2))
+        weights = spatial_weight.astype(np.float32), range_weight.astype(np.float32)
+        return SamplingPattern(offsets[:, 0].copy(), offsets[:, 1].copy(), *weights)
 
 
-def pack(grey: NDArray[np.uint8]) -> NDArray[np.uint32]:
-    """Each pixel (h, w) of an 8-bit photo with its right, lower and lower right neighbours in one word; the last row and column repeat."""
+def pack_2x2(grey: NDArray[np.uint8]) -> NDArray[np.uint32]:
+    """Each pixel (h, w) of an 8-bit photo packed with its right, lower and lower right neighbours; the last row and column repeat."""
     wide = np.pad(grey, ((0, 1), (0, 1)), mode="edge").astype(np.uint32)
     return np.asarray(wide[:-1, :-1] | wide[:-1, 1:] << 8 | wide[1:, :-1] << 16 | wide[1:, 1:] << 24, np.uint32)
 
 
-@nb.njit(fastmath=FAST, error_model="numpy", nogil=True, cache=True)
-def describe(grey: Any, inside: Any, v: int, u: int, pattern: Any, weight: Any, moment: Any) -> Any:
+@nb.njit(fastmath=FASTMATH, error_model="numpy", nogil=True, cache=True)
+def patch_statistics(grey: Any, inside: Any, v: int, u: int, pattern: Any, weight: Any, moment: Any) -> Any:
     """Fill `weight` (s,), summing to 1, and `moment` (s,) = weight (g − mean)/deviation of the patch at (v, u); return its variance.
 
-    `grey` and `inside` (h + 2 RADIUS, w + 2 RADIUS) are 8-bit with a border, `inside` zero where there is nothing to match, and
-    there the weights are zero; `pattern` is the tuple of a `Pattern`'s arrays.
+    `grey` and `inside` (h + 2 RADIUS, w + 2 RADIUS) are 8-bit with a border; weights are zero where `inside`, the mask, is zero.
+    `pattern` is `SamplingPattern.arrays`.
     """
-    du, dv, near, alike = pattern
+    du, dv, spatial_weight, range_weight = pattern
     here = np.int64(grey[v + RADIUS, u + RADIUS])
     total = np.float32(0)
     mean = np.float32(0)
     for i in range(du.shape[0]):
         y, x = np.uint64(v + RADIUS + np.int64(dv[i])), np.uint64(u + RADIUS + np.int64(du[i]))
         g = np.int64(grey[y, x])
-        w = near[i] * alike[np.uint64(abs(g - here))] * np.float32(inside[y, x])
+        w = spatial_weight[i] * range_weight[np.uint64(abs(g - here))] * np.float32(inside[y, x])
         weight[i] = w
         moment[i] = np.float32(g)
         total += w
@@ -94,42 +102,43 @@ def describe(grey: Any, inside: Any, v: int, u: int, pattern: Any, weight: Any, 
         gap = moment[i] - mean
         variance += weight[i] * gap * gap
         moment[i] = weight[i] * gap
-    inverse = np.float32(1) / np.sqrt(variance + NOISE)
+    inverse = np.float32(1) / np.sqrt(variance + NOISE_VARIANCE)
     for i in range(du.shape[0]):
         moment[i] *= inverse
     return variance
 
 
-@nb.njit(fastmath=FAST, error_model="numpy", nogil=True, cache=True)
-def match(
+@nb.njit(fastmath=FASTMATH, error_model="numpy", nogil=True, cache=True)
+def ncc_cost(
     j: int, m0: Any, m1: Any, m2: Any, x: Any, y: Any, step_x: Any, step_y: Any, pattern: Any, weight: Any, moment: Any, views: Any,
 ) -> Any:  # fmt: skip
-    """1 − NCC of the described patch at normalised (x, y) against view j through plane m; UNSEEN where the patch leaves the view.
+    """1 − NCC of a patch at normalised (x, y) against source view j under plane m; OUT_OF_VIEW_COST where the patch leaves the view.
 
-    `step_x`, `step_y` are 1/fx, 1/fy of the reference; `views` are lenses (k, 12) with K_j R (row by row) and K_j t, K_j with its
-    principal point less half a pixel; packed photos one after another; their starts (k,); sizes (k, 2) as width, height.
+    `weight` and `moment` come from `patch_statistics`; `step_x`, `step_y` are 1/fx, 1/fy of the reference; `views` is
+    `MatchingViews.sources`: projections (k, 12) with K_j R (row by row) and K_j t, K_j with its principal point less half a pixel;
+    packed photos, concatenated; their start offsets (k,); sizes (k, 2) as width, height.
     """
     du, dv = pattern[0], pattern[1]
-    lenses, packed, starts, sizes = views
-    lens = lenses[j]
+    projections, packed, starts, sizes = views
+    projection = projections[j]
     rho = m0 * x + m1 * y + m2
-    e0 = lens[0] * x + lens[1] * y + lens[2] + lens[9] * rho
-    e1 = lens[3] * x + lens[4] * y + lens[5] + lens[10] * rho
-    e2 = lens[6] * x + lens[7] * y + lens[8] + lens[11] * rho
+    e0 = projection[0] * x + projection[1] * y + projection[2] + projection[9] * rho
+    e1 = projection[3] * x + projection[4] * y + projection[5] + projection[10] * rho
+    e2 = projection[6] * x + projection[7] * y + projection[8] + projection[11] * rho
     if not e2 > np.float32(1e-6):
-        return UNSEEN
+        return OUT_OF_VIEW_COST
     inverse = np.float32(1) / e2
     u, v = e0 * inverse, e1 * inverse
-    gx, gy = lens[6] + lens[11] * m0, lens[7] + lens[11] * m1
-    ux = (lens[0] + lens[9] * m0 - u * gx) * inverse * step_x
-    uy = (lens[1] + lens[9] * m1 - u * gy) * inverse * step_y
-    vx = (lens[3] + lens[10] * m0 - v * gx) * inverse * step_x
-    vy = (lens[4] + lens[10] * m1 - v * gy) * inverse * step_y
+    gx, gy = projection[6] + projection[11] * m0, projection[7] + projection[11] * m1
+    ux = (projection[0] + projection[9] * m0 - u * gx) * inverse * step_x
+    uy = (projection[1] + projection[9] * m1 - u * gy) * inverse * step_y
+    vx = (projection[3] + projection[10] * m0 - v * gx) * inverse * step_x
+    vy = (projection[4] + projection[10] * m1 - v * gy) * inverse * step_y
     reach_u = np.float32(RADIUS) * (abs(ux) + abs(uy))
     reach_v = np.float32(RADIUS) * (abs(vx) + abs(vy))
     width, height = sizes[j, 0], sizes[j, 1]
     if not (u - reach_u >= 0 and v - reach_v >= 0 and u + reach_u < width - 1 and v + reach_v < height - 1):
-        return UNSEEN
+        return OUT_OF_VIEW_COST
     start = starts[j]
     wide = np.float32(width)
     s0, s1, s2 = np.float32(0), np.float32(0), np.float32(0)
@@ -150,4 +159,4 @@ def match(
         s1 += weight[i] * value * value
         s2 += moment[i] * value
     variance = max(s1 - s0 * s0, np.float32(0))
-    return np.float32(1) - s2 / np.sqrt(variance + NOISE)
+    return np.float32(1) - s2 / np.sqrt(variance + NOISE_VARIANCE)

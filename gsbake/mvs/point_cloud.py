@@ -1,4 +1,4 @@
-"""The fused point cloud: oriented, coloured, with pixel size and confidence."""
+"""Fused point cloud: oriented, coloured, with pixel size and confidence."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from gsbake.geometry.ply import read_points, write_points
 
 Array = NDArray[np.float64]
 
-#: One point in the file.
+#: Record of one point in the PLY file.
 RECORD = np.dtype(
     [("position", "<f4", 3), ("normal", "<f4", 3), ("colour", "u1", 3), ("radius", "<f4"), ("confidence", "<f4"), ("views", "u1")]
 )
@@ -22,8 +22,8 @@ RECORD = np.dtype(
 class StereoCloud:
     """Oriented points in the unit frame.
 
-    `points` (n, 3), `normals` (n, 3) unit and outward, `colours` (n, 3) 8-bit sRGB, `radius` (n,) of the pixel that saw the point,
-    `confidence` (n,) in 0..1, `views` (n,) that agreed.
+    `points` (n, 3), `normals` (n, 3) unit and outward, `colours` (n, 3) 8-bit sRGB, `radius` (n,) of the pixel's footprint,
+    `confidence` (n,) in 0..1, number of consistent `views` (n,).
     """
 
     points: Array

@@ -8,20 +8,20 @@ from typing import Any
 
 import numpy as np
 
-from gsbake.capture.hull.thin_parts import find_thin
+from gsbake.capture.hull.thin_parts import find_thin_parts
 from gsbake.capture.hull.visual_hull import Hull, visual_hull
 from gsbake.capture.posed_photos import PosedPhotos
 from gsbake.config.schema import Stereo
 from gsbake.monitor import SILENT, Monitor
 from gsbake.mvs.depth_maps import DepthMap
 from gsbake.mvs.matching import StereoRun
-from gsbake.mvs.outliers import find_ghosts, without_ghosts
+from gsbake.mvs.outliers import find_outliers, remove_outliers
 from gsbake.mvs.point_cloud import StereoCloud
-from gsbake.mvs.pyramids import one_thread
+from gsbake.mvs.pyramids import single_threaded_opencv
 
-#: Fewer or smaller photos than this (pixels) give too few matches to be worth the time.
+#: Minimum number of photos and longer side in pixels; below, matching finds too few depths.
 MIN_PHOTOS, MIN_SIZE = 5, 200
-#: Density of points on parts too thin for the hull: so many over the whole object.
+#: Density of points on thin parts, as a number of points over the whole object.
 THIN_POINTS = 40_000
 
 
@@ -38,7 +38,7 @@ def run_stereo(
     """Match the photos of the folder `poses` and write depth maps and points into the folder `out`; return the figures.
 
     Written: `points.ply` (unit frame), `depth/<name>.npz`, and with masks `hull.npz` and `thin.npz`. Nothing is written where matching is
-    skipped: by the options, or because photos are too few or too small. `scratch` keeps finished planes for a run that is interrupted.
+    skipped: by the options, or because photos are too few or too small. `scratch` keeps finished planes, so an interrupted run resumes.
     """
     options = options or Stereo()
     posed = PosedPhotos.open(poses)
@@ -50,20 +50,20 @@ def run_stereo(
         with tempfile.TemporaryDirectory(prefix="gsbake-stereo-") as folder:
             return run_stereo(poses, out, options, seed=seed, threads=threads, scratch=Path(folder), monitor=monitor)
 
-    def step(done: int, text: str) -> None:
+    def report(done: int, text: str) -> None:
         monitor.check_stop()
         monitor.progress(min(done, len(posed)), len(posed), text)
 
-    with one_thread():
+    with single_threaded_opencv():
         hull = _hull(posed, monitor)
-        run = StereoRun(posed, options, hull, seed, threads, scratch / "planes", step)
+        run = StereoRun(posed, options, hull, seed, threads, scratch / "planes", report)
         with monitor.part("photos"):
             run.prepare()
         with monitor.part("matching"):
             run.match()
-        with monitor.part("confirming"):
-            maps = run.confirm()
-        with monitor.part("fusing"):
+        with monitor.part("consistency"):
+            maps = run.filter_depths()
+        with monitor.part("fusion"):
             cloud, maps = _fuse(run, maps, hull, monitor)
         _carve(run, out, monitor)
     if hull is not None:
@@ -86,7 +86,7 @@ def _skip_reason(posed: PosedPhotos, options: Stereo) -> str | None:
 
 
 def _hull(posed: PosedPhotos, monitor: Monitor) -> Hull | None:
-    """The visual hull, which bounds the depths; None where not all photos have masks or the masks share nothing."""
+    """The visual hull, which bounds the depths; None where a photo has no mask or the hull is empty."""
     hull = None
     if posed.has_masks:
         with monitor.part("hull"):
@@ -98,44 +98,45 @@ def _hull(posed: PosedPhotos, monitor: Monitor) -> Hull | None:
 
 
 def _fuse(run: StereoRun, maps: list[DepthMap], hull: Hull | None, monitor: Monitor) -> tuple[StereoCloud, list[DepthMap]]:
-    """The fused cloud and the depth maps without outlier components."""
-    cloud = run.points(maps)
-    ghosts = find_ghosts(cloud, hull)
-    if not ghosts.points:
+    """The fused cloud and the depth maps, without outlier components."""
+    cloud = run.fuse(maps)
+    outliers = find_outliers(cloud, hull)
+    if not outliers.points:
         return cloud, maps
-    monitor.decide("outlier components", f"{ghosts.points} points removed", "too few, or isolated and deep inside the hull: mirror images")
-    return cloud.select(~ghosts.hold(cloud.points)), [without_ghosts(one, ghosts) for one in maps]
+    evidence = "components too small, or isolated and deep inside the hull (mirror images)"
+    monitor.decide("outlier components", f"{outliers.points} points removed", evidence)
+    return cloud.select(~outliers.contains(cloud.points)), [remove_outliers(one, outliers) for one in maps]
 
 
 def _carve(run: StereoRun, out: Path, monitor: Monitor) -> None:
     """Carve the hull where photos see through it, and write it."""
     with monitor.part("carving"):
-        opened = run.opened()
-    if opened is None:
+        carved = run.carved_hull()
+    if carved is None:
         return
-    opened.hull.save(out / "hull.npz")
+    carved.hull.save(out / "hull.npz")
     monitor.decide(
         "visual hull carving",
-        f"{opened.made} regions carved",
-        f"photos see through {100 * opened.share:.1f} % of the cells onto a surface behind; rejected: "
-        f"{opened.refused} regions without a surface behind, {opened.holed} that would open silhouettes",
+        f"{carved.carved_regions} regions carved",
+        f"{100 * carved.share:.1f} % of the cells are free space before a surface; rejected: {carved.unsupported_regions} regions "
+        f"without a surface behind, {carved.silhouette_violations} that violate silhouettes",
     )
 
 
 def _thin_parts(posed: PosedPhotos, hull: Hull, out: Path, seed: int, monitor: Monitor) -> None:
     """Find parts thinner than a cell of the hull and write points on them."""
     with monitor.part("thin parts"):
-        slight = find_thin(posed, hull, THIN_POINTS, seed)
-    found = f"{len(slight.points)} points" if len(slight.points) else "none"
-    monitor.decide("thin parts", found, f"{100 * slight.share:.1f} % of the masks is narrower than a cell of the hull")
-    slight.save(out / "thin.npz")
+        thin = find_thin_parts(posed, hull, THIN_POINTS, seed)
+    found = f"{len(thin.points)} points" if len(thin.points) else "none"
+    monitor.decide("thin parts", found, f"{100 * thin.share:.1f} % of the masks is narrower than a cell of the hull")
+    thin.save(out / "thin.npz")
 
 
 def _figures(run: StereoRun, maps: list[DepthMap], cloud: StereoCloud, options: Stereo, monitor: Monitor) -> dict[str, Any]:
-    """What the manifest keeps."""
-    inside = sum(int(sizes[-1].inside.sum()) for sizes in run.photos)
+    """The figures for the manifest."""
+    inside = sum(int(sizes[-1].inside.sum()) for sizes in run.pyramids)
     confirmed = sum(int((one.confidence > 0).sum()) for one in maps) / max(inside, 1)
-    unmatched = sum(not n for n in run.matched)
+    unmatched = sum(not n for n in run.sources)
     views = options.min_consistent_views
     evidence = f"{100 * confirmed:.0f} % of the object's pixels are confirmed by {views} or more other photos"
     monitor.decide("geometric consistency", f"{len(cloud)} points", evidence)
@@ -146,6 +147,6 @@ def _figures(run: StereoRun, maps: list[DepthMap], cloud: StereoCloud, options: 
         "confirmed_share": confirmed,
         "pixels": inside,
         "unmatched_photos": unmatched,
-        "neighbours": float(np.mean([len(n) for n in run.matched])),
+        "neighbours": float(np.mean([len(n) for n in run.sources])),
         "median_views": float(np.median(cloud.views)) if len(cloud) else 0.0,
     }

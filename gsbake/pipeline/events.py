@@ -25,7 +25,7 @@ class EventLog:
 
     def write(self, event: str, **fields: Any) -> None:
         """Append one event. Write errors are ignored, so that logging cannot end a run."""
-        line = json.dumps({"time": now(), "run": self.run, "event": event, **fields}, ensure_ascii=False, default=str) + "\n"
+        line = json.dumps({"time": now(), "run": self.run, "event": event, **fields}, default=str) + "\n"
         with suppress(OSError):
             handle = os.open(self.path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o666)
             try:

@@ -143,7 +143,7 @@ class Store:
         sizes = {name: (temporary / name).stat().st_size for name in names}
         body = {**manifest, "digest": tree_digest(files), "files": {n: {"digest": files[n], "bytes": sizes[n]} for n in names}}
         body["seal"] = _seal(body)
-        write_atomic(temporary / MANIFEST, json.dumps(body, indent=1, ensure_ascii=False), durable=True)
+        write_atomic(temporary / MANIFEST, json.dumps(body, indent=1), durable=True)
         sync(temporary)
         if final.exists():  # a damaged artifact, or one of other schema defaults
             old = final.with_name(f"{final.name}.tmp-{uuid.uuid4().hex[:8]}")

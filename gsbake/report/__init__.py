@@ -1,1 +1,1 @@
-"""The report and the renderer behind its figures."""
+"""HTML report of a run, and the renderer that compares the asset with the photos."""

@@ -1,4 +1,4 @@
-"""The exported GLB, opened for drawing: glTF's conventions undone (sRGB base colour, packed channels, coded normals, factors)."""
+"""GLB reader for rendering: linear base colour, unpacked channels, decoded normals, factors applied."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from gsbake.gltf.read import GltfAsset, read_glb
 from gsbake.imaging.srgb import decode
 from gsbake.report.render import Asset, Floats
 
-#: glTF's sampler value for clamping to the edge.
-CLAMP = 33071
+#: Sampler wrap mode CLAMP_TO_EDGE of glTF (an OpenGL constant).
+CLAMP_TO_EDGE = 33071
 
 
 def open_asset(path: Path, unlit: bool = False) -> Asset:
-    """Read the GLB at `path`; `unlit` when its base colour holds the photographed light. Raises BadInputError when it cannot be drawn."""
+    """Read the GLB at `path`. `unlit`: its base colour contains the shading of the photos. Raises BadInputError for an invalid GLB."""
     return from_gltf(read_glb(path), unlit, str(path))
 
 
 def from_gltf(file: GltfAsset, unlit: bool, name: str) -> Asset:
-    """The drawable asset of a GLB; occlusion is 1 where the material names no occlusion texture, a missing image is its factor alone."""
+    """Asset of a parsed GLB; ambient occlusion is 1 without an occlusion texture, a missing texture is replaced by its factor."""
     missing = [k for k in ("POSITION", "NORMAL", "TEXCOORD_0") if k not in file.attributes]
     if missing:
         raise BadInputError(f"{name} lacks the vertex attributes {', '.join(missing)}; export it again.")
@@ -40,8 +40,8 @@ def from_gltf(file: GltfAsset, unlit: bool, name: str) -> Asset:
         orm[..., 0] = 1
     elif occlusion.shape == orm.shape:
         orm[..., 0] = occlusion[..., 0].astype(np.float32) / 255
-    coded, glow = file.image("normal"), file.image("emissive")
-    strength = np.array(material.get("emissiveFactor", (0, 0, 0)), np.float32)
+    normal, emissive = file.image("normal"), file.image("emissive")
+    emissive_factor = np.array(material.get("emissiveFactor", (0, 0, 0)), np.float32)
     samplers = file.document.get("samplers") or [{}]
     return Asset(
         position=file.attributes["POSITION"].astype(np.float64),
@@ -51,8 +51,8 @@ def from_gltf(file: GltfAsset, unlit: bool, name: str) -> Asset:
         faces=file.faces.astype(np.int32),
         base_color=base,
         orm=orm,
-        normal_map=None if coded is None else coded.astype(np.float32) / np.float32(127.5) - 1,
-        emissive=None if glow is None else decode(glow.astype(np.float32) / 255) * strength,
+        normal_map=None if normal is None else normal.astype(np.float32) / np.float32(127.5) - 1,
+        emissive=None if emissive is None else decode(emissive.astype(np.float32) / 255) * emissive_factor,
         unlit=unlit,
-        wrap=samplers[0].get("wrapS") != CLAMP,
+        wrap=samplers[0].get("wrapS") != CLAMP_TO_EDGE,
     )

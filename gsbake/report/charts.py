@@ -1,4 +1,4 @@
-"""The report's charts as inline SVG: bars of stage times and memory, and training curves. Colours come from the page's CSS variables."""
+"""Inline SVG charts of the report: bars of stage times and memory, and training curves. Colours are CSS variables of the page."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from html import escape
 
 from gsbake.text import duration
 
-#: Points per curve in the page; more cannot be seen.
-CURVE_POINTS = 240
+#: Maximum points per curve; about one per two pixels.
+MAX_CURVE_POINTS = 240
 
 
 @dataclass(frozen=True)
 class Bar:
-    """One row of a bar chart: name, value, the value as text, and the segments it is made of as (name, value)."""
+    """One row of a bar chart: name, value, label, and segments as (name, value)."""
 
     name: str
     value: float
@@ -24,7 +24,7 @@ class Bar:
 
 
 def bars(rows: Sequence[Bar], label: str) -> str:
-    """Horizontal bars, one row each, drawn to one scale; segments of a bar are shaded apart and named in tooltips."""
+    """Horizontal bars on a common scale; segments alternate in colour and are named in tooltips."""
     line, left, width = 30, 92, 640
     room = width - left - 96
     longest = max((row.value for row in rows), default=0) or 1.0
@@ -50,7 +50,7 @@ def bars(rows: Sequence[Bar], label: str) -> str:
 
 @dataclass(frozen=True)
 class Curve:
-    """One named line: x and y of equal length; points that are not finite are left out."""
+    """One named line: x and y of equal length; points that are not finite are skipped."""
 
     name: str
     x: Sequence[float]
@@ -58,7 +58,7 @@ class Curve:
 
 
 def ticks(low: float, high: float, count: int = 4) -> list[float]:
-    """Round numbers (1, 2 or 5 times a power of ten apart) within low..high, about `count` of them."""
+    """About `count` multiples of 1, 2 or 5 times a power of ten within low..high."""
     if not (math.isfinite(low) and math.isfinite(high)) or high <= low:
         return [low]
     rough = (high - low) / count
@@ -69,7 +69,7 @@ def ticks(low: float, high: float, count: int = 4) -> list[float]:
 
 
 def log_ticks(low: float, high: float, most: int = 6) -> list[float]:
-    """Values of 1, 2 and 5 times powers of ten within low..high (both above 0); powers of ten alone where that makes more than `most`."""
+    """1, 2 and 5 times powers of ten within low..high (both above 0); fewer factors where these are more than `most`."""
     powers = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
     for factors in ((1, 2, 5), (1, 3), (1,)):
         found = [m * 10.0**k for k in powers for m in factors if low <= m * 10.0**k <= high]
@@ -78,19 +78,19 @@ def log_ticks(low: float, high: float, most: int = 6) -> list[float]:
     return found
 
 
-def _thin(curve: Curve, log: bool) -> list[tuple[float, float]]:
-    """The curve's finite points, averaged over neighbours down to CURVE_POINTS."""
+def _downsample(curve: Curve, log: bool) -> list[tuple[float, float]]:
+    """Finite points of the curve, averaged in groups down to MAX_CURVE_POINTS."""
     points = [(x, y) for x, y in zip(curve.x, curve.y, strict=True) if math.isfinite(x) and math.isfinite(y) and (y > 0 or not log)]
-    if len(points) <= CURVE_POINTS:
+    if len(points) <= MAX_CURVE_POINTS:
         return points
-    edges = [round(i * len(points) / CURVE_POINTS) for i in range(CURVE_POINTS + 1)]
+    edges = [round(i * len(points) / MAX_CURVE_POINTS) for i in range(MAX_CURVE_POINTS + 1)]
     groups = [points[a:b] for a, b in zip(edges, edges[1:], strict=False) if b > a]
     return [(sum(p[0] for p in g) / len(g), sum(p[1] for p in g) / len(g)) for g in groups]
 
 
 def lines(curves: Sequence[Curve], title: str, log: bool = False) -> str:
-    """A line chart with a legend; empty text when no curve has two points. `log` draws the values by their logarithm."""
-    kept = [(curve.name, points) for curve in curves if len(points := _thin(curve, log)) >= 2]
+    """A line chart with a legend; an empty string when no curve has two points. `log`: logarithmic y axis."""
+    kept = [(curve.name, points) for curve in curves if len(points := _downsample(curve, log)) >= 2]
     if not kept:
         return ""
     width, height, left, right, top, bottom = 460, 230, 48, 12, 34, 26
@@ -132,7 +132,7 @@ def lines(curves: Sequence[Curve], title: str, log: bool = False) -> str:
 
 
 def labels(values: Sequence[float]) -> list[str]:
-    """Short numbers for an axis, with as many digits as it takes to tell them apart."""
+    """Axis labels with the fewest digits that distinguish the values."""
     for digits in range(3, 9):
         out = [number(value, digits) for value in values]
         if len(set(out)) == len(set(values)):
@@ -141,7 +141,7 @@ def labels(values: Sequence[float]) -> list[str]:
 
 
 def number(value: float, digits: int = 3) -> str:
-    """A short number for an axis: 0, 0.25, 12, 3k, 1e-4; `digits` significant ones where it is no power of ten."""
+    """Axis label of a number: 0, 0.25, 12, 3k, 1e-4, with `digits` significant digits."""
     if value == 0 or abs(value) < 1e-12:
         return "0"
     if abs(value) >= 1e6:

@@ -1,6 +1,6 @@
-"""The report as one HTML file that opens offline: page contents as plain data, images and model inlined, filled into a Jinja template.
+"""HTML page of the report: plain data filled into a Jinja template, as one file that opens offline.
 
-Style, script and the 3D viewer (vendored, see `vendor/`) are inlined too; nothing is fetched. Text is escaped by the template engine.
+Images, model, style, script and the 3D viewer (vendored, see `vendor/`) are inlined; nothing is fetched. Jinja escapes all text.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ class Figure:
 
 
 @dataclass(frozen=True)
-class Warned:
+class StageWarning:
     """A warning of a stage."""
 
     stage: str
@@ -35,7 +35,7 @@ class Warned:
 
 @dataclass(frozen=True)
 class Comparison:
-    """Photo and render of one view as data addresses, with their likeness."""
+    """Photo and render of one view as data URIs, with PSNR (dB) and SSIM."""
 
     name: str
     photo: str
@@ -47,7 +47,7 @@ class Comparison:
 
 @dataclass(frozen=True)
 class Panel:
-    """An image (data address) with title and caption."""
+    """An image (data URI) with title and caption."""
 
     title: str
     caption: str
@@ -56,7 +56,7 @@ class Panel:
 
 @dataclass(frozen=True)
 class Light:
-    """A light for the 3D view: its name and a base64 Radiance HDR picture."""
+    """Environment map of the 3D view: name and Radiance HDR file in base64."""
 
     name: str
     hdr: str
@@ -64,7 +64,7 @@ class Light:
 
 @dataclass(frozen=True)
 class Check:
-    """A line of the audit; `state` is pass, warn, fail or info."""
+    """One rule of the audit; `state` is pass, warn, fail or info."""
 
     rule: str
     state: str
@@ -73,7 +73,7 @@ class Check:
 
 @dataclass(frozen=True)
 class Decision:
-    """A choice that a stage took from evidence."""
+    """A decision of a stage and its evidence."""
 
     stage: str
     what: str
@@ -82,8 +82,8 @@ class Decision:
 
 
 @dataclass(frozen=True)
-class LeftOut:
-    """A rule on work that a scene may not need: the setting's name, who decided what and why, and the time saved where it is known."""
+class SkipDecision:
+    """Decision on a rule of [skip]: setting, stage, choice, evidence, and the time saved where it is known."""
 
     rule: str
     stage: str
@@ -94,7 +94,7 @@ class LeftOut:
 
 @dataclass(frozen=True)
 class StageRow:
-    """What the manifest of a stage says, as (heading, rows of key and value)."""
+    """Manifest of a stage as tables (heading, rows of key and value)."""
 
     title: str
     summary: str
@@ -103,12 +103,12 @@ class StageRow:
 
 @dataclass(frozen=True)
 class Page:
-    """Everything on the page. Charts are SVG from `gsbake.report.charts`; `model` is the GLB in base64, or empty for no 3D view."""
+    """Contents of the page. Charts are SVG from `gsbake.report.charts`; `model` is the GLB in base64, empty for no 3D view."""
 
     title: str
     lead: str
     figures: tuple[Figure, ...]
-    warnings: tuple[Warned, ...]
+    warnings: tuple[StageWarning, ...]
     model: str
     lights: tuple[Light, ...]
     comparisons: tuple[Comparison, ...]
@@ -121,7 +121,7 @@ class Page:
     audit: tuple[Check, ...]
     curves: tuple[str, ...]
     curves_note: str
-    left_out: tuple[LeftOut, ...]
+    skip_decisions: tuple[SkipDecision, ...]
     decisions: tuple[Decision, ...]
     stages: tuple[StageRow, ...]
     time_chart: str
@@ -130,8 +130,8 @@ class Page:
     footer: str
 
 
-def picture_uri(rgb: NDArray[np.floating], alpha: NDArray[np.floating] | None = None, quality: int = 88) -> str:
-    """Data address of an sRGB picture (h, w, 3) in 0..1 as JPEG, or as WebP with `alpha` (h, w)."""
+def image_uri(rgb: NDArray[np.floating], alpha: NDArray[np.floating] | None = None, quality: int = 88) -> str:
+    """Data URI of an sRGB image (h, w, 3) in 0..1: JPEG, or WebP with `alpha` (h, w)."""
     bgr = np.round(255 * np.clip(rgb[..., ::-1], 0, 1)).astype(np.uint8)
     if alpha is None:
         return _uri(bgr, ".jpg", "image/jpeg", [cv2.IMWRITE_JPEG_QUALITY, quality, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, 0x111111])
@@ -142,25 +142,25 @@ def picture_uri(rgb: NDArray[np.floating], alpha: NDArray[np.floating] | None = 
 def _uri(image: NDArray[np.uint8], ending: str, kind: str, options: list[int]) -> str:
     done, data = cv2.imencode(ending, image, options)
     if not done:
-        raise RuntimeError(f"could not encode a picture of shape {image.shape} as {kind}")
+        raise RuntimeError(f"could not encode an image of shape {image.shape} as {kind}")
     return f"data:{kind};base64," + base64.b64encode(data.tobytes()).decode()
 
 
 def hdr_base64(radiance: NDArray[np.floating]) -> str:
-    """An equirectangular map (h, w, 3) as a Radiance HDR file in base64."""
+    """Equirectangular radiance map (h, w, 3) as a Radiance HDR file in base64."""
     done, data = cv2.imencode(".hdr", np.ascontiguousarray(radiance[..., ::-1], np.float32))
     if not done:
-        raise RuntimeError(f"could not encode a light of shape {radiance.shape} as HDR")
+        raise RuntimeError(f"could not encode an environment map of shape {radiance.shape} as HDR")
     return base64.b64encode(data.tobytes()).decode()
 
 
 def inline_script(text: str) -> Markup:
-    """Script text that can stand inside a script element: what would end or nest the element is written with an escape."""
+    """Script text for a script element: sequences that would close or nest the element are escaped."""
     return Markup(text.replace("<!--", "<\\!--").replace("</script", "<\\/script"))
 
 
 def render_page(page: Page) -> str:
-    """The HTML text of the page."""
+    """HTML of the page."""
     here = resources.files("gsbake.report")
 
     def text(name: str) -> str:

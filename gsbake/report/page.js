@@ -40,7 +40,7 @@
         return;
       }
       if (!urls.has(id)) urls.set(id, URL.createObjectURL(new Blob([bytes(document.getElementById(id).textContent)])));
-      // The viewer tells the format by the address's ending; a fragment does not change what is loaded.
+      // The viewer determines the format from the URL's extension; a fragment does not change the loaded file.
       viewer.environmentImage = `${urls.get(id)}#light.hdr`;
     });
   }

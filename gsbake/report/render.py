@@ -1,9 +1,9 @@
-"""A small ray-traced renderer of the finished asset: what a glTF viewer shows, from any camera, with an alpha channel.
+"""Ray-casting renderer of the finished asset with an alpha channel, after the rules of glTF 2.0.
 
-Primary rays hit the triangles (Embree); at each hit the textures are read bilinearly as glTF 2.0 says: base colour as sRGB, decoded before
-filtering; occlusion, roughness and metallic from R, G, B of one linear image; the normal map in the frame (tangent, w · n × t, normal) of
-the interpolated vertex vectors. Samples are shaded one by one, then averaged in linear light over each pixel, so edges are smooth.
-A texture that is finer than the picture's samples is halved (area filter) until it is not, which stands in for mip maps.
+Primary rays hit the triangles (Embree); at each hit the textures are sampled bilinearly: base colour as sRGB, decoded before filtering;
+occlusion, roughness and metallic from R, G, B of one linear image; the normal map in the frame (tangent, w · n × t, normal) of the
+interpolated vertex vectors. Samples are shaded one by one and averaged in linear radiance over each pixel (anti-aliasing). One mip level
+per image (area filter) matches texel and sample footprints.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ Floats = NDArray[np.float32]
 
 @dataclass(frozen=True, eq=False)
 class Asset:
-    """A textured mesh ready to be drawn, in one frame (the glTF asset's own when it was read from a GLB).
+    """A textured mesh in one frame (the glTF asset's when read from a GLB).
 
     `position`, `normal` (v, 3); `tangent` (v, 4) or None; `uv` (v, 2) with the origin top left; `faces` (f, 3). `base_color` (h, w, 3)
     linear, `orm` (h, w, 3) linear occlusion, roughness, metallic, `normal_map` (h, w, 3) vectors in -1..1, `emissive` (h, w, 3) linear
     radiance; the last three may be None.
-    `unlit`: the base colour is the picture, no light falls on it. `wrap`: textures repeat beyond 0..1, else their edge goes on.
+    `unlit`: the base colour is the outgoing radiance. `wrap`: textures repeat beyond 0..1, else they are clamped to the edge.
     """
 
     position: NDArray[np.float64]
@@ -50,7 +50,7 @@ class Asset:
 
     @property
     def centre(self) -> NDArray[np.float64]:
-        """Middle (3,) of the bounding box."""
+        """Centre (3,) of the bounding box."""
         return np.asarray((self.position.min(0) + self.position.max(0)) / 2)
 
     @property
@@ -61,8 +61,8 @@ class Asset:
 
 @dataclass(frozen=True, eq=False)
 class Samples:
-    """What n camera samples on the asset see, in the asset's frame: `position`, unit `normal` and `view` (towards the eye) (n, 3), linear
-    `base_color` (n, 3), `occlusion`, `roughness`, `metallic` (n,), emitted radiance `emissive` (n, 3) if any part is emissive."""
+    """Surface samples of n camera rays in the asset's frame: `position`, unit `normal` and `view` (towards the camera) (n, 3), linear
+    `base_color` (n, 3), `occlusion`, `roughness`, `metallic` (n,), emitted radiance `emissive` (n, 3) or None."""
 
     position: Floats
     normal: Floats
@@ -75,15 +75,15 @@ class Samples:
 
 
 class Shader(Protocol):
-    """Turns samples into the linear radiance (n, 3) they reflect."""
+    """Maps samples to reflected linear radiance (n, 3)."""
 
     def __call__(self, samples: Samples) -> Floats:
-        """Radiance towards the eye (n, 3), linear."""
+        """Linear radiance towards the camera (n, 3)."""
 
 
 @dataclass(frozen=True, eq=False)
-class Picture:
-    """A render: straight linear radiance `linear` (h, w, 3), `alpha` (h, w), and the buffers behind it, averaged over the covered samples:
+class RenderedImage:
+    """A render: linear radiance with straight alpha `linear` (h, w, 3), `alpha` (h, w), and G-buffers averaged over the covered samples:
     `base_color` (h, w, 3) linear, unit `normal` (h, w, 3), `orm` (h, w, 3)."""
 
     linear: Floats
@@ -94,21 +94,21 @@ class Picture:
 
     @property
     def rgb(self) -> Floats:
-        """Straight sRGB (h, w, 3) in 0..1."""
+        """sRGB with straight alpha (h, w, 3) in 0..1."""
         return encode(self.linear)
 
     def over(self, grey: float) -> Floats:
-        """The picture (h, w, 3) over a plain background, mixed in sRGB values as photos with masks are."""
+        """The render (h, w, 3) over a uniform background, composited in sRGB values as photos with masks are."""
         return self.rgb * self.alpha[..., None] + np.float32(grey) * (1 - self.alpha[..., None])
 
 
 def unlit(samples: Samples) -> Floats:
-    """The shader of assets whose base colour already is the picture."""
+    """Shader of assets whose base colour is the outgoing radiance."""
     return samples.base_color
 
 
 class Renderer:
-    """Draws one asset from many cameras; the ray tree and the halved textures are kept."""
+    """Renders one asset from many cameras; the ray tracing structure and the mip levels are cached."""
 
     def __init__(self, asset: Asset, threads: int | None = None) -> None:
         self.asset = asset
@@ -116,29 +116,30 @@ class Renderer:
         corner, uv = asset.position[asset.faces], asset.uv[asset.faces].astype(np.float64)
         area = np.linalg.norm(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=1)
         e1, e2 = uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]
-        # Texture area per unit of surface area, for the choice of the halving.
+        # Texture area (in UV units) per surface area, for the choice of the mip level.
         self._density = float(np.abs(e1[:, 0] * e2[:, 1] - e1[:, 1] * e2[:, 0]).sum() / max(area.sum(), 1e-30))
-        self._level = lru_cache(maxsize=16)(self._halved)
+        self._texture = lru_cache(maxsize=16)(self._mip_level)
 
-    def _halved(self, name: str, level: int) -> Floats | None:
+    def _mip_level(self, name: str, level: int) -> Floats | None:
+        """Texture `name` downsampled by 2**level, or None when the asset has no such texture."""
         image: Floats | None = getattr(self.asset, name)
         if image is None or level == 0:
             return image
         size = (max(1, image.shape[1] >> level), max(1, image.shape[0] >> level))
         return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.float32)
 
-    def _read(self, name: str, level: int, uv: Floats) -> Floats | None:
+    def _sample_texture(self, name: str, level: int, uv: Floats) -> Floats | None:
         """Texture values (n, 3) at uv (n, 2), or None when the asset has no such texture."""
-        image = self._level(name, level)
+        image = self._texture(name, level)
         if image is None:
             return None
         return bilinear(image, uv, self.asset.wrap)
 
-    def draw(self, camera: Camera, shader: Shader, samples: int = 2) -> Picture:
-        """Render from `camera` (same frame as the asset) with samples² rays a pixel."""
+    def draw(self, camera: Camera, shader: Shader, samples: int = 2) -> RenderedImage:
+        """Render from `camera` (frame of the asset) with samples² rays per pixel."""
         height, width = camera.height, camera.width
         fine = camera.scaled(width * samples, height * samples)
-        inside = self._window(fine)
+        inside = self._screen_bounds(fine)
         rays = fine.rays()[inside]
         shape = rays.shape[:2]
         hits = self._caster.first_hit(fine.centre[None], rays.reshape(-1, 3))
@@ -158,10 +159,10 @@ class Renderer:
         straight = mean / np.maximum(alpha, 1e-6)[..., None]
         normal = straight[..., 7:10]
         length = np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-6)
-        return Picture(straight[..., :3], alpha, straight[..., 4:7], normal / length, straight[..., 10:13])
+        return RenderedImage(straight[..., :3], alpha, straight[..., 4:7], normal / length, straight[..., 10:13])
 
-    def _window(self, camera: Camera) -> tuple[slice, slice]:
-        """Rows and columns that hold the asset's projection; the whole picture when the camera stands within its bounds."""
+    def _screen_bounds(self, camera: Camera) -> tuple[slice, slice]:
+        """Rows and columns of the asset's projection; the whole image when a vertex is behind the camera."""
         pixels, depth = camera.project(self.asset.position)
         if depth.min() <= 0:
             return slice(0, camera.height), slice(0, camera.width)
@@ -173,28 +174,28 @@ class Renderer:
         asset = self.asset
         corners = asset.faces[face]
 
-        def mix(values: Floats) -> Floats:
+        def interpolate(values: Floats) -> Floats:
             return np.einsum("nk,nkc->nc", bary, values[corners]).astype(np.float32)
 
-        uv, normal = mix(asset.uv), unit(mix(asset.normal))
+        uv, normal = interpolate(asset.uv), unit(interpolate(asset.normal))
         view = unit(-rays.astype(np.float32))
-        level = self._choose_level(camera, distance)
-        base = self._read("base_color", level, uv)
-        orm = self._read("orm", level, uv)
-        bent = self._read("normal_map", level, uv)
-        if bent is not None and asset.tangent is not None:
-            tangent = mix(asset.tangent)
+        level = self._select_mip_level(camera, distance)
+        base = self._sample_texture("base_color", level, uv)
+        orm = self._sample_texture("orm", level, uv)
+        local = self._sample_texture("normal_map", level, uv)
+        if local is not None and asset.tangent is not None:
+            tangent = interpolate(asset.tangent)
             sign = np.where(tangent[:, 3:] < 0, np.float32(-1), np.float32(1))
-            across = sign * np.cross(normal, tangent[:, :3])
-            normal = unit(bent[:, :1] * tangent[:, :3] + bent[:, 1:2] * across + bent[:, 2:] * normal)
+            bitangent = sign * np.cross(normal, tangent[:, :3])
+            normal = unit(local[:, :1] * tangent[:, :3] + local[:, 1:2] * bitangent + local[:, 2:] * normal)
         if orm is None:
             orm = np.broadcast_to(np.array([1, 1, 0], np.float32), (len(face), 3))
         assert base is not None
-        position, emissive = mix(asset.position.astype(np.float32)), self._read("emissive", level, uv)
+        position, emissive = interpolate(asset.position.astype(np.float32)), self._sample_texture("emissive", level, uv)
         return Samples(position, normal, view, base, orm[:, 0], orm[:, 1], orm[:, 2], emissive)
 
-    def _choose_level(self, camera: Camera, distance: Floats) -> int:
-        """Halvings after which a texel is about as large as a sample's footprint on the surface."""
+    def _select_mip_level(self, camera: Camera, distance: Floats) -> int:
+        """Mip level at which a texel is about as large as a sample's footprint on the surface."""
         if len(distance) == 0:
             return 0
         height, width = self.asset.base_color.shape[:2]

@@ -1,4 +1,4 @@
-"""The asset's maps as pictures: textures, their channels, and the UV sheet with its charts."""
+"""Images of the asset's textures, their channels, and the UV atlas with its charts."""
 
 from __future__ import annotations
 
@@ -10,15 +10,16 @@ import scipy.sparse
 from numpy.typing import NDArray
 
 from gsbake.imaging.srgb import encode
-from gsbake.report.html import Panel, picture_uri
+from gsbake.report.html import Panel, image_uri
 from gsbake.report.render import Asset, Floats
+from gsbake.text import number
 
-#: Longer side of a map in the page.
-SHOWN = 768
+#: Longer side of a map in the page in pixels.
+MAX_MAP_SIZE = 768
 
 
-def shrink(image: Floats, longest: int = SHOWN) -> Floats:
-    """The picture at most `longest` wide and high (area filter)."""
+def downsample(image: Floats, longest: int = MAX_MAP_SIZE) -> Floats:
+    """The image, at most `longest` pixels wide and high (area filter)."""
     height, width = image.shape[:2]
     if max(height, width) <= longest:
         return image
@@ -27,8 +28,8 @@ def shrink(image: Floats, longest: int = SHOWN) -> Floats:
     return np.asarray(small, np.float32)
 
 
-def chart_of_faces(faces: NDArray[np.int32], vertices: int) -> NDArray[np.int32]:
-    """Chart number (f,) of each face: faces that share vertices of the atlas are one chart."""
+def face_charts(faces: NDArray[np.int32], vertices: int) -> NDArray[np.int32]:
+    """Chart index (f,) of each face: connected components over shared vertices of the atlas."""
     a, b = faces[:, [0, 1]].ravel(), faces[:, [1, 2]].ravel()
     graph = scipy.sparse.coo_matrix((np.ones(len(a), np.int8), (a, b)), shape=(vertices, vertices))
     _, label = scipy.sparse.csgraph.connected_components(graph, directed=False)
@@ -36,11 +37,11 @@ def chart_of_faces(faces: NDArray[np.int32], vertices: int) -> NDArray[np.int32]
     return chart.astype(np.int32)
 
 
-def uv_sheet(asset: Asset, edge: int = 1024) -> Floats:
-    """The atlas (edge, edge, 3) in 0..1: every chart in a colour of its own, triangle edges fine, empty space dark."""
-    chart = chart_of_faces(asset.faces, len(asset.uv))
+def uv_atlas_image(asset: Asset, edge: int = 1024) -> Floats:
+    """UV atlas as an image (edge, edge, 3) in 0..1: charts in distinct colours with triangle edges, empty space dark."""
+    chart = face_charts(asset.faces, len(asset.uv))
     sheet = np.full((edge, edge, 3), 34, np.uint8)
-    # Fixed point with 4 fractional bits; OpenCV puts pixel centres at whole numbers.
+    # Fixed point with 4 fractional bits; OpenCV has pixel centres at integers.
     corners = np.round((asset.uv[asset.faces] * edge - 0.5) * 16).astype(np.int32)
     order = np.argsort(chart, kind="stable")
     for part in np.split(order, np.flatnonzero(np.diff(chart[order])) + 1):
@@ -55,27 +56,27 @@ def uv_sheet(asset: Asset, edge: int = 1024) -> Floats:
 
 
 def map_panels(asset: Asset) -> tuple[Panel, ...]:
-    """Panels of the asset's maps; channels that the asset lacks are left out."""
+    """Panels of the asset's textures; missing ones are skipped."""
 
     def panel(title: str, caption: str, image: Floats) -> Panel:
-        return Panel(title, caption, picture_uri(shrink(image)))
+        return Panel(title, caption, image_uri(downsample(image)))
 
     def grey(channel: Floats) -> Floats:
         return np.repeat(channel[..., None], 3, axis=2)
 
     height, width = asset.base_color.shape[:2]
-    kind = "as photographed" if asset.unlit else "no light in it"
+    kind = "with the shading of the photos" if asset.unlit else "without shading"
     out = [panel("Base colour", f"{width} × {height}, {kind}", encode(asset.base_color))]
     if asset.normal_map is not None:
         out.append(panel("Normal", "tangent space, +Y up", 0.5 + 0.5 * asset.normal_map))
     if asset.orm is not None:
-        names = (("Occlusion", "white = open"), ("Roughness", "white = rough"), ("Metallic", "white = metal"))
+        names = (("Ambient occlusion", "white = unoccluded"), ("Roughness", "white = rough"), ("Metallic", "white = metal"))
         for k, (title, caption) in enumerate(names):
             low, high = float(asset.orm[..., k].min()), float(asset.orm[..., k].max())
-            span = f"{low:.2f} everywhere" if high - low < 0.004 else f"{caption}, {low:.2f}–{high:.2f}"
+            span = f"constant {low:.2f}" if high - low < 0.004 else f"{caption}, {low:.2f}–{high:.2f}"
             out.append(panel(title, span, grey(asset.orm[..., k])))
     if asset.emissive is not None:
-        out.append(panel("Emission", "light of its own", encode(asset.emissive)))
-    charts = int(chart_of_faces(asset.faces, len(asset.uv)).max()) + 1 if len(asset.faces) else 0
-    out.append(panel("UV sheet", f"{charts} charts, {len(asset.faces)} triangles", uv_sheet(asset)))
+        out.append(panel("Emission", "emitted radiance", encode(asset.emissive)))
+    charts = int(face_charts(asset.faces, len(asset.uv)).max()) + 1 if len(asset.faces) else 0
+    out.append(panel("UV atlas", f"{charts} charts, {number(len(asset.faces))} triangles", uv_atlas_image(asset)))
     return tuple(out)

@@ -1,4 +1,4 @@
-"""From a finished run to its report: one HTML page that opens offline, and its figures as JSON."""
+"""Report of a finished run: one HTML page that opens offline, and its figures as JSON."""
 
 from __future__ import annotations
 
@@ -16,13 +16,14 @@ from gsbake.errors import BadInputError
 from gsbake.monitor import SILENT, Monitor
 from gsbake.report import compose, manifests
 from gsbake.report.asset import open_asset
-from gsbake.report.html import Page, render_page
-from gsbake.report.quality import asset_cameras, chosen_views
+from gsbake.report.html import Light, Page, Panel, render_page
+from gsbake.report.quality import asset_cameras, select_views
 from gsbake.report.render import Asset, Renderer, Shader, unlit
 from gsbake.report.sheets import map_panels
 from gsbake.surfels.training.views import held_out
+from gsbake.text import number
 
-#: Photos compared at most; more would not change the mean.
+#: Maximum number of compared photos; more hardly change the mean.
 MAX_COMPARED = 24
 
 
@@ -39,15 +40,28 @@ def write_report(
 ) -> dict[str, Any]:
     """Write `report.html` and `report.json` into the folder `out` and return the figures.
 
-    `folders` maps the names of the stages before (ingest to export) to their folders with manifests. Raises BadInputError when the asset's
-    cameras are not those of the photos.
+    `folders` maps the stages ingest to export to their folders with manifests. Raises BadInputError when the number of the asset's cameras
+    differs from the number of photos.
     """
-    return _Reporting(folders, out, options or ReportOptions(), threads, monitor).run()
+    return _ReportWriter(folders, out, options or ReportOptions(), threads, monitor).run()
+
+
+@dataclass(frozen=True)
+class _Renders:
+    """The asset, and its renders: metrics per compared photo, panels under other environments, and these environments."""
+
+    asset: Asset
+    posed: PosedPhotos
+    scored: list[compose.ViewScore]
+    held_out: bool
+    lit: bool
+    relit: tuple[Panel, ...]
+    lights: tuple[Light, ...]
 
 
 @dataclass
-class _Reporting:
-    """One run."""
+class _ReportWriter:
+    """One run of the report."""
 
     folders: Mapping[str, Path]
     out: Path
@@ -55,14 +69,28 @@ class _Reporting:
     threads: int
     monitor: Monitor
 
+    def __post_init__(self) -> None:
+        self.manifests = manifests.load_manifests(self.folders)
+        self.glb = self.folders["export"] / "asset.glb"
+
     def run(self) -> dict[str, Any]:
-        """The recipe."""
+        """Render, compare and write the page; returns the figures."""
+        renders = self._render()
+        with self.monitor.part("page"):
+            figures = self._figures(renders)
+            text = render_page(self._page(renders))
+            views = [{"name": s.name, "psnr": s.metrics.psnr, "ssim": s.metrics.ssim} for s in renders.scored]
+            (self.out / "report.html").write_text(text, encoding="utf-8")
+            (self.out / "report.json").write_text(json.dumps(figures | {"views": views}, indent=1))
+        return figures | {"page_bytes": len(text)}
+
+    def _render(self) -> _Renders:
+        """Render the asset from the cameras of photos and under other environments."""
         settings, monitor = self.options.report, self.monitor
-        said = manifests.load_manifests(self.folders)
-        glb, light = self.folders["export"] / "asset.glb", self.folders["bake"] / "light.safetensors"
+        light = self.folders["bake"] / "light.safetensors"
         posed = PosedPhotos.open(self.folders["poses"], self.folders["refine"])
         with monitor.part("open"):
-            asset = open_asset(glb, unlit=not light.exists())
+            asset = open_asset(self.glb, unlit=not light.exists())
             cameras = asset_cameras(self.folders["export"] / "cameras.json")
             if len(cameras) != len(posed):
                 raise BadInputError(
@@ -75,99 +103,94 @@ class _Reporting:
         shader: Shader = learnt or unlit
         monitor.check_stop()
         with monitor.part("compare"):
-            indices, held = chosen_views(len(posed), held_out(len(posed), self.options.holdout), MAX_COMPARED)
-            scored = compose.score(
+            indices, held = select_views(len(posed), held_out(len(posed), self.options.holdout), MAX_COMPARED)
+            scored = compose.score_views(
                 renderer, shader, posed, cameras, indices, held, settings.view_size, lambda k, n: monitor.progress(k, 2 * n, "comparison")
             )
-            shown, _ = chosen_views(len(scored), [], settings.views)
         monitor.check_stop()
         with monitor.part("relight"):
             directions = compose.viewpoints(asset, cameras, 2 if learnt else 3)
             relit, lights = compose.relit_panels(
                 renderer, learnt, directions, settings.view_size, lambda k, n: monitor.progress(n + k, 2 * n, "relighting")
             )
-        with monitor.part("page"):
-            figures = self._figures(asset, scored, held, glb.stat().st_size, said)
-            page = self._page(said, asset, posed, scored, [scored[i] for i in shown], held, bool(learnt), glb, lights, relit)
-            text = render_page(page)
-            views = [{"name": s.name, "psnr": s.likeness.psnr, "ssim": s.likeness.ssim} for s in scored]
-            (self.out / "report.html").write_text(text, encoding="utf-8")
-            (self.out / "report.json").write_text(json.dumps(figures | {"views": views}, indent=1))
-        return figures | {"page_bytes": len(text)}
+        return _Renders(asset, posed, scored, held, learnt is not None, relit, lights)
 
-    def _figures(
-        self, asset: Asset, scored: list[compose.Scored], held: bool, size: int, said: Mapping[str, Mapping[str, Any]]
-    ) -> dict[str, Any]:
+    def _figures(self, renders: _Renders) -> dict[str, Any]:
         """The figures of `report.json`."""
         return {
-            "psnr": compose.mean([s.likeness.psnr for s in scored]),
-            "ssim": compose.mean([s.likeness.ssim for s in scored]),
-            "held_out": held,
-            "compared": len(scored),
-            "triangles": len(asset.faces),
-            "texture": max(asset.base_color.shape[:2]),
-            "bytes": size,
-            "seconds": manifests.total_seconds(said),
-            "peak_bytes": manifests.peak(said)[0],
+            "psnr": compose.mean([s.metrics.psnr for s in renders.scored]),
+            "ssim": compose.mean([s.metrics.ssim for s in renders.scored]),
+            "held_out": renders.held_out,
+            "compared": len(renders.scored),
+            "triangles": len(renders.asset.faces),
+            "texture": max(renders.asset.base_color.shape[:2]),
+            "bytes": self.glb.stat().st_size,
+            "seconds": manifests.total_seconds(self.manifests),
+            "peak_bytes": manifests.peak(self.manifests)[0],
         }
 
-    def _page(
-        self, said: Mapping[str, Mapping[str, Any]], asset: Asset, posed: PosedPhotos, scored: list[compose.Scored],
-        shown: list[compose.Scored], held: bool, lit: bool, glb: Path, lights: Any, relit: Any,
-    ) -> Page:  # fmt: skip
+    def _page(self, renders: _Renders) -> Page:
         """The contents of the page."""
+        found, lit, posed, scored = self.manifests, renders.lit, renders.posed, renders.scored
+        shown, _ = select_views(len(scored), [], self.options.report.views)
         logs = {name: manifests.read_log(self.folders[name] / "log.csv") for name in ("train", "refine")}
         count = len(json.loads((self.folders["ingest"] / "photos.json").read_text(encoding="utf-8"))["photos"])
         refined = (self.folders["refine"] / "cameras.json").exists()
         return Page(
-            title=manifests.capture_name(said),
-            lead=_lead(count, _kind(lit, said), posed.cameras.poses),
-            figures=compose.headline(said, asset, glb.stat().st_size, scored, (len(posed), count)),
-            warnings=manifests.warnings(said),
-            model=base64.b64encode(glb.read_bytes()).decode(),
-            lights=lights,
-            comparisons=compose.comparisons(shown),
-            comparison_note=_comparison_note(held, posed.has_masks, lit, refined),
-            relit_title="Under other light" if lit else "From other sides",
-            relit=relit,
-            relit_note="The learnt light is the one in the photos; studio and sunset lit none of them."
+            title=manifests.capture_name(found),
+            lead=_lead(count, _kind(lit, found), posed.cameras.poses),
+            figures=compose.headline(found, renders.asset, self.glb.stat().st_size, scored, (len(posed), count)),
+            warnings=manifests.warnings(found),
+            model=base64.b64encode(self.glb.read_bytes()).decode(),
+            lights=renders.lights,
+            comparisons=compose.comparisons([scored[i] for i in shown]),
+            comparison_note=_comparison_note(renders.held_out, posed.has_masks, lit, refined),
+            relit_title="Under other environments" if lit else "Other views",
+            relit=renders.relit,
+            relit_note="The learnt environment map is that of the photos; studio and sunset are procedural."
             if lit
-            else "The base colour contains the light of the photos, as this profile asks; it is shown without any other light.",
-            maps=map_panels(asset),
-            maps_note="The textures inside the GLB, reduced for this page; click to enlarge.",
+            else "The base colour contains the shading of the photos, as this profile sets; it is shown unlit.",
+            maps=map_panels(renders.asset),
+            maps_note="The textures of the GLB, downsampled for this page; click to enlarge.",
             audit=manifests.audit_rows(self.folders["export"] / "audit.json"),
             curves=manifests.training_charts(logs),
             curves_note="",
-            left_out=manifests.left_out(said),
-            decisions=manifests.decisions(said),
-            stages=manifests.stage_rows(said),
-            time_chart=manifests.time_chart(said),
-            memory_chart=manifests.memory_chart(said),
-            run_note=manifests.run_note(said),
+            skip_decisions=manifests.skip_decisions(found),
+            decisions=manifests.decisions(found),
+            stages=manifests.stage_rows(found),
+            time_chart=manifests.time_chart(found),
+            memory_chart=manifests.memory_chart(found),
+            run_note=manifests.run_note(found),
             footer=f"gsbake {__version__}.",
         )
 
 
-def _kind(lit: bool, said: Mapping[str, Mapping[str, Any]]) -> str:
-    """What the asset's colours are."""
+def _kind(lit: bool, found: manifests.Manifests) -> str:
+    """What the asset's colours contain."""
     if not lit:
-        return "colour as photographed"
-    if said["bake"].get("settings", {}).get("bake.materials") == "delight":
-        return "diffuse colour, without the shading of the photos' light"
-    return "base colour, roughness and metallic fitted together with the light"
+        return "colour with the shading of the photos"
+    if found["bake"].get("settings", {}).get("bake.materials") == "delight":
+        return "diffuse colour without shading"
+    return "base colour, roughness and metallic fitted together with the environment map"
 
 
 def _lead(photos: int, kind: str, poses: str) -> str:
     """The line below the title."""
-    found = "poses given" if poses == "given" else "poses solved from the photos"
-    return f"{photos} photos, {found}; {kind}."
+    source = "poses given" if poses == "given" else "poses from structure from motion"
+    return f"{number(photos)} photos, {source}; {kind}."
 
 
 def _comparison_note(held: bool, masked: bool, lit: bool, refined: bool) -> str:
-    """What is compared, and how."""
-    words = ["The exported GLB drawn from the photos' cameras" + (" under the learnt light." if lit else ", unlit.")]
-    unseen, seen = "Training never saw these photos.", "No photo was held out, so training saw these: the figures flatter."
-    both = "Figures are over the pixels where mask or asset shows the object."
-    own = "There are no masks: figures are over the asset's pixels."
-    fitted = ["Their poses were fitted to the trained surfels."] if refined else []
-    return " ".join([*words, unseen if held else seen, *fitted, both if masked else own])
+    """How photos and renders are compared."""
+    shading = "under the learnt environment map" if lit else "unlit"
+    fitted = "No photo was held out: training fitted these, so the figures are too high."
+    poses = ["Their poses were fitted to the trained surfels."] if refined else []
+    pixels = "the pixels where mask or asset shows the object." if masked else "the asset's pixels, because there are no masks."
+    return " ".join(
+        [
+            f"The exported GLB rendered from the photos' cameras, {shading}.",
+            "These photos were held out of training." if held else fitted,
+            *poses,
+            f"Figures are over {pixels}",
+        ]
+    )

@@ -1,6 +1,6 @@
-"""Where surfels start: stereo points with the visual hull in their holes, SfM points, the visual hull of the masks, or a sphere.
+"""Initialisation of surfels: from stereo points with the visual hull in their holes, SfM points, the visual hull, or a sphere.
 
-DSDF starts from a sphere of radius 1.1 (Zhu et al. 2025); a start near the surface needs far fewer steps.
+The discretized SDF starts from a sphere of radius 1.1 (Zhu et al. 2025); initialisation near the surface needs far fewer steps.
 """
 
 from __future__ import annotations
@@ -18,8 +18,9 @@ from gsbake.geometry.vectors import unit
 from gsbake.surfels.model import Surfels, create
 
 Floats = NDArray[np.float64]
+#: Radius of the initial sphere (unit frame).
 SPHERE_RADIUS = 1.1
-#: SDF sample of surfels on stereo points: how far they may be off (unit frame).
+#: Initial SDF sample of surfels on stereo points: the error of those points (unit frame).
 STEREO_SDF = 0.002
 
 
@@ -40,7 +41,7 @@ def spacing(points: Floats, neighbours: int = 3) -> Floats:
 
 
 def _cloud_normals(points: Floats, centres: Floats) -> Floats:
-    """Normals of a point cloud by PCA over 12 neighbours, turned towards the nearest camera."""
+    """Normals (n, 3) of a point cloud by PCA over 12 neighbours, oriented towards the nearest camera."""
     _, index = cKDTree(points).query(points, k=min(12, len(points)), workers=-1)
     local = points[index] - points[index].mean(1, keepdims=True)
     _, vectors = np.linalg.eigh(np.einsum("nki,nkj->nij", local, local))
@@ -52,42 +53,42 @@ def _cloud_normals(points: Floats, centres: Floats) -> Floats:
 
 
 def _sample_colours(posed: PosedPhotos, points: Floats, normals: Floats) -> Floats:
-    """sRGB (n, 3) of each point in the photo that faces it best (occlusion ignored: a start value only)."""
+    """sRGB colours (n, 3) of the points in the photo that sees each most frontally; occlusion is ignored in these initial values."""
     cameras = posed.cameras.cameras
     facing = np.stack([np.einsum("ni,ni->n", normals, unit(c.centre - points)) for c in cameras])
     colours = np.full((len(points), 3), 0.5)
     best = facing.argmax(0)
     for i in np.unique(best):
         view = posed.view(int(i), 400)
-        mine = np.flatnonzero(best == i)
-        uv, z = view.camera.project(points[mine])
+        index = np.flatnonzero(best == i)
+        uv, z = view.camera.project(points[index])
         x, y = np.floor(uv[:, 0]).astype(int), np.floor(uv[:, 1]).astype(int)
-        ok = (z > 0) & (x >= 0) & (y >= 0) & (x < view.camera.width) & (y < view.camera.height)
-        colours[mine[ok]] = view.rgb[y[ok], x[ok]] / 255.0
+        visible = (z > 0) & (x >= 0) & (y >= 0) & (x < view.camera.width) & (y < view.camera.height)
+        colours[index[visible]] = view.rgb[y[visible], x[visible]] / 255.0
     return colours
 
 
-def begin(posed: PosedPhotos, train: Any, model: Any, seed: int, stereo: Path | None = None) -> tuple[Surfels, str, str]:
-    """Surfels to start from, the source taken ("stereo", "hull", "points", "sphere") and the evidence for it.
+def initialise_surfels(posed: PosedPhotos, train: Any, model: Any, seed: int, stereo: Path | None = None) -> tuple[Surfels, str, str]:
+    """Initial surfels, their source ("stereo", "hull", "points", "sphere") and the evidence for it.
 
-    `train` and `model` are the profile's sections, `stereo` is the folder of the stereo stage. With "auto" stereo wins where it found
-    enough points, then the hull when every photo has a mask, then SfM points (200 or more), then the sphere.
+    `train` and `model` are the profile's sections, `stereo` is the folder of the stereo stage. "auto" takes stereo where it found enough
+    points, then the hull when every photo has a mask, then SfM points (200 or more), then the sphere.
     """
     if train.init in ("auto", "stereo") and stereo is not None:
-        begun = _from_stereo(posed, train, model, seed, stereo)
-        if begun is not None:
-            return begun
+        initial = _from_stereo(posed, train, model, seed, stereo)
+        if initial is not None:
+            return initial
     cloud = posed.points()
     n_points = 0 if cloud is None else len(cloud[0])
     kind = train.init
-    why = "asked for by the profile"
+    evidence = "set by the profile"
     if kind in ("auto", "stereo"):
         kind = "hull" if posed.has_masks else "points" if n_points >= 200 else "sphere"
-        why = f"no stereo points; {'all' if posed.has_masks else 'not all'} photos have masks, {n_points} SfM points"
+        evidence = f"no stereo points; {'all' if posed.has_masks else 'not all'} photos have masks, {n_points} SfM points"
     if kind == "hull" and not posed.has_masks:
-        kind, why = "sphere", "a hull was asked for, but not every photo has a mask"
+        kind, evidence = "sphere", "train.init = hull, but not every photo has a mask"
     if kind == "points" and n_points < 10:
-        kind, why = "sphere", f"SfM points were asked for, but there are {n_points}"
+        kind, evidence = "sphere", f"train.init = points, but there are only {n_points} SfM points"
     rng = np.random.default_rng(seed)
     colours: Floats | None
     if kind == "hull":
@@ -108,21 +109,21 @@ def begin(posed: PosedPhotos, train: Any, model: Any, seed: int, stereo: Path | 
         points = SPHERE_RADIUS * fibonacci_sphere(train.init_surfels)
         normals, colours, sdf = points / SPHERE_RADIUS, None, 0.2
     gap = np.minimum(spacing(points), 0.3)
-    return create(points, normals, gap, colours, model.shading, model.sh_degree, sdf, 1.0, model.transfer), kind, why
+    return create(points, normals, gap, colours, model.shading, model.sh_degree, sdf, 1.0, model.transfer), kind, evidence
 
 
 def _from_stereo(posed: PosedPhotos, train: Any, model: Any, seed: int, folder: Path) -> tuple[Surfels, str, str] | None:
-    """Surfels on the stereo points and on the hull in their holes, or None when stereo found too few."""
-    from gsbake.mvs.initial_points import start_points
+    """Surfels on stereo points and on the hull in their holes, or None when stereo found too few points."""
+    from gsbake.mvs.initial_points import initial_points
 
-    begun = start_points(posed, folder, min(train.init_surfels, model.max_count), seed)
-    if begun is None:
+    initial = initial_points(posed, folder, min(train.init_surfels, model.max_count), seed)
+    if initial is None:
         return None
-    points, normals, colours = begun.points, begun.normals, begun.colours
-    filled = len(points) - begun.stereo
+    points, normals, colours = initial.points, initial.normals, initial.colours
+    filled = len(points) - initial.stereo
     if filled:
-        colours[begun.stereo :] = _sample_colours(posed, points[begun.stereo :], normals[begun.stereo :])
+        colours[initial.stereo :] = _sample_colours(posed, points[initial.stereo :], normals[initial.stereo :])
     gap = np.minimum(spacing(points), 0.3)
-    why = f"{begun.stereo} evenly spread stereo points, {filled} hull points in their holes"
-    # One sample for all: at the starting sharpness of 1 every one of them is opaque.
-    return create(points, normals, gap, colours, model.shading, model.sh_degree, STEREO_SDF, 1.0, model.transfer), "stereo", why
+    evidence = f"{initial.stereo} evenly spread stereo points, {filled} hull points in their holes"
+    # One SDF sample for all: at the initial sharpness of 1 all are opaque.
+    return create(points, normals, gap, colours, model.shading, model.sh_degree, STEREO_SDF, 1.0, model.transfer), "stereo", evidence

@@ -1,1 +1,1 @@
-"""The built-in analytic capture with known truth."""
+"""Built-in synthetic capture: analytic scene, reference renderer, ground truth."""

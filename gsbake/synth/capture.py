@@ -1,7 +1,7 @@
-"""Writing the built-in capture: photos and poses as a person would bring them, and in `truth/` what a perfect bake would find.
+"""Writer of the built-in capture: photos and poses as user input, and ground truth in `truth/`.
 
-Poses are NeRF's `transforms.json` (OpenGL camera-to-world, Z-up world). The principal point lies off the picture's centre and the cameras
-roll a little, so that a wrong convention cannot pass unnoticed. No stage reads `truth/`; tests and benchmarks do.
+Poses are NeRF's `transforms.json` (OpenGL camera-to-world, Z-up world). The principal point lies off the image centre and the cameras roll
+slightly, to reveal wrong conventions. No stage reads `truth/`; tests and benchmarks do.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from gsbake.errors import UsageError
 from gsbake.geometry.cameras import Camera, CameraSet
 from gsbake.imaging.srgb import encode_bytes
 from gsbake.synth import scene
-from gsbake.synth.shade import Rig, render, studio
+from gsbake.synth.shade import LightRig, render, studio_rig
 
 Array = NDArray[np.float64]
 
 
 def look_at(name: str, centre: Array, target: Array, roll: float, focal: float, principal: tuple[float, float], size: int) -> Camera:
-    """Square pinhole camera at `centre` (world, Z-up) that looks at `target`, turned by `roll` radians about its axis."""
+    """Square pinhole camera at `centre` (world, Z-up) that looks at `target`, rotated by `roll` radians around its optical axis."""
     forward = (target - centre) / np.linalg.norm(target - centre)
     right = np.cross(forward, [0.0, 0.0, 1.0])
     right /= np.linalg.norm(right)
@@ -35,26 +35,26 @@ def look_at(name: str, centre: Array, target: Array, roll: float, focal: float, 
 
 
 def cameras(views: int, size: int, seed: int, background: bool = False) -> tuple[Camera, ...]:
-    """Cameras around the object, from below it (with a background: from above the ground) to high above, slightly disturbed by `seed`."""
+    """Cameras around the object, from below it (with a background: from above the ground) to high above, with jitter by `seed`."""
     draw = np.random.default_rng(seed)
     low, high = (12.0, 70.0) if background else (-28.0, 72.0)
     start = draw.uniform(0, 2 * np.pi)
     out = []
     for i in range(views):
-        # Even in sin(elevation) = even in area; an irrational stride spreads any every-n-th choice of photos over the heights.
-        share = (i * math.sqrt(2) + 0.5 / views) % 1.0
-        height = math.sin(math.radians(low)) * (1 - share) + math.sin(math.radians(high)) * share
+        # Uniform in sin(elevation) is uniform in area; an irrational stride distributes every subset of each n-th photo over the heights.
+        t = (i * math.sqrt(2) + 0.5 / views) % 1.0
+        height = math.sin(math.radians(low)) * (1 - t) + math.sin(math.radians(high)) * t
         azimuth = start + 2 * np.pi * i / views + draw.normal(0, 0.05)
-        flat = math.sqrt(1 - height * height)
-        reach = draw.uniform(2.3, 2.6)
+        horizontal = math.sqrt(1 - height * height)
+        distance = draw.uniform(2.3, 2.6)
         target = np.array(scene.CENTRE) + draw.normal(0, 0.015, 3)
-        centre = target + reach * np.array([flat * math.cos(azimuth), flat * math.sin(azimuth), height])
+        centre = target + distance * np.array([horizontal * math.cos(azimuth), horizontal * math.sin(azimuth), height])
         out.append(look_at(f"{i:03d}", centre, target, draw.normal(0, 0.06), 1.65 * size, (0.51 * size, 0.485 * size), size))
     return tuple(out)
 
 
 def true_mesh(cells: int = 112) -> tuple[Array, NDArray[np.int64]]:
-    """The object's surface as vertices (v, 3) on the zero set (world) and outward faces (f, 3), `cells` along the ball's diameter."""
+    """Ground-truth mesh: vertices (v, 3) on the zero set (world) and outward faces (f, 3); `cells` along the bounding sphere's diameter."""
     from skimage.measure import marching_cubes
 
     cell = 2 * scene.RADIUS / cells
@@ -62,7 +62,7 @@ def true_mesh(cells: int = 112) -> tuple[Array, NDArray[np.int64]]:
     field = scene.grid_distances(low, cell, cells + 1, cells + 1, cells + 1)
     vertices, faces, _, _ = marching_cubes(field, 0.0, spacing=(cell, cell, cell), gradient_direction="descent")
     points = vertices.astype(np.float64) + low
-    for _ in range(3):  # onto the zero set; steps are exact where the field is a distance
+    for _ in range(3):  # project onto the zero set; steps are exact where the field is a distance
         points -= scene.distances(points)[:, None] * scene.normals(points)
     return points, faces.astype(np.int64)
 
@@ -78,7 +78,7 @@ def surface_points(vertices: Array, faces: NDArray[np.int64], count: int, seed: 
     points = np.einsum("nk,nkc->nc", bary, corner[face])
     points -= scene.distances(points)[:, None] * scene.normals(points)
     surface = scene.materials(points)
-    parts = {
+    arrays = {
         "position": points,
         "normal": scene.normals(points),
         "albedo": surface[:, :3],
@@ -86,31 +86,31 @@ def surface_points(vertices: Array, faces: NDArray[np.int64], count: int, seed: 
         "metallic": surface[:, 4],
         "emission": scene.emissions(points),
     }
-    return {name: part.astype(np.float32) for name, part in parts.items()}
+    return {name: array.astype(np.float32) for name, array in arrays.items()}
 
 
 def _write_png(path: Path, rgb: NDArray[np.uint8], alpha: NDArray[np.uint8] | None = None) -> None:
     channels = [rgb[..., 2], rgb[..., 1], rgb[..., 0]] if rgb.ndim == 3 else [rgb]
-    picture = np.stack([*channels, alpha] if alpha is not None else channels, -1)
-    if not cv2.imwrite(str(path), picture):
-        raise OSError(f"could not write {path}")
+    image = np.stack([*channels, alpha] if alpha is not None else channels, -1)
+    if not cv2.imwrite(str(path), image):
+        raise OSError(f"{path} cannot be written")
 
 
-def _write_view(folder: Path, camera: Camera, rig: Rig, background: bool) -> None:
-    """Render one camera and write its photo and its true maps."""
-    picture, buffers = render(
+def _write_view(folder: Path, camera: Camera, rig: LightRig, background: bool) -> None:
+    """Render one camera and write its photo and its ground-truth maps."""
+    image, buffers = render(
         camera.R, camera.centre, camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height, rig, background
     )  # fmt: skip
-    coverage = picture[..., 3]
+    coverage = image[..., 3]
     alpha = np.round(255 * coverage).astype(np.uint8)
-    straight = 1 / np.maximum(coverage, 1e-9)[..., None]
+    to_straight = 1 / np.maximum(coverage, 1e-9)[..., None]
     name = f"{camera.name}.png"
     if background:
-        _write_png(folder / "images" / name, encode_bytes(picture[..., :3]))
+        _write_png(folder / "images" / name, encode_bytes(image[..., :3]))
     else:
-        _write_png(folder / "images" / name, encode_bytes(picture[..., :3] * straight), alpha)
+        _write_png(folder / "images" / name, encode_bytes(image[..., :3] * to_straight), alpha)
     truth = folder / "truth"
-    maps = buffers * straight
+    maps = buffers * to_straight
     length = np.maximum(np.linalg.norm(maps[..., 3:6], axis=-1, keepdims=True), 1e-9)
     code = np.where(coverage[..., None] > 0, 0.5 + 0.5 * maps[..., 3:6] / length, 0.5)
     orm = np.stack([np.ones_like(coverage), maps[..., 6], maps[..., 7]], -1)
@@ -133,21 +133,21 @@ def _transforms(cams: tuple[Camera, ...]) -> dict[str, object]:
 
 
 def write_capture(folder: Path, views: int = 24, size: int = 128, seed: int = 0, poses: bool = True, background: bool = False) -> None:
-    """Write the capture into `folder` (made if missing).
+    """Write the capture into `folder` (created if missing).
 
-    `images/000.png`…: sRGB photos of `size`² pixels, RGBA cut-outs, or opaque photos with a patterned ground when `background`;
+    `images/000.png`…: sRGB photos of `size`² pixels, RGBA with transparent background, or opaque with a textured ground when `background`;
     `transforms.json` when `poses`; `truth/`: `mesh.ply`, `points.npz` (30 000 surface points with materials), `cameras.json`
-    (`CameraSet`), and per photo `masks/`, `albedo/` and `emission/` (sRGB), `normal/` (world, 0..1 coded), `orm/` (1, roughness, metallic;
-    linear). The same arguments write the same bytes. Raises UsageError for fewer than 3 views or a size below 16.
+    (`CameraSet`), and per photo `masks/`, `albedo/` and `emission/` (sRGB), `normal/` (world, coded 0..1), `orm/` (1, roughness, metallic;
+    linear). Equal arguments write equal bytes. Raises UsageError for fewer than 3 views or a size below 16.
     """
     if views < 3 or size < 16:
-        raise UsageError(f"The built-in capture needs at least 3 views of 16 pixels, not {views} of {size}; raise --views or --size.")
+        raise UsageError(f"The built-in capture needs at least 3 views of 16 pixels, not {views} of {size}; increase --views or --size.")
     import trimesh
 
     for name in ("images", "truth/masks", "truth/albedo", "truth/normal", "truth/orm", "truth/emission"):
         (folder / name).mkdir(parents=True, exist_ok=True)
     cams = cameras(views, size, seed, background)
-    rig = studio()
+    rig = studio_rig()
     with ThreadPoolExecutor(2) as pool:  # the renderer releases the GIL
         list(pool.map(lambda camera: _write_view(folder, camera, rig, background), cams))
     if poses:

@@ -1,12 +1,11 @@
-"""The analytic object of the built-in capture: a bowl-topped jar with a glazed band, a small lamp, a metal foot and a thin metal handle.
+"""Analytic object of the built-in capture: a signed distance field with materials.
 
-It is a signed distance field with materials.
-
-World frame: Z-up, the object stands on z = 0 at `ORIGIN`. Primitives are exact distances (rounded cylinder, torus, sphere); unions by min
-and the carved bowl by max keep the field 1-Lipschitz, which is all that sphere tracing needs (Hart, *Sphere tracing*, The Visual Computer
-1996). The surface carries four materials: a diffuse, brightly patterned dielectric, a glossy dielectric (the glazed band), a rough
-gold-like metal, and a round emissive patch. The pattern is hashed value noise, aperiodic, so that structure from motion finds features
-that do not repeat. The lamp is flush with the convex side of the jar, so no other point of the object receives its light.
+The object is a jar with a bowl-shaped top, a glossy glazed band, a round emissive patch, a metal foot and a thin metal handle. World
+frame: Z-up, the object stands on z = 0 at `ORIGIN`. Primitives are exact distances (rounded cylinder, torus, sphere); unions by min and
+the carved bowl by max keep the field 1-Lipschitz, as sphere tracing requires (Hart, *Sphere tracing*, The Visual Computer 1996). Four
+materials: a diffuse textured dielectric, a glossy dielectric (the glazed band), a rough gold-like metal, and the emissive patch. The
+texture is hashed value noise, aperiodic, so that structure from motion finds unique features. The emissive patch is flush with the convex
+side of the jar, so no other point of the object receives its light.
 """
 
 from __future__ import annotations
@@ -20,9 +19,9 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-#: Where the object's axis meets the ground, off the world origin on purpose: a capture's frame is never the object's.
+#: Intersection of the object's axis with the ground (world), off the world origin to reveal confused frames.
 ORIGIN = (0.2, -0.1, 0.0)
-#: Centre (world) and radius of a ball that holds the object.
+#: Centre (world) and radius of a bounding sphere of the object.
 CENTRE = (0.33, -0.1, 0.46)
 RADIUS = 0.75
 
@@ -30,10 +29,10 @@ BODY_Z, BODY_RADIUS, BODY_HALF, BODY_ROUND = 0.52, 0.40, 0.40, 0.08
 BOWL_Z, BOWL_RADIUS = 1.10, 0.36
 FOOT_Z, FOOT_RADIUS, FOOT_HALF, FOOT_ROUND = 0.08, 0.30, 0.08, 0.03
 HANDLE_X, HANDLE_Z, HANDLE_MAJOR, HANDLE_MINOR = 0.40, 0.52, 0.22, 0.04
-#: The glazed band about the jar between these heights: linear albedo and roughness.
+#: The glazed band around the jar: range of heights, linear albedo and roughness.
 GLAZE_Z, GLAZE_ALBEDO, GLAZE_ROUGHNESS = (0.16, 0.34), (0.05, 0.12, 0.34), 0.22
-#: The lamp: its centre's direction from the axis is (-1, 0), its height, radius and radiance (linear; above 1 would clip in the photos).
-LAMP_Z, LAMP_RADIUS, LAMP_RADIANCE = 0.66, 0.09, (0.95, 0.80, 0.45)
+#: The emissive patch, in direction (-1, 0) from the axis: height, radius and radiance (linear; above 1 would clip in the photos).
+EMITTER_Z, EMITTER_RADIUS, EMITTER_RADIANCE = 0.66, 0.09, (0.95, 0.80, 0.45)
 
 _compiled: Any = njit(cache=True, nogil=True, error_model="numpy")
 _inlined: Any = njit(cache=True, nogil=True, error_model="numpy", inline="always")
@@ -41,7 +40,7 @@ _inlined: Any = njit(cache=True, nogil=True, error_model="numpy", inline="always
 
 @_inlined
 def _rounded_cylinder(radial: float, z: float, radius: float, half: float, rounding: float) -> float:
-    """Distance to a cylinder about z of the given outer size, its edges rounded."""
+    """Signed distance to a cylinder around z of the given outer size, with rounded edges."""
     a = radial - (radius - rounding)
     b = abs(z) - (half - rounding)
     return min(max(a, b), 0.0) + math.sqrt(max(a, 0.0) ** 2 + max(b, 0.0) ** 2) - rounding
@@ -74,7 +73,7 @@ def distance(x: float, y: float, z: float) -> float:
 
 @_compiled
 def normal(x: float, y: float, z: float) -> tuple[float, float, float]:
-    """Unit gradient of the field by differences along a tetrahedron (four evaluations)."""
+    """Unit gradient of the field by finite differences along a tetrahedron (four evaluations)."""
     h = 1e-5
     a = distance(x + h, y - h, z - h)
     b = distance(x - h, y - h, z + h)
@@ -117,17 +116,17 @@ def _step(edge0: float, edge1: float, value: float) -> float:
 
 
 @_inlined
-def _in_lamp(x: float, y: float, z: float) -> bool:
-    """Whether a world point on the surface belongs to the lamp."""
-    dy, dz = y - ORIGIN[1], z - LAMP_Z
-    return x < ORIGIN[0] - 0.5 * BODY_RADIUS and dy * dy + dz * dz < LAMP_RADIUS * LAMP_RADIUS
+def _in_emitter(x: float, y: float, z: float) -> bool:
+    """Whether a world point on the surface belongs to the emissive patch."""
+    dy, dz = y - ORIGIN[1], z - EMITTER_Z
+    return x < ORIGIN[0] - 0.5 * BODY_RADIUS and dy * dy + dz * dz < EMITTER_RADIUS * EMITTER_RADIUS
 
 
 @_compiled
 def emission(x: float, y: float, z: float) -> tuple[float, float, float]:
     """Emitted radiance (3), linear, of the surface point nearest to a world point."""
-    if _in_lamp(x, y, z):
-        return LAMP_RADIANCE
+    if _in_emitter(x, y, z):
+        return EMITTER_RADIANCE
     return 0.0, 0.0, 0.0
 
 
@@ -141,9 +140,9 @@ def material(x: float, y: float, z: float) -> tuple[float, float, float, float, 
         return 0.82 * shade, 0.62 * shade, 0.33 * shade, 0.42 + 0.12 * (fine - 0.5), 1.0
     if GLAZE_Z[0] < z < GLAZE_Z[1]:
         return GLAZE_ALBEDO[0], GLAZE_ALBEDO[1], GLAZE_ALBEDO[2], GLAZE_ROUGHNESS, 0.0
-    if _in_lamp(x, y, z):
+    if _in_emitter(x, y, z):
         return 0.03, 0.03, 0.03, 0.5, 0.0
-    # Cream glaze, blotches of teal and rust at two scales, and a dark speckle: strong, aperiodic edges.
+    # Cream base, patches of teal and rust at two scales, and dark speckles: strong, aperiodic edges.
     teal = _step(0.50, 0.58, coarse)
     rust = _step(0.58, 0.66, noise(11 * x + 31, 11 * y, 11 * z + 17))
     speckle = 0.55 * _step(0.62, 0.72, fine)
@@ -151,13 +150,13 @@ def material(x: float, y: float, z: float) -> tuple[float, float, float, float, 
     g = (1 - teal) * 0.58 + teal * 0.36
     b = (1 - teal) * 0.40 + teal * 0.38
     r, g, b = (1 - rust) * r + rust * 0.52, (1 - rust) * g + rust * 0.15, (1 - rust) * b + rust * 0.06
-    keep = 1 - speckle
-    return r * keep, g * keep, b * keep, 0.75, 0.0
+    scale = 1 - speckle
+    return r * scale, g * scale, b * scale, 0.75, 0.0
 
 
 @_compiled
 def ground(x: float, y: float) -> tuple[float, float, float]:
-    """Linear albedo of the matte ground z = 0 (used only for photos with a background)."""
+    """Linear albedo of the diffuse ground z = 0 (used only for photos with a background)."""
     value = 0.55 * noise(5 * x, 5 * y, 40.5) + 0.45 * noise(13 * x, 13 * y, 80.5)
     dark = _step(0.42, 0.56, value)
     tint = noise(2 * x, 2 * y, 9.5)
@@ -168,7 +167,7 @@ def ground(x: float, y: float) -> tuple[float, float, float]:
 def trace(
     ox: float, oy: float, oz: float, dx: float, dy: float, dz: float, start: float, epsilon: float
 ) -> float:
-    """Distance along a unit ray (world) to the object, or -1; starts at `start`, ends within `epsilon` of the surface."""
+    """Distance along a unit ray (world) to the object by sphere tracing from `start`, or -1; accurate to `epsilon`."""
     cx, cy, cz = CENTRE[0] - ox, CENTRE[1] - oy, CENTRE[2] - oz
     along = cx * dx + cy * dy + cz * dz
     inside = RADIUS * RADIUS - (cx * cx + cy * cy + cz * cz - along * along)
@@ -184,7 +183,7 @@ def trace(
         if d < epsilon:
             return t
         t += d
-    return -1.0  # a grazing ray that ran out of steps passes by
+    return -1.0  # a grazing ray that exceeds the steps counts as a miss
 
 
 @_compiled
@@ -225,7 +224,7 @@ def emissions(points: Array) -> Array:
 
 @_compiled
 def grid_distances(low: Array, cell: float, nx: int, ny: int, nz: int) -> NDArray[np.float32]:
-    """Field on a grid (nx, ny, nz) of `cell`-sized cubes whose first point is `low` (3,)."""
+    """Signed distances on a grid (nx, ny, nz) of spacing `cell` whose first point is `low` (3,)."""
     out = np.empty((nx, ny, nz), np.float32)
     for i in range(nx):
         for j in range(ny):

@@ -1,11 +1,11 @@
-"""Direct-light shading of the analytic scene: its own renderer, sharing no code with the splat rasteriser or the split sum.
+"""Direct lighting of the analytic scene: a reference renderer that shares no code with the surfel rasteriser or the split sum.
 
 Microfacet model: GGX with height-correlated Smith shadowing (Heitz, *Understanding the masking-shadowing function*, JCGT 2014) and
 Schlick's Fresnel, `F0 = .04 (1 - m) + m albedo`, alpha = roughness²; plus Lambert `(1 - m) albedo / pi`. Light comes from a rectangle
 (stratified points, each with a shadow ray), a sun (one shadow ray) and an environment whose radiance `a + b z` is linear in the
-direction, so that its irradiance `pi (a + 2/3 b n_z)` is exact; ambient visibility is measured with hemisphere rays, its specular part is
+direction, so that its irradiance `pi (a + 2/3 b n_z)` is exact. Ambient visibility is sampled with hemisphere rays; the specular part is
 summed over visible half vectors (Dupuy and Benyoub, *Sampling visible GGX normals with spherical caps*, CGF 2023).
-Everything is deterministic: the 2x2 samples of a pixel use interleaved subsets of the light and hemisphere points.
+The renderer is deterministic: the 2x2 samples of a pixel use interleaved subsets of the light and hemisphere points.
 """
 
 from __future__ import annotations
@@ -21,29 +21,31 @@ from gsbake.synth.scene import distance, emission, ground, material, normal, tra
 
 Array = NDArray[np.float64]
 
-SUBSETS = 4  # interleaved subsets of the light and hemisphere points, one per sample of a pixel
+#: Interleaved subsets of the light and hemisphere points, one per sample of a pixel.
+SAMPLE_SUBSETS = 4
 _compiled: Any = njit(cache=True, nogil=True, error_model="numpy")
 _inlined: Any = njit(cache=True, nogil=True, error_model="numpy", inline="always")
 
 
-class Rig(NamedTuple):
+class LightRig(NamedTuple):
     """Lights in world coordinates; all values are linear RGB.
 
-    `points` (n, 3) on the area light (n a multiple of SUBSETS), each standing for `patch` area units facing `facing` (3,) with `radiance`
-    (3,); `sun` (3,) unit direction towards the sun, `irradiance` (3,) at normal incidence; environment: `ambient` (3,) + `gradient` (3,)
-    * z; `cosine` (m, 3) cosine-distributed hemisphere directions about +z, `square` (k, 2) stratified points for the half vectors.
+    Area light: `area_points` (n, 3) with n a multiple of SAMPLE_SUBSETS, each representing `patch_area`, with unit normal `area_normal`
+    (3,) and radiance `area_radiance` (3,). Sun: unit `sun_direction` (3,) towards it, `sun_irradiance` (3,) at normal incidence.
+    Environment: radiance `ambient` (3,) + `gradient` (3,) * z. Samples: `hemisphere` (m, 3) cosine-distributed directions around +z,
+    `half_vector_samples` (k, 2) stratified points of the unit square.
     """
 
-    points: Array
-    facing: Array
-    patch: float
-    radiance: Array
-    sun: Array
-    irradiance: Array
+    area_points: Array
+    area_normal: Array
+    patch_area: float
+    area_radiance: Array
+    sun_direction: Array
+    sun_irradiance: Array
     ambient: Array
     gradient: Array
-    cosine: Array
-    square: Array
+    hemisphere: Array
+    half_vector_samples: Array
 
 
 def _van_der_corput(count: int) -> Array:
@@ -57,38 +59,44 @@ def _van_der_corput(count: int) -> Array:
     return out
 
 
-def make_rig(
+def make_light_rig(
     area: tuple[float, float, float] = (0.0, 0.0, 0.0),
     sun: tuple[float, float, float] = (0.0, 0.0, 0.0),
     ambient: tuple[float, float, float] = (0.0, 0.0, 0.0),
     gradient: tuple[float, float, float] = (0.0, 0.0, 0.0),
     sun_direction: tuple[float, float, float] = (0.0, 0.0, 1.0),
-) -> Rig:
-    """A rig with a 2 x 2 area light at (2.2, -2.4, 2.8) facing the object and a sun; black parts cost nothing."""
-    centre, aim = np.array([2.2, -2.4, 2.8]), np.array([0.3, -0.1, 0.45])
-    facing = (aim - centre) / np.linalg.norm(aim - centre)
-    u = np.cross(facing, [0, 0, 1.0])
+) -> LightRig:
+    """Light rig with a 2 x 2 area light at (2.2, -2.4, 2.8) that faces the object, and a sun; black lights are not evaluated."""
+    centre, target = np.array([2.2, -2.4, 2.8]), np.array([0.3, -0.1, 0.45])
+    area_normal = (target - centre) / np.linalg.norm(target - centre)
+    u = np.cross(area_normal, [0, 0, 1.0])
     u /= np.linalg.norm(u)
-    v = np.cross(facing, u)
+    v = np.cross(area_normal, u)
     steps = (np.arange(4) + 0.5) / 2 - 1
-    # Ordered so that every fourth point makes a spread-out subset (a Latin square of the 4 x 4 strata).
-    order = sorted(((i, j) for i in range(4) for j in range(4)), key=lambda ij: (ij[0], (ij[1] + ij[0]) % SUBSETS))
-    points = np.array([centre + u * steps[i] + v * steps[j] for i, j in order])
+    # Ordered so that every fourth point forms a well-distributed subset (a Latin square of the 4 x 4 strata).
+    order = sorted(((i, j) for i in range(4) for j in range(4)), key=lambda ij: (ij[0], (ij[1] + ij[0]) % SAMPLE_SUBSETS))
+    area_points = np.array([centre + u * steps[i] + v * steps[j] for i, j in order])
     count = 16
-    # Golden-angle spiral: every fourth direction is spread out as well.
-    radial, turn = np.sqrt((np.arange(count) + 0.5) / count), np.pi * (3 - np.sqrt(5)) * np.arange(count)
-    cosine = np.stack([radial * np.cos(turn), radial * np.sin(turn), np.sqrt(1 - radial**2)], 1)
-    square = np.stack([(np.arange(count) + 0.5) / count, _van_der_corput(count)], 1)
+    # Golden-angle spiral: every fourth direction is well distributed too.
+    radius, angle = np.sqrt((np.arange(count) + 0.5) / count), np.pi * (3 - np.sqrt(5)) * np.arange(count)
     direction = np.array(sun_direction, float)
-    return Rig(
-        points, facing, 4.0 / len(points), np.array(area, float), direction / np.linalg.norm(direction), np.array(sun, float),
-        np.array(ambient, float), np.array(gradient, float), cosine, square,
-    )  # fmt: skip
+    return LightRig(
+        area_points=area_points,
+        area_normal=area_normal,
+        patch_area=4.0 / len(area_points),
+        area_radiance=np.array(area, float),
+        sun_direction=direction / np.linalg.norm(direction),
+        sun_irradiance=np.array(sun, float),
+        ambient=np.array(ambient, float),
+        gradient=np.array(gradient, float),
+        hemisphere=np.stack([radius * np.cos(angle), radius * np.sin(angle), np.sqrt(1 - radius**2)], 1),
+        half_vector_samples=np.stack([(np.arange(count) + 0.5) / count, _van_der_corput(count)], 1),
+    )
 
 
-def studio() -> Rig:
-    """The capture's light: warm key from an area light, a weak cool sun from behind, a bluish sky over a darker floor."""
-    return make_rig(
+def studio_rig() -> LightRig:
+    """Lighting of the built-in capture: a warm area light as key, a weak cool sun from behind, a bluish sky above darker ground."""
+    return make_light_rig(
         area=(8.5, 7.9, 7.0),
         sun=(0.55, 0.62, 0.75),
         ambient=(0.50, 0.51, 0.53),
@@ -107,13 +115,13 @@ def _microfacet(nl: float, nv: float, nh: float, alpha: float) -> float:
 
 
 @_compiled
-def reflect(
+def brdf_cosine(
     light: tuple[float, float, float],
     n: tuple[float, float, float],
     v: tuple[float, float, float],
     surface: tuple[float, float, float, float, float],
 ) -> tuple[float, float, float]:
-    """BRDF times cos(theta_l) (3) for unit directions to light and eye about unit normal n; surface = albedo (3), roughness, metallic."""
+    """BRDF times cos(theta_l) (3); unit directions to light and camera, unit normal n, surface = albedo (3), roughness, metallic."""
     nl = n[0] * light[0] + n[1] * light[1] + n[2] * light[2]
     if nl <= 0:
         return 0.0, 0.0, 0.0
@@ -135,12 +143,12 @@ def reflect(
 
 
 @_inlined
-def _blocked(x: float, y: float, z: float, dx: float, dy: float, dz: float) -> bool:
+def _occluded(x: float, y: float, z: float, dx: float, dy: float, dz: float) -> bool:
     return trace(x, y, z, dx, dy, dz, 0.0, 1e-4) >= 0
 
 
 @_inlined
-def _frame(n: tuple[float, float, float]) -> tuple[float, float, float, float, float, float]:
+def _tangents(n: tuple[float, float, float]) -> tuple[float, float, float, float, float, float]:
     """Two unit tangents of n without branches (Duff et al., *Building an orthonormal basis, revisited*, JCGT 2017)."""
     sign = math.copysign(1.0, n[2])
     a = -1.0 / (sign + n[2])
@@ -149,44 +157,76 @@ def _frame(n: tuple[float, float, float]) -> tuple[float, float, float, float, f
 
 
 @_compiled
-def outgoing(
-    point: tuple[float, float, float],
+def _area_light(
+    position: tuple[float, float, float],
     n: tuple[float, float, float],
     v: tuple[float, float, float],
     surface: tuple[float, float, float, float, float],
-    rig: Rig,
+    rig: LightRig,
     subset: int,
 ) -> tuple[float, float, float]:
-    """Radiance (3) leaving a surface point (world) towards unit direction v: area light, sun, environment, each with the object's shadow.
-
-    `subset` 0..3 selects every fourth light and hemisphere point; the mean of the four is the full quadrature.
-    """
-    offset = 2e-3
-    x, y, z = point[0] + offset * n[0], point[1] + offset * n[1], point[2] + offset * n[2]
+    """Reflected radiance (3) of the area light, by every fourth of its points from `subset`, each with a shadow ray."""
+    x, y, z = position
     r = g = b = 0.0
-    if rig.radiance[0] + rig.radiance[1] + rig.radiance[2] > 0:
-        for i in range(subset, len(rig.points), SUBSETS):
-            lx, ly, lz = rig.points[i, 0] - x, rig.points[i, 1] - y, rig.points[i, 2] - z
-            square = lx * lx + ly * ly + lz * lz
-            inverse = 1 / math.sqrt(square)
-            lx, ly, lz = lx * inverse, ly * inverse, lz * inverse
-            emitted = -(lx * rig.facing[0] + ly * rig.facing[1] + lz * rig.facing[2])
-            fr, fg, fb = reflect((lx, ly, lz), n, v, surface)
-            if emitted > 0 and fr + fg + fb > 0 and not _blocked(x, y, z, lx, ly, lz):
-                angle = SUBSETS * rig.patch * emitted / square  # solid angle of the patch
-                r, g, b = r + fr * angle * rig.radiance[0], g + fg * angle * rig.radiance[1], b + fb * angle * rig.radiance[2]
-    if rig.irradiance[0] + rig.irradiance[1] + rig.irradiance[2] > 0:
-        fr, fg, fb = reflect((rig.sun[0], rig.sun[1], rig.sun[2]), n, v, surface)
-        if fr + fg + fb > 0 and not _blocked(x, y, z, rig.sun[0], rig.sun[1], rig.sun[2]):
-            r, g, b = r + fr * rig.irradiance[0], g + fg * rig.irradiance[1], b + fb * rig.irradiance[2]
-    tx, ty, tz, ux, uy, uz = _frame(n)
-    free = 0.0
-    for i in range(subset, len(rig.cosine), SUBSETS):
-        a, c, e = rig.cosine[i, 0], rig.cosine[i, 1], rig.cosine[i, 2]
-        if not _blocked(x, y, z, a * tx + c * ux + e * n[0], a * ty + c * uy + e * n[1], a * tz + c * uz + e * n[2]):
-            free += 1.0
-    free *= SUBSETS / len(rig.cosine)
-    # Environment: exact diffuse part; specular part by visible half vectors (Dupuy and Benyoub 2023), each weighing F G2 / G1.
+    for i in range(subset, len(rig.area_points), SAMPLE_SUBSETS):
+        lx, ly, lz = rig.area_points[i, 0] - x, rig.area_points[i, 1] - y, rig.area_points[i, 2] - z
+        squared = lx * lx + ly * ly + lz * lz
+        inverse = 1 / math.sqrt(squared)
+        lx, ly, lz = lx * inverse, ly * inverse, lz * inverse
+        emitted = -(lx * rig.area_normal[0] + ly * rig.area_normal[1] + lz * rig.area_normal[2])
+        fr, fg, fb = brdf_cosine((lx, ly, lz), n, v, surface)
+        if emitted > 0 and fr + fg + fb > 0 and not _occluded(x, y, z, lx, ly, lz):
+            angle = SAMPLE_SUBSETS * rig.patch_area * emitted / squared  # solid angle of the patch
+            radiance = rig.area_radiance
+            r, g, b = r + fr * angle * radiance[0], g + fg * angle * radiance[1], b + fb * angle * radiance[2]
+    return r, g, b
+
+
+@_compiled
+def _sun_light(
+    position: tuple[float, float, float],
+    n: tuple[float, float, float],
+    v: tuple[float, float, float],
+    surface: tuple[float, float, float, float, float],
+    rig: LightRig,
+) -> tuple[float, float, float]:
+    """Reflected radiance (3) of the sun, with one shadow ray."""
+    direction, irradiance = rig.sun_direction, rig.sun_irradiance
+    fr, fg, fb = brdf_cosine((direction[0], direction[1], direction[2]), n, v, surface)
+    if fr + fg + fb > 0 and not _occluded(position[0], position[1], position[2], direction[0], direction[1], direction[2]):
+        return fr * irradiance[0], fg * irradiance[1], fb * irradiance[2]
+    return 0.0, 0.0, 0.0
+
+
+@_compiled
+def _ambient_visibility(
+    position: tuple[float, float, float],
+    n: tuple[float, float, float],
+    tangents: tuple[float, float, float, float, float, float],
+    rig: LightRig,
+    subset: int,
+) -> float:
+    """Unoccluded share of the cosine-weighted hemisphere, by every fourth of the rig's directions from `subset`."""
+    x, y, z = position
+    tx, ty, tz, ux, uy, uz = tangents
+    visible = 0.0
+    for i in range(subset, len(rig.hemisphere), SAMPLE_SUBSETS):
+        a, c, e = rig.hemisphere[i, 0], rig.hemisphere[i, 1], rig.hemisphere[i, 2]
+        if not _occluded(x, y, z, a * tx + c * ux + e * n[0], a * ty + c * uy + e * n[1], a * tz + c * uz + e * n[2]):
+            visible += 1.0
+    return visible * (SAMPLE_SUBSETS / len(rig.hemisphere))
+
+
+@_compiled
+def _environment_specular(
+    n: tuple[float, float, float],
+    v: tuple[float, float, float],
+    surface: tuple[float, float, float, float, float],
+    tangents: tuple[float, float, float, float, float, float],
+    rig: LightRig,
+) -> tuple[float, float, float]:
+    """Unoccluded specular reflection (3) of the environment, by visible half vectors (Dupuy and Benyoub 2023) weighted with F G2 / G1."""
+    tx, ty, tz, ux, uy, uz = tangents
     alpha = surface[3] * surface[3]
     a2 = alpha * alpha
     nv = max(n[0] * v[0] + n[1] * v[1] + n[2] * v[2], 1e-4)
@@ -195,12 +235,12 @@ def outgoing(
     wx, wy = alpha * (v[0] * tx + v[1] * ty + v[2] * tz), alpha * (v[0] * ux + v[1] * uy + v[2] * uz)
     inverse = 1 / math.sqrt(wx * wx + wy * wy + nv * nv)
     wx, wy, wz = wx * inverse, wy * inverse, nv * inverse
-    reach = math.sqrt(a2 + (1 - a2) * nv * nv)
-    sr = sg = sb = 0.0
-    for i in range(len(rig.square)):
-        c = (1 - rig.square[i, 0]) * (1 + wz) - wz
-        sin, turn = math.sqrt(max(1 - c * c, 0.0)), 2 * math.pi * rig.square[i, 1]
-        hx, hy, hz = alpha * (sin * math.cos(turn) + wx), alpha * (sin * math.sin(turn) + wy), c + wz
+    smith_v = math.sqrt(a2 + (1 - a2) * nv * nv)
+    r = g = b = 0.0
+    for i in range(len(rig.half_vector_samples)):
+        c = (1 - rig.half_vector_samples[i, 0]) * (1 + wz) - wz
+        sin, phi = math.sqrt(max(1 - c * c, 0.0)), 2 * math.pi * rig.half_vector_samples[i, 1]
+        hx, hy, hz = alpha * (sin * math.cos(phi) + wx), alpha * (sin * math.sin(phi) + wy), c + wz
         inverse = 1 / math.sqrt(hx * hx + hy * hy + hz * hz)
         hx, hy, nh = hx * inverse, hy * inverse, hz * inverse
         hx, hy, hz = hx * tx + hy * ux + nh * n[0], hx * ty + hy * uy + nh * n[1], hx * tz + hy * uz + nh * n[2]
@@ -208,36 +248,64 @@ def outgoing(
         nl = 2 * vh * nh - (n[0] * v[0] + n[1] * v[1] + n[2] * v[2])
         if vh <= 0 or nl <= 0:
             continue
-        weight = nl * (reach + nv) / (nl * reach + nv * math.sqrt(a2 + (1 - a2) * nl * nl))
+        weight = nl * (smith_v + nv) / (nl * smith_v + nv * math.sqrt(a2 + (1 - a2) * nl * nl))
         schlick = (1 - vh) ** 5
-        height = 2 * vh * hz - v[2]
-        sr += weight * (r0 + (1 - r0) * schlick) * (rig.ambient[0] + rig.gradient[0] * height)
-        sg += weight * (g0 + (1 - g0) * schlick) * (rig.ambient[1] + rig.gradient[1] * height)
-        sb += weight * (b0 + (1 - b0) * schlick) * (rig.ambient[2] + rig.gradient[2] * height)
-    count, matte, tilt = len(rig.square), 1 - surface[4], 2 / 3 * n[2]
+        lz = 2 * vh * hz - v[2]
+        r += weight * (r0 + (1 - r0) * schlick) * (rig.ambient[0] + rig.gradient[0] * lz)
+        g += weight * (g0 + (1 - g0) * schlick) * (rig.ambient[1] + rig.gradient[1] * lz)
+        b += weight * (b0 + (1 - b0) * schlick) * (rig.ambient[2] + rig.gradient[2] * lz)
+    count = len(rig.half_vector_samples)
+    return r / count, g / count, b / count
+
+
+@_compiled
+def outgoing_radiance(
+    point: tuple[float, float, float],
+    n: tuple[float, float, float],
+    v: tuple[float, float, float],
+    surface: tuple[float, float, float, float, float],
+    rig: LightRig,
+    subset: int,
+) -> tuple[float, float, float]:
+    """Radiance (3) leaving a surface point (world) towards unit direction v: area light, sun, environment, each with self-shadowing.
+
+    `subset` 0..3 selects every fourth light and hemisphere point; the mean of the four is the full quadrature.
+    """
+    offset = 2e-3
+    position = (point[0] + offset * n[0], point[1] + offset * n[1], point[2] + offset * n[2])
+    r = g = b = 0.0
+    if rig.area_radiance[0] + rig.area_radiance[1] + rig.area_radiance[2] > 0:
+        r, g, b = _area_light(position, n, v, surface, rig, subset)
+    if rig.sun_irradiance[0] + rig.sun_irradiance[1] + rig.sun_irradiance[2] > 0:
+        sun_r, sun_g, sun_b = _sun_light(position, n, v, surface, rig)
+        r, g, b = r + sun_r, g + sun_g, b + sun_b
+    tangents = _tangents(n)
+    visible = _ambient_visibility(position, n, tangents, rig, subset)
+    sr, sg, sb = _environment_specular(n, v, surface, tangents, rig)
+    diffuse, slope = 1 - surface[4], 2 / 3 * n[2]  # irradiance over pi is ambient + 2/3 gradient n_z
     return (
-        r + free * (matte * surface[0] * (rig.ambient[0] + rig.gradient[0] * tilt) + sr / count),
-        g + free * (matte * surface[1] * (rig.ambient[1] + rig.gradient[1] * tilt) + sg / count),
-        b + free * (matte * surface[2] * (rig.ambient[2] + rig.gradient[2] * tilt) + sb / count),
+        r + visible * (diffuse * surface[0] * (rig.ambient[0] + rig.gradient[0] * slope) + sr),
+        g + visible * (diffuse * surface[1] * (rig.ambient[1] + rig.gradient[1] * slope) + sg),
+        b + visible * (diffuse * surface[2] * (rig.ambient[2] + rig.gradient[2] * slope) + sb),
     )
 
 
 @_compiled
 def render(
-    rotation: Array, centre: Array, fx: float, fy: float, cx: float, cy: float, width: int, height: int, rig: Rig, background: bool
+    rotation: Array, centre: Array, fx: float, fy: float, cx: float, cy: float, width: int, height: int, rig: LightRig, background: bool
 ) -> tuple[Array, Array]:
-    """One photo with 2x2 samples a pixel: linear RGB + coverage (h, w, 4) and the surface buffers (h, w, 11), premultiplied.
+    """One photo with 2x2 samples per pixel: linear RGB + coverage (h, w, 4) and the surface buffers (h, w, 11), premultiplied.
 
     Buffers: albedo (3), normal (3), roughness, metallic, emission (3).
 
-    `rotation` (3, 3) world→camera with OpenCV axes, `centre` (3,) the camera in the world. With `background` the colour channels also hold
-    the ground and the environment behind it; coverage stays the object's.
+    `rotation` (3, 3) world→camera with OpenCV axes, `centre` (3,) of the camera in the world. With `background` the colour channels include
+    the ground and the environment; coverage remains that of the object.
     """
-    picture, buffers = np.zeros((height, width, 4)), np.zeros((height, width, 11))
+    image, buffers = np.zeros((height, width, 4)), np.zeros((height, width, 11))
     ox, oy, oz = centre[0], centre[1], centre[2]
     for j in range(height):
         for i in range(width):
-            for k in range(SUBSETS):
+            for k in range(SAMPLE_SUBSETS):
                 px = (i + 0.25 + 0.5 * (k & 1) - cx) / fx
                 py = (j + 0.25 + 0.5 * (k >> 1) - cy) / fy
                 dx = rotation[0, 0] * px + rotation[1, 0] * py + rotation[2, 0]
@@ -247,33 +315,34 @@ def render(
                 dx, dy, dz = dx * inverse, dy * inverse, dz * inverse
                 t = trace(ox, oy, oz, dx, dy, dz, 0.0, 1e-5)
                 if t >= 0:
-                    t += distance(ox + t * dx, oy + t * dy, oz + t * dz)  # one step more: on the surface
+                    t += distance(ox + t * dx, oy + t * dy, oz + t * dz)  # one more step, onto the surface
                     x, y, z = ox + t * dx, oy + t * dy, oz + t * dz
                     n = normal(x, y, z)
                     surface = material(x, y, z)
-                    glow = emission(x, y, z)
-                    r, g, b = outgoing((x, y, z), n, (-dx, -dy, -dz), surface, rig, k)
-                    r, g, b = r + glow[0], g + glow[1], b + glow[2]
-                    picture[j, i, 3] += 0.25
+                    emitted = emission(x, y, z)
+                    r, g, b = outgoing_radiance((x, y, z), n, (-dx, -dy, -dz), surface, rig, k)
+                    r, g, b = r + emitted[0], g + emitted[1], b + emitted[2]
+                    image[j, i, 3] += 0.25
                     for c in range(3):
                         buffers[j, i, c] += 0.25 * surface[c]
                         buffers[j, i, 3 + c] += 0.25 * n[c]
-                        buffers[j, i, 8 + c] += 0.25 * glow[c]
+                        buffers[j, i, 8 + c] += 0.25 * emitted[c]
                     buffers[j, i, 6] += 0.25 * surface[3]
                     buffers[j, i, 7] += 0.25 * surface[4]
                 elif not background:
                     continue
                 elif dz < -1e-3:
                     x, y = ox - oz / dz * dx, oy - oz / dz * dy
-                    shade = ground(x, y)
-                    r, g, b = outgoing((x, y, 0.0), (0.0, 0.0, 1.0), (-dx, -dy, -dz), (shade[0], shade[1], shade[2], 0.9, 0.0), rig, k)
+                    albedo = ground(x, y)
+                    surface = (albedo[0], albedo[1], albedo[2], 0.9, 0.0)
+                    r, g, b = outgoing_radiance((x, y, 0.0), (0.0, 0.0, 1.0), (-dx, -dy, -dz), surface, rig, k)
                 else:
                     r, g, b = (
                         rig.ambient[0] + rig.gradient[0] * dz,
                         rig.ambient[1] + rig.gradient[1] * dz,
                         rig.ambient[2] + rig.gradient[2] * dz,
                     )
-                picture[j, i, 0] += 0.25 * r
-                picture[j, i, 1] += 0.25 * g
-                picture[j, i, 2] += 0.25 * b
-    return picture, buffers
+                image[j, i, 0] += 0.25 * r
+                image[j, i, 1] += 0.25 * g
+                image[j, i, 2] += 0.25 * b
+    return image, buffers

@@ -1,7 +1,7 @@
-"""Ambient occlusion per texel: the cosine-weighted share of the hemisphere that the object itself leaves open.
+"""Ambient occlusion per texel: the unoccluded share of the cosine-weighted hemisphere.
 
-Directions follow the additive R2 sequence, shifted per texel by a hash (Cranley-Patterson rotation): stratified, noise that a small filter
-removes, and the same result on every machine. A light filter then averages neighbouring texels of the same surface and orientation.
+Directions follow the additive R2 sequence, shifted per texel by a hash (Cranley-Patterson rotation): stratified and deterministic. A small
+filter removes the noise by averaging neighbouring texels of the same surface and orientation.
 
 Roberts, *The unreasonable effectiveness of quasirandom sequences*, 2018 (R2); Malley's method for cosine-weighted directions (Pharr, Jakob
 & Humphreys, *Physically Based Rendering*, section 13.6).
@@ -23,8 +23,8 @@ Floats = NDArray[np.float32]
 
 #: Steps of the R2 sequence: 1/g and 1/g² of the plastic number g.
 R2 = (0.7548776662466927, 0.5698402909980532)
-#: Half width of the filter in texels.
-FILTER = 2
+#: Radius of the filter in texels.
+FILTER_RADIUS = 2
 
 
 def occlusion(
@@ -35,7 +35,7 @@ def occlusion(
     offset: float,
     each: Callable[[int, int], None] | None = None,
 ) -> Floats:
-    """Open share (n,) in 0..1 of the hemisphere over each `position` (n, 3) with unit `normal` (n, 3); 1 is fully open.
+    """Ambient occlusion (n,) at each `position` (n, 3) with unit `normal` (n, 3), 0..1, 1 = open.
 
     Rays start `offset` (mesh units) above the surface; `each(done, total)` is called after every round of one ray per texel.
     """
@@ -62,8 +62,8 @@ def _directions(normal: Floats, k: int, rays: int, out: Floats) -> None:
         shift_b = ((h >> np.uint32(16)) & np.uint32(0xFFFF)) / 65536.0
         a = (0.5 + k * R2[0] + shift_a) % 1.0
         b = (0.5 + k * R2[1] + shift_b) % 1.0
-        radius, turn = np.sqrt(a), 2 * np.pi * b
-        x, y, z = radius * np.cos(turn), radius * np.sin(turn), np.sqrt(max(0.0, 1 - a))
+        disc_radius, azimuth = np.sqrt(a), 2 * np.pi * b
+        x, y, z = disc_radius * np.cos(azimuth), disc_radius * np.sin(azimuth), np.sqrt(max(0.0, 1 - a))
         nx, ny, nz = normal[i, 0], normal[i, 1], normal[i, 2]
         # Branch-free basis about the normal: Duff et al., JCGT 2017.
         sign = np.float32(1 if nz >= 0 else -1)
@@ -74,16 +74,16 @@ def _directions(normal: Floats, k: int, rays: int, out: Floats) -> None:
         out[i, 2] = -x * sign * nx + -y * ny + z * nz
 
 
-def smoothed(texels: Texels, value: Floats, position: NDArray[Any], normal: NDArray[Any], reach: float) -> Floats:
-    """`value` (n,) averaged over neighbouring texels within `reach` (mesh units) whose normals agree."""
+def smooth_over_surface(texels: Texels, value: Floats, position: NDArray[Any], normal: NDArray[Any], radius: float) -> Floats:
+    """`value` (n,) averaged over neighbouring texels within `radius` (mesh units) with similar normals."""
     values = texels.image(value, np.nan)[..., 0]
-    out = _filter(values, texels.image(position), texels.image(normal), np.float32(reach))
+    out = _filter(values, texels.image(position), texels.image(normal), np.float32(radius))
     return np.asarray(out.ravel()[texels.index], np.float32)
 
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")
-def _filter(value: Floats, position: Floats, normal: Floats, reach: np.float32) -> Floats:
-    """Mean of `value` (s, s; NaN where empty) over near texels, weighted by distance and agreement of normals."""
+def _filter(value: Floats, position: Floats, normal: Floats, radius: np.float32) -> Floats:
+    """Mean of `value` (s, s; NaN where empty) over neighbouring texels, weighted by distance and similarity of normals."""
     size = value.shape[0]
     out = value.copy()
     for j in numba.prange(size):
@@ -92,17 +92,17 @@ def _filter(value: Floats, position: Floats, normal: Floats, reach: np.float32) 
                 continue
             total: Any = 0.0
             weight: Any = 0.0
-            for y in range(max(0, j - FILTER), min(size, j + FILTER + 1)):
-                for x in range(max(0, i - FILTER), min(size, i + FILTER + 1)):
+            for y in range(max(0, j - FILTER_RADIUS), min(size, j + FILTER_RADIUS + 1)):
+                for x in range(max(0, i - FILTER_RADIUS), min(size, i + FILTER_RADIUS + 1)):
                     if not value[y, x] >= 0:
                         continue
-                    gap, turn = 0.0, 0.0
+                    distance2, cosine = 0.0, 0.0
                     for c in range(3):
-                        gap += (position[y, x, c] - position[j, i, c]) ** 2
-                        turn += normal[y, x, c] * normal[j, i, c]
-                    if gap > reach * reach or turn < 0.8:
+                        distance2 += (position[y, x, c] - position[j, i, c]) ** 2
+                        cosine += normal[y, x, c] * normal[j, i, c]
+                    if distance2 > radius * radius or cosine < 0.8:
                         continue
-                    w = (turn - 0.8) * (1.0001 - gap / (reach * reach))
+                    w = (cosine - 0.8) * (1.0001 - distance2 / (radius * radius))
                     total += w * value[y, x]
                     weight += w
             if weight > 0:

@@ -1,11 +1,10 @@
-"""The UV atlas: charts by xatlas, packing of our own into an exact power-of-two square.
+"""UV atlas: charts by xatlas, packed by `gsbake.texturing.packing` into an exact power-of-two square.
 
-xatlas' chart growing takes time that rises faster than the mesh, so the mesh is cut into compact clusters first, which run as separate
-meshes in parallel. A chart that xatlas left mirrored is mirrored back and every chart is scaled to its true surface area, so that the texel
-density is even; `gsbake.texturing.packing` then places them.
+xatlas' chart growing is superlinear in the number of faces, so the mesh is split into compact clusters first, which run as separate meshes
+in parallel. Mirrored charts are mirrored back, and every chart is scaled to its true surface area for a uniform texel density.
 
-UVs leave in the glTF convention: origin at the top left of the image, v downwards. Seen from outside, the image is never mirrored:
-with v flipped upwards every triangle keeps its counter-clockwise turn.
+UVs are in the glTF convention: origin at the top left of the image, v downwards. Seen from outside, the image is never mirrored:
+with v flipped upwards every triangle keeps its counter-clockwise orientation.
 """
 
 from __future__ import annotations
@@ -33,7 +32,7 @@ CLUSTER_FACES = 1000
 NOISY_DIHEDRAL = 0.2
 #: Laplacian steps of that smoothing.
 SMOOTHING_STEPS = 4
-#: Resolution at which charts that xatlas folded over themselves are looked for.
+#: Resolution at which charts that overlap themselves are searched for.
 CHECK_SIZE = 2048
 
 
@@ -59,7 +58,7 @@ class Atlas:
 
 
 def signed_areas(uv: NDArray[Any], faces: NDArray[Any]) -> Floats:
-    """Signed areas (f,) of triangles `faces` (f, 3) in the plane of `uv` (v, 2); positive when they turn from +u to +v."""
+    """Signed areas (f,) of triangles `faces` (f, 3) in the plane of `uv` (v, 2); positive when oriented from +u to +v."""
     a, b, c = (np.asarray(uv, np.float64)[faces[:, k]] for k in range(3))
     return 0.5 * ((b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (c[:, 0] - a[:, 0]) * (b[:, 1] - a[:, 1]))
 
@@ -75,7 +74,7 @@ def make_atlas(vertices: NDArray[Any], faces: NDArray[Any], size: int, padding: 
     gap = max(2, size // 128) if padding is None else padding
     source, uv, corner = _chart(_smoothed_when_noisy(points, triangles), triangles)
     chart = _islands(len(uv), corner)
-    uv = _upright(points, triangles, uv, corner, chart)
+    uv = _normalise_charts(points, triangles, uv, corner, chart)
     packed = pack(uv, corner, chart, size, gap)
     for alone in (False, True, True):
         folded = overlapping_faces(packed.uv / size, corner, CHECK_SIZE)
@@ -99,15 +98,15 @@ def _islands(count: int, corner: Ints) -> Ints:
 
 
 def _detach(source: Ints, uv: Floats, corner: Ints, folded: NDArray[np.bool_], alone: bool) -> tuple[Ints, Floats, Ints]:
-    """Give the folded faces (f,) vertices of their own, in connected groups or each `alone`: they become charts of their own."""
+    """Make charts of the folded faces (f,), with vertices of their own: one per connected group, or one per face if `alone`."""
     index = np.flatnonzero(folded)
     group = np.arange(len(index)) if alone else _islands(len(uv), corner[index])
     pairs = np.stack([np.repeat(group, 3), corner[index].ravel()], 1)
     unique, inverse = np.unique(pairs, axis=0, return_inverse=True)
     out = corner.copy()
     out[index] = len(uv) + inverse.reshape(-1, 3)
-    kept, compact = np.unique(out, return_inverse=True)
-    from_old = np.concatenate([np.arange(len(uv)), unique[:, 1]])[kept]
+    used, compact = np.unique(out, return_inverse=True)
+    from_old = np.concatenate([np.arange(len(uv)), unique[:, 1]])[used]
     return source[from_old], uv[from_old], compact.reshape(-1, 3)
 
 
@@ -125,7 +124,7 @@ def _chart(points: Floats, faces: Ints) -> tuple[Ints, Floats, Ints]:
         parts.append((mine, used))
     options = xatlas.PackOptions()
     options.rotate_charts = options.rotate_charts_to_axis = False
-    options.resolution = 1024  # any: our own packing follows
+    options.resolution = 1024  # arbitrary: charts are packed again
     options.blockAlign = True
     atlas.generate(xatlas.ChartOptions(), options)
     source, coordinates, corner = [], [], np.zeros_like(faces)
@@ -148,8 +147,8 @@ def _clusters(centres: Floats) -> Ints:
     return label
 
 
-def _upright(points: Floats, faces: Ints, uv: Floats, corner: Ints, chart: Ints) -> Floats:
-    """Charts without mirroring, in surface units, each turned so that its tightest bounding box is axis-aligned."""
+def _normalise_charts(points: Floats, faces: Ints, uv: Floats, corner: Ints, chart: Ints) -> Floats:
+    """Charts without mirroring, in surface units, each rotated so that its tightest bounding box is axis-aligned."""
     count = int(chart.max()) + 1
     area_uv = np.bincount(chart, signed_areas(uv, corner), count)
     a, b, c = (points[faces[:, k]] for k in range(3))
@@ -169,7 +168,7 @@ def _upright(points: Floats, faces: Ints, uv: Floats, corner: Ints, chart: Ints)
 
 
 def _smoothed_when_noisy(points: Floats, faces: Ints) -> Floats:
-    """The positions charts are cut on: Laplacian-smoothed when the surface is noisy, else as they are."""
+    """The positions used for charting: Laplacian-smoothed if the surface is noisy, else unchanged."""
     edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
     face_of = np.tile(np.arange(len(faces)), 3)
     order = np.lexsort((edges[:, 1], edges[:, 0]))

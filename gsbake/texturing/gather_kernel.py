@@ -1,6 +1,6 @@
-"""Numba kernel: what one view gives to each texel, kept if it is among the texel's best views.
+"""Numba kernel that samples one view at all texels and stores the sample where the view is among the texel's best.
 
-Samples are kept as 16-bit codes of the square root of the linear value in 0..1: half the memory of floats, and even steps in perception.
+Samples are stored as 16-bit codes of the square root of the linear value in 0..1: half the memory of floats, about uniform in perception.
 """
 
 from __future__ import annotations
@@ -13,13 +13,13 @@ Floats = NDArray[np.float32]
 Codes = NDArray[np.uint16]
 Doubles = NDArray[np.float64]
 
-#: A view flatter than this (cosine between normal and view) gives nothing.
-GRAZING = 0.12
+#: Least cosine between a texel's normal and the view.
+MIN_COSINE = 0.12
 
 
 @numba.njit(cache=True, error_model="numpy")
 def _sample(image: Floats, x: float, y: float, c: int) -> float:
-    """Channel `c` of `image` (h, w, k) at pixel coordinates (x, y): Catmull-Rom, kept within what the nearest four pixels span."""
+    """Channel `c` of `image` (h, w, k) at pixel coordinates (x, y): Catmull-Rom, clamped to the range of the nearest four pixels."""
     height, width = image.shape[0], image.shape[1]
     fx, fy = x - 0.5, y - 0.5
     i, j = int(np.floor(fx)), int(np.floor(fy))
@@ -44,7 +44,7 @@ def _sample(image: Floats, x: float, y: float, c: int) -> float:
 def gather(
     position: Floats,  # (n, 3)
     normal: Floats,  # (n, 3) unit
-    pose: Doubles,  # (3, 4) frame -> camera
+    pose: Doubles,  # (3, 4) texels' frame -> camera
     centre: Doubles,  # (3,)
     lens: Doubles,  # fx, fy, cx, cy
     image: Floats,  # (h, w, c)
@@ -54,23 +54,23 @@ def gather(
     slack: float,
     view_weight: float,
     view: np.int16,
-    values: Codes,  # (n, keep, c) best views so far
+    values: Codes,  # (n, keep, c) samples of the best views so far
     weights: Floats,  # (n, keep)
     views: NDArray[np.int16],  # (n, keep)
 ) -> int:
-    """Put this view into `values`, `weights` and `views` wherever it is among a texel's best; returns to how many texels it gave."""
+    """Store this view in `values`, `weights` and `views` where it is among a texel's best; returns the number of texels it shows."""
     height, width, channels = image.shape
     depth_h, depth_w = depth.shape
     scale_x, scale_y = depth_w / width, depth_h / height
     focal = np.sqrt(lens[0] * lens[1])
     keep = weights.shape[1]
-    taken = 0
+    shown = 0
     for n in numba.prange(position.shape[0]):
         px, py, pz = position[n, 0], position[n, 1], position[n, 2]
         vx, vy, vz = centre[0] - px, centre[1] - py, centre[2] - pz
         away = np.sqrt(vx * vx + vy * vy + vz * vz)
         cosine = (vx * normal[n, 0] + vy * normal[n, 1] + vz * normal[n, 2]) / max(away, 1e-12)
-        if not cosine > GRAZING:
+        if not cosine > MIN_COSINE:
             continue
         z = pose[2, 0] * px + pose[2, 1] * py + pose[2, 2] * pz + pose[2, 3]
         if not z > 1e-6:
@@ -79,7 +79,7 @@ def gather(
         y = lens[1] * (pose[1, 0] * px + pose[1, 1] * py + pose[1, 2] * pz + pose[1, 3]) / z + lens[3]
         if not (x >= 1 and x <= width - 1 and y >= 1 and y <= height - 1):
             continue
-        # Seen if no farther than the farthest of the four depths around it; its own slope within a pixel is allowed for.
+        # Visible if no farther than the farthest of the four depths around it, with tolerance for its own slope within a pixel.
         i, j = int(np.floor(x * scale_x - 0.5)), int(np.floor(y * scale_y - 0.5))
         behind, beside = 0.0, 1.0
         for b in range(2):
@@ -98,10 +98,10 @@ def gather(
         for k in range(1, keep):
             if weights[n, k] < weights[n, worst]:
                 worst = k
-        taken += 1
+        shown += 1
         if w > weights[n, worst]:
             weights[n, worst] = w
             views[n, worst] = view
             for c in range(channels):
                 values[n, worst, c] = np.uint16(65535 * np.sqrt(min(max(_sample(image, x, y, c), 0.0), 1.0)) + 0.5)
-    return taken
+    return shown

@@ -1,8 +1,8 @@
-"""Smooth vertex normals, and the tangent-space normal map of a dense surface seen from a light mesh.
+"""Tangent-space normal map of the dense mesh on the low-poly mesh, and smooth vertex normals.
 
-From each texel's point of the light mesh a ray goes both ways along its normal; the nearer hit on the dense surface within a bound, if that
-surface faces the same way, gives its smooth normal, which is written in the texel's MikkTSpace frame (OpenGL: +Y up in the image). The
-bound follows from the distances found: the decimation error itself. A texel without such a hit stays flat.
+From each texel's point on the low-poly mesh rays are cast both ways along its normal; the nearer hit on the dense mesh within a bound, if
+it faces the same way, gives its smooth normal, coded in the texel's MikkTSpace frame (OpenGL: +Y up in the image). The bound follows from
+the distances found, that is from the decimation error. A texel without such a hit stays flat.
 
 Vertex normals are weighted by corner angle: Thürmer & Wüthrich, *Computing vertex normals from polygonal facets*, JGT 1998.
 Cohen, Olano & Manocha, *Appearance-preserving simplification*, SIGGRAPH 1998 (normal maps of simplified surfaces).
@@ -22,20 +22,20 @@ from gsbake.geometry.vectors import unit
 
 Floats = NDArray[np.float64]
 
-#: Widest search along the normal, as a share of the light mesh's bounding-box diagonal.
-WIDEST = 0.05
+#: Largest search distance along the normal, as a share of the low-poly mesh's bounding-box diagonal.
+MAX_DISTANCE = 0.05
 #: The bound on accepted distances is this many times the 95th percentile of the distances found.
-BOUND = 2.0
-#: A dense surface that turns from the light mesh by more than this (cosine) is another sheet, not detail.
-SAME_SIDE = 0.2
+BOUND_FACTOR = 2.0
+#: Least cosine between the normals of both meshes: below it, the hit is another sheet.
+MIN_COSINE = 0.2
 
 
 @dataclass(frozen=True)
-class Detail:
-    """The dense surface at each of n texels.
+class DenseSamples:
+    """The dense mesh at each of n texels.
 
-    `found` (n,) where there is one; `position` (n, 3) and unit `normal` (n, 3) in the mesh's frame, those of the light mesh where there is
-    none; `bound` the farthest accepted distance.
+    `found` (n,) where there is one; `position` (n, 3) and unit `normal` (n, 3) in the mesh's frame, those of the low-poly mesh elsewhere;
+    `bound`, the largest accepted distance.
     """
 
     found: NDArray[np.bool_]
@@ -59,35 +59,37 @@ def vertex_normals(vertices: NDArray[Any], faces: NDArray[Any]) -> Floats:
     return np.where(length > 1e-12, out / np.maximum(length, 1e-12), np.array([0.0, 0.0, 1.0]))
 
 
-def find_detail(position: NDArray[Any], normal: NDArray[Any], dense: RayCaster, dense_normals: NDArray[Any], diagonal: float) -> Detail:
-    """The dense surface along the normals of n texels: `position` (n, 3), `normal` (n, 3) of the light mesh.
+def sample_dense_mesh(
+    position: NDArray[Any], normal: NDArray[Any], dense: RayCaster, dense_normals: NDArray[Any], diagonal: float
+) -> DenseSamples:
+    """The dense mesh along the normals of n texels with `position` (n, 3) and `normal` (n, 3) of the low-poly mesh.
 
-    `dense_normals` (v, 3) belong to the dense mesh's vertices; `diagonal` is the light mesh's bounding-box diagonal.
+    `dense_normals` (v, 3) are those of the dense mesh's vertices; `diagonal` is that of the low-poly mesh's bounding box.
     """
     p, n = np.asarray(position, np.float64), unit(np.asarray(normal, np.float64))
-    widest = WIDEST * diagonal
-    slip = 1e-3 * widest  # so that a surface exactly at the texel is met by at least one of the two rays
+    max_distance = MAX_DISTANCE * diagonal
+    lift = 1e-3 * max_distance  # a surface exactly at the texel is hit by at least one of the two rays
     distance = np.full(len(p), np.inf)
-    place, turned = p.copy(), n.copy()
+    found_position, found_normal = p.copy(), n.copy()
     for side in (1.0, -1.0):
-        hits = dense.first_hit(p - side * slip * n, side * n)
-        away = np.abs(hits.distance - slip)
+        hits = dense.first_hit(p - side * lift * n, side * n)
+        offset = np.abs(hits.distance - lift)
         smooth = _smooth_normal(hits, dense, dense_normals)
-        take = hits.hit & (away < distance) & (away < widest) & (np.einsum("nd,nd->n", smooth, n) > SAME_SIDE)
-        distance[take] = away[take]
-        place[take] = dense.points(hits)[take]
-        turned[take] = smooth[take]
+        take = hits.hit & (offset < distance) & (offset < max_distance) & (np.einsum("nd,nd->n", smooth, n) > MIN_COSINE)
+        distance[take] = offset[take]
+        found_position[take] = dense.points(hits)[take]
+        found_normal[take] = smooth[take]
     near = distance[np.isfinite(distance)]
-    bound = float(min(widest, BOUND * np.quantile(near, 0.95) + 2 * slip)) if len(near) else 0.0
+    bound = float(min(max_distance, BOUND_FACTOR * np.quantile(near, 0.95) + 2 * lift)) if len(near) else 0.0
     found = distance <= bound
-    place[~found], turned[~found] = p[~found], n[~found]
-    return Detail(found, place, turned, bound)
+    found_position[~found], found_normal[~found] = p[~found], n[~found]
+    return DenseSamples(found, found_position, found_normal, bound)
 
 
-def normal_map(detail: Detail, normal: NDArray[Any], tangent: NDArray[Any]) -> NDArray[np.float32]:
-    """Tangent-space normals (n, 3) coded 0..1 (0.5 is zero, +Y up); flat where no detail was found.
+def normal_map(detail: DenseSamples, normal: NDArray[Any], tangent: NDArray[Any]) -> NDArray[np.float32]:
+    """Tangent-space normals (n, 3) coded 0..1 (0.5 is zero, +Y up); flat where the dense mesh was not found.
 
-    `normal` (n, 3) and `tangent` (n, 4) are the light mesh's, interpolated at the texels and not normalised.
+    `normal` (n, 3) and `tangent` (n, 4) are those of the low-poly mesh, interpolated at the texels and not normalised.
     """
     local = world_to_frame(detail.normal, normal, tangent)
     usable = detail.found & np.isfinite(local).all(1) & (local[:, 2] > 0.05)

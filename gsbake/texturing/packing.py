@@ -1,4 +1,4 @@
-"""Packing charts into one square of an exact size.
+"""Chart packing into one square texture of an exact size.
 
 Charts are drawn conservatively on a coarse grid, grown by half the padding, and placed one by one, largest first, at the lowest free
 position of the square in the best of four right-angle rotations. The scale is then searched so that all charts just fit. Rotations only:
@@ -30,7 +30,7 @@ SCALE_STEP = 1.012
 
 @dataclass(frozen=True)
 class Packed:
-    """Where charts went: `uv` (v, 2) texel coordinates in a square of `size`, and `scale` in texels per input unit."""
+    """Packed charts: `uv` (v, 2) texel coordinates in a square of `size`, and `scale` in texels per input unit."""
 
     uv: Floats
     scale: float
@@ -38,7 +38,7 @@ class Packed:
 
 @numba.njit(cache=True, error_model="numpy")
 def _draw(uv: Floats, faces: Ints, cell: float, reach: float, out: NDArray[np.uint8]) -> None:
-    """Mark cells of `out` (h, w) whose square, grown by `reach` (in uv units), meets a triangle; uv starts at (reach, reach)."""
+    """Mark cells of `out` (h, w) whose square, grown by `reach` (in uv units), overlaps a triangle; uv starts at (reach, reach)."""
     height, width = out.shape
     for f in range(faces.shape[0]):
         x0, y0 = uv[faces[f, 0], 0], uv[faces[f, 0], 1]
@@ -82,8 +82,8 @@ def _bits(bitmap: NDArray[np.uint8]) -> NDArray[np.uint64]:
 
 
 @numba.njit(cache=True)
-def _meets(occupied: NDArray[np.uint64], row: NDArray[np.uint64], y: int, word: int, shift: np.uint64) -> bool:
-    """Whether one chart row shifted to (word, shift) meets row y of the occupied cells."""
+def _overlaps(occupied: NDArray[np.uint64], row: NDArray[np.uint64], y: int, word: int, shift: np.uint64) -> bool:
+    """Whether one chart row shifted to (word, shift) overlaps row y of the occupied cells."""
     back = np.uint64(64) - shift
     carry = np.uint64(0)
     for k in range(row.shape[0]):
@@ -99,17 +99,17 @@ def _meets(occupied: NDArray[np.uint64], row: NDArray[np.uint64], y: int, word: 
 def _place(occupied: NDArray[np.uint64], rows: NDArray[np.uint64], width: int, cells: int, limit: int) -> tuple[int, int]:
     """Lowest (then leftmost) free position (x, y) with y < limit, or (-1, -1).
 
-    `occupied` (cells, words + 1) has one spare word per row, which takes the bits shifted past the end.
+    `occupied` (cells, words + 1) has one extra word per row for the bits shifted past the end.
     """
     height = rows.shape[0]
     for y in range(min(limit, cells - height + 1)):
         for x in range(cells - width + 1):
             word, shift = x >> 6, np.uint64(x & 63)
             free = True
-            # The middle row of a chart is the widest as a rule: look there first.
+            # The middle row of a chart is usually the widest: test it first.
             for k in range(height):
                 r = (height // 2 + k) % height
-                if _meets(occupied, rows[r], y + r, word, shift):
+                if _overlaps(occupied, rows[r], y + r, word, shift):
                     free = False
                     break
             if free:

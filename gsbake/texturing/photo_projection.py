@@ -6,33 +6,33 @@ from pathlib import Path
 
 import numpy as np
 
-from gsbake.capture.photos.exposure import TiePoints
+from gsbake.capture.photos.exposure import TiePointExposure
 from gsbake.capture.posed_photos import PosedPhotos
 from gsbake.imaging.srgb import decode_bytes
 from gsbake.monitor import Monitor, Rule, decide_skip
 from gsbake.surfels.raster.render import SurfelRenderer
 from gsbake.surfels.training.views import held_out
 from gsbake.texturing.needed import constant_exposure
-from gsbake.texturing.projection import Blended, ProjectionBlender, mask_weights
-from gsbake.texturing.unwrapped_mesh import Surface
+from gsbake.texturing.projection import ProjectedTexture, ProjectionBlender, mask_weights
+from gsbake.texturing.unwrapped_mesh import UnwrappedMesh
 
-#: Weight of held-out photos: they fill only what no other photo observed, so that figures taken on them stay honest.
+#: Weight of held-out photos: they fill only what no other photo observed, so that validation figures stay unbiased.
 HELD_OUT_WEIGHT = 1e-4
 #: Within this share of a photo's longer side from the mask's boundary, pixels weigh less.
 MASK_MARGIN = 0.008
-#: Rendered materials count where the surfels are at least this opaque.
+#: Least alpha of a surfel render whose materials are used.
 MIN_ALPHA = 0.8
 
 
-def project_photos(surface: Surface, posed: PosedPhotos, holdout: int, equalisation: Rule, monitor: Monitor) -> Blended:
+def project_photos(surface: UnwrappedMesh, posed: PosedPhotos, holdout: int, equalisation: Rule, monitor: Monitor) -> ProjectedTexture:
     """Linear colours (n, 3) of the texels, fused from the photos at their stored size.
 
     `holdout` is that of training. `equalisation` is the rule of [skip] for dividing out exposure gains.
     """
-    aside = set(held_out(len(posed), holdout))
-    blender = ProjectionBlender(surface.at, surface.facing, surface.caster, 3, surface.texel)
-    asked = equalisation != "always"
-    tied = TiePoints.of(posed.folder / "sparse", posed.cameras.to_world.inverse()) if asked else None
+    held_out_views = set(held_out(len(posed), holdout))
+    blender = ProjectionBlender(surface.texel_position, surface.texel_normal, surface.caster, 3, surface.texel_size)
+    measured = equalisation != "always"
+    tied = TiePointExposure.from_model(posed.folder / "sparse", posed.cameras.to_world.inverse()) if measured else None
     for index in range(len(posed)):
         monitor.check_stop()
         view = posed.view(index)
@@ -41,28 +41,28 @@ def project_photos(surface: Surface, posed: PosedPhotos, holdout: int, equalisat
             tied.add(view.camera, linear)
         margin = MASK_MARGIN * max(view.camera.width, view.camera.height)
         weights = None if view.mask is None else mask_weights(view.mask, margin)
-        blender.add(view.camera, linear, weights, HELD_OUT_WEIGHT if index in aside else 1.0)
+        blender.add(view.camera, linear, weights, HELD_OUT_WEIGHT if index in held_out_views else 1.0)
         monitor.progress(index + 1, len(posed), "projection")
-    blended = blender.result(solve_exposure=asked)
+    projected = blender.result(solve_exposure=measured)
     constant, evidence = True, "not measured"
-    if asked:
-        constant, evidence = constant_exposure(blended.gains, blended.explained, None if tied is None else tied.spread())
+    if measured:
+        constant, evidence = constant_exposure(projected.gains, projected.explained, None if tied is None else tied.spread())
     skipped, done = "exposure taken as constant", "exposure equalised"
-    if decide_skip(monitor, "exposure_equalisation", equalisation, constant, evidence, skipped, done) and (blended.gains != 1).any():
-        blended = blender.result()
-    return blended
+    if decide_skip(monitor, "exposure_equalisation", equalisation, constant, evidence, skipped, done) and (projected.gains != 1).any():
+        projected = blender.result()
+    return projected
 
 
-def project_surfel_materials(surface: Surface, posed: PosedPhotos, trained: Path, size: int, monitor: Monitor) -> Blended:
+def project_surfel_materials(surface: UnwrappedMesh, posed: PosedPhotos, trained: Path, size: int, monitor: Monitor) -> ProjectedTexture:
     """Base colour, roughness, metallic (n, 5) of the texels, from the surfels of the folder `trained` rendered at the photos' poses.
 
     `size` is the longer side of the renders in pixels.
     """
     renderer = SurfelRenderer.load(trained)
-    blender = ProjectionBlender(surface.at, surface.facing, surface.caster, 5, surface.texel)
+    blender = ProjectionBlender(surface.texel_position, surface.texel_normal, surface.caster, 5, surface.texel_size)
     for index, full in enumerate(posed.cameras.cameras):
         monitor.check_stop()
-        camera = full.within(size)
+        camera = full.downscaled_to(size)
         buffers = renderer.gbuffer(camera)
         image = np.dstack([buffers["albedo"], buffers["roughness"], buffers["metallic"]])
         solid = (buffers["alpha"] > MIN_ALPHA).astype(np.uint8) * 255

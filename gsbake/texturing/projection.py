@@ -1,9 +1,9 @@
-"""Projecting views onto the texture and fusing them robustly.
+"""Projective texturing: views projected onto the texture and fused robustly.
 
-Views come one at a time. Each texel that a view sees gets a weight: how frontal and how near the view is (pixels per area), how far from
-depth edges and silhouettes, and the view's own weight image. The `KEEP` best views of a texel are stored. At the end one gain per view and
-channel may be solved for (exposure), the weighted median of a texel's views gives its centre, and the mean of the views near that centre,
-the best ones counting most, its value: highlights, foreground and misaligned edges fall away, detail stays as sharp as in the best photos.
+Views are added one at a time. Each texel visible in a view gets a weight: pixels per area (viewing angle and distance), distance to depth
+edges and silhouettes, and the view's own weight image. The `VIEWS_PER_TEXEL` best views of a texel are stored. At the end one exposure gain
+per view and channel may be solved for; a texel's value is the mean of its views near their weighted median, the best ones weighted most:
+highlights, occluders and misaligned edges are rejected, detail stays as sharp as in the best photos.
 
 Weights after Callieri et al., *Masked photo blending*, Computers & Graphics 2008; robust fusion as a weighted median followed by one
 reweighted mean (an M-estimator's step).
@@ -25,11 +25,11 @@ from gsbake.texturing.view_fusion import fuse, solve_gains
 
 Floats = NDArray[np.float32]
 
-#: Best views kept per texel.
-KEEP = 10
-#: Longer side of the depth maps that decide what a view sees.
+#: Best views stored per texel.
+VIEWS_PER_TEXEL = 10
+#: Longer side of the depth maps for visibility, in pixels.
 DEPTH_SIZE = 800
-#: Within this share of the depth map's longer side from a depth edge, a view counts less.
+#: Within this share of the depth map's longer side from a depth edge, a view weighs less.
 EDGE_MARGIN = 0.008
 #: A depth step larger than this share of the object's diagonal is an edge.
 EDGE_STEP = 0.015
@@ -38,48 +38,49 @@ DEPTH_SLACK = 0.003
 
 
 @dataclass(frozen=True)
-class Blended:
-    """Fused views: `values` (n, c) float32, `views` (n,) how many of the kept views saw each texel (0: unseen), `confidence` (n,) 0..1."""
+class ProjectedTexture:
+    """Fused views: `values` (n, c) float32; number of stored `views` (n,) of each texel (0: unobserved); `confidence` (n,) 0..1; `gains`
+    (views, c) divided out of the views; `explained`, the share of the views' differences that the gains explain."""
 
     values: Floats
     views: NDArray[np.int32]
     confidence: Floats
-    gains: Floats  # (views, c) factor that was divided out of each view
-    explained: float = 0.0  # share of the views' differences that went with the gains
+    gains: Floats
+    explained: float = 0.0
 
     @property
-    def seen(self) -> NDArray[np.bool_]:
-        """Texels that at least one view saw (n,)."""
+    def observed(self) -> NDArray[np.bool_]:
+        """Texels (n,) that at least one view shows."""
         return self.views > 0
 
 
 class ProjectionBlender:
     """Fuses images of `channels` channels into n texels with `position` (n, 3) and unit `normal` (n, 3).
 
-    `caster` holds the mesh the texels lie on; `texel` is the edge of a texel in mesh units, used to filter photos finer than the texture.
+    `caster` holds the mesh of the texels; `texel_size` is the edge of a texel in mesh units, used to filter photos finer than the texture.
     """
 
-    def __init__(self, position: NDArray[Any], normal: NDArray[Any], caster: RayCaster, channels: int, texel: float) -> None:
+    def __init__(self, position: NDArray[Any], normal: NDArray[Any], caster: RayCaster, channels: int, texel_size: float) -> None:
         self._position = np.ascontiguousarray(position, np.float32)
         self._normal = np.ascontiguousarray(normal, np.float32)
         self._caster = caster
-        self._texel = texel
+        self._texel_size = texel_size
         self._diagonal = float(np.linalg.norm(np.ptp(caster.vertices, axis=0))) if len(caster.vertices) else 1.0
         n = len(self._position)
-        self._values = np.zeros((n, KEEP, channels), np.uint16)
-        self._weights = np.zeros((n, KEEP), np.float32)
-        self._view = np.full((n, KEEP), -1, np.int16)
+        self._values = np.zeros((n, VIEWS_PER_TEXEL, channels), np.uint16)
+        self._weights = np.zeros((n, VIEWS_PER_TEXEL), np.float32)
+        self._view = np.full((n, VIEWS_PER_TEXEL), -1, np.int16)
         self._count = 0
 
     def add(self, camera: Camera, image: NDArray[Any], weight_image: NDArray[Any] | None = None, weight: float = 1.0) -> int:
-        """Project one view; returns to how many texels it gave.
+        """Project one view; returns the number of texels it shows.
 
-        `image` (h, w, c) is linear in 0..1 and of the size of `camera`, whose frame is the texels'.
-        `weight_image` (h, w) 0..1 multiplies the weights (0: never use the pixel); `weight` counts the whole view.
+        `image` (h, w, c) is linear in 0..1, of the size of `camera`, which is in the texels' frame.
+        `weight_image` (h, w) 0..1 multiplies the weights of pixels (0: never use the pixel), `weight` that of the whole view.
         """
-        picture = np.asarray(image, np.float32)
-        mask = np.ones(picture.shape[:2], np.float32) if weight_image is None else np.asarray(weight_image, np.float32)
-        camera, picture, mask = self._filtered(camera, picture, mask)
+        pixels = np.asarray(image, np.float32)
+        mask = np.ones(pixels.shape[:2], np.float32) if weight_image is None else np.asarray(weight_image, np.float32)
+        camera, pixels, mask = self._filtered(camera, pixels, mask)
         longer = max(camera.width, camera.height)
         shrink = min(1.0, DEPTH_SIZE / longer)
         small = camera.scaled(max(2, round(camera.width * shrink)), max(2, round(camera.height * shrink)))
@@ -87,43 +88,43 @@ class ProjectionBlender:
         edge = edge_weights(depth, EDGE_STEP * self._diagonal, EDGE_MARGIN * max(small.width, small.height))
         pose = np.concatenate([camera.R, camera.t[:, None]], 1)
         lens = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
-        taken = gather(
-            self._position, self._normal, pose, camera.centre, lens, np.ascontiguousarray(picture), np.ascontiguousarray(mask),
+        shown = gather(
+            self._position, self._normal, pose, camera.centre, lens, np.ascontiguousarray(pixels), np.ascontiguousarray(mask),
             depth, edge, DEPTH_SLACK * self._diagonal, weight, np.int16(self._count), self._values, self._weights, self._view,
         )  # fmt: skip
         self._count += 1
-        return int(taken)
+        return int(shown)
 
-    def result(self, solve_exposure: bool = False) -> Blended:
-        """Fuse what was added. `solve_exposure` first divides a gain per view and channel out (for photos, not for materials)."""
+    def result(self, solve_exposure: bool = False) -> ProjectedTexture:
+        """Fuse the views added. `solve_exposure` first divides out a gain per view and channel (for photos, not for materials)."""
         channels = self._values.shape[2]
         gains, explained = np.ones((max(self._count, 1), channels), np.float32), 0.0
         if solve_exposure and self._count > 1:
             gains, explained = solve_gains(self._values, self._weights, self._view, self._count)
         values, views, confidence = fuse(self._values, self._weights, self._view, gains)
-        return Blended(values, views, confidence, gains, explained)
+        return ProjectedTexture(values, views, confidence, gains, explained)
 
-    def _filtered(self, camera: Camera, picture: Floats, mask: Floats) -> tuple[Camera, Floats, Floats]:
-        """The view reduced by an area filter when its pixels are much finer than texels: sampling it at points would alias."""
-        towards = self._position - camera.centre.astype(np.float32)
-        depth = towards[:: max(1, len(towards) // 2000)] @ camera.R[2].astype(np.float32)
+    def _filtered(self, camera: Camera, pixels: Floats, mask: Floats) -> tuple[Camera, Floats, Floats]:
+        """The view reduced by an area filter when its pixels are much finer than texels, against aliasing."""
+        offset = self._position - camera.centre.astype(np.float32)
+        depth = offset[:: max(1, len(offset) // 2000)] @ camera.R[2].astype(np.float32)
         depth = depth[depth > 0]
         if len(depth) == 0:
-            return camera, picture, mask
-        pixels = self._texel * camera.fx / float(np.median(depth))
-        if pixels < 1.5:
-            return camera, picture, mask
-        size = (max(2, round(camera.width / pixels)), max(2, round(camera.height / pixels)))
+            return camera, pixels, mask
+        texel_width = self._texel_size * camera.fx / float(np.median(depth))
+        if texel_width < 1.5:
+            return camera, pixels, mask
+        size = (max(2, round(camera.width / texel_width)), max(2, round(camera.height / texel_width)))
         # Plane by plane: OpenCV's area filter takes at most four channels.
-        planes = [cv2.resize(np.ascontiguousarray(picture[..., c]), size, interpolation=cv2.INTER_AREA) for c in range(picture.shape[2])]
+        planes = [cv2.resize(np.ascontiguousarray(pixels[..., c]), size, interpolation=cv2.INTER_AREA) for c in range(pixels.shape[2])]
         reduced = np.asarray(np.stack(planes, 2), np.float32)
         return camera.scaled(*size), reduced, np.asarray(cv2.resize(mask, size, interpolation=cv2.INTER_AREA), np.float32)
 
 
 def edge_weights(depth: NDArray[Any], step: float, margin: float) -> Floats:
-    """Weights (h, w) 0..1 that fall to a small floor within `margin` pixels of a jump larger than `step` in `depth` (h, w; 0: nothing).
+    """Weights (h, w) 0..1 that fall to a small minimum within `margin` pixels of a step larger than `step` in `depth` (h, w; 0: nothing).
 
-    The floor is not 0, so that a thin part, all of it near an edge, is still textured by the views that see it.
+    The minimum is not 0, so that a thin part, all of it near an edge, is still textured.
     """
     z = np.where(depth > 0, depth, np.float32(1e6)).astype(np.float32)
     edge = np.zeros(z.shape, bool)
@@ -133,11 +134,11 @@ def edge_weights(depth: NDArray[Any], step: float, margin: float) -> Floats:
         after = (slice(1, None), slice(None)) if axis == 0 else (slice(None), slice(1, None))
         edge[before] |= jump
         edge[after] |= jump
-    far = cv2.distanceTransform((~edge).astype(np.uint8), cv2.DIST_L2, 5)
-    return np.asarray(np.clip(far / max(margin, 1e-6), 0.02, 1) ** 2, np.float32)
+    distance = cv2.distanceTransform((~edge).astype(np.uint8), cv2.DIST_L2, 5)
+    return np.asarray(np.clip(distance / max(margin, 1e-6), 0.02, 1) ** 2, np.float32)
 
 
 def mask_weights(mask: NDArray[np.uint8], margin: float) -> Floats:
     """Weights (h, w) from an object mask (255: object): 0 outside, rising to 1 at `margin` pixels inside."""
-    far = cv2.distanceTransform((mask > 127).astype(np.uint8), cv2.DIST_L2, 5)
-    return np.asarray(np.where(far > 0, np.clip(far / max(margin, 1e-6), 0.02, 1) ** 2, 0), np.float32)
+    distance = cv2.distanceTransform((mask > 127).astype(np.uint8), cv2.DIST_L2, 5)
+    return np.asarray(np.where(distance > 0, np.clip(distance / max(margin, 1e-6), 0.02, 1) ** 2, 0), np.float32)

@@ -1,4 +1,4 @@
-"""Which point of the surface each texel shows.
+"""Rasterisation of the UV atlas: the surface point of each texel.
 
 Every texel whose centre lies in a triangle of the UV atlas gets that triangle and exact barycentrics; texels within one texel of a chart's
 border, which bilinear filtering reads, get the nearest point of the chart. Texel (i, j) has its centre at (i + .5, j + .5); row 0 is the
@@ -20,13 +20,13 @@ Doubles = NDArray[np.float64]
 
 #: How far outside a chart (in texels) a texel still takes the chart's nearest point.
 BORDER = 1.0
-#: Triangles that share no more than a sliver of this width (in texels) do not count as overlapping.
+#: Triangles overlapping by no more than a sliver of this width (in texels) do not count as overlapping.
 MARGIN = 0.05
 
 
 @dataclass(frozen=True)
 class Texels:
-    """The n texels of a square texture of `size` that show the surface.
+    """The n texels of a square texture of `size` that lie on the surface.
 
     `index` (n,) int64 flat row-major texel; `face` (n,) int32; `bary` (n, 3) float32; `inside` (n,) False where the texel lies just outside
     its chart.
@@ -46,16 +46,16 @@ class Texels:
         return _interpolate(np.ascontiguousarray(values, np.float32), np.ascontiguousarray(faces, np.int32), self.face, self.bary)
 
     @cached_property
-    def slot(self) -> NDArray[np.int64]:
-        """Which texel each place (size²,) of the texture is, -1: none."""
+    def lookup(self) -> NDArray[np.int64]:
+        """Index (size²,) of the texel at each flat position of the texture, -1: none."""
         out = np.full(self.size * self.size, -1, np.int64)
         out[self.index] = np.arange(len(self))
         return out
 
-    def holding(self, uv: NDArray[Any]) -> NDArray[np.int64]:
-        """The texel (m,) that texture coordinates (m, 2) (origin top left) lie in, -1: none."""
+    def containing(self, uv: NDArray[Any]) -> NDArray[np.int64]:
+        """Index (m,) of the texel that contains each texture coordinate (m, 2) (origin top left), -1: none."""
         x, y = np.clip((uv * self.size).astype(np.int64), 0, self.size - 1).T
-        return np.asarray(self.slot[y * self.size + x])
+        return np.asarray(self.lookup[y * self.size + x])
 
     def image(self, values: NDArray[Any], empty: float = 0.0) -> Floats:
         """An image (size, size, c) float32 with texel `values` (n, c) or (n,) in place and `empty` elsewhere."""
@@ -65,7 +65,7 @@ class Texels:
         return out.reshape(self.size, self.size, -1)
 
     def covered(self) -> NDArray[np.bool_]:
-        """Which texels (size, size) show the surface."""
+        """Mask (size, size) of the texels on the surface."""
         out = np.zeros(self.size * self.size, bool)
         out[self.index] = True
         return out.reshape(self.size, self.size)
@@ -87,7 +87,7 @@ def overlapping(uv: NDArray[Any], faces: NDArray[Any], size: int) -> int:
 
 
 def overlapping_faces(uv: NDArray[Any], faces: NDArray[Any], size: int) -> NDArray[np.bool_]:
-    """Which triangles (f,) cover a texel centre that an earlier one covers; without them nothing overlaps."""
+    """Which triangles (f,) cover a texel centre that an earlier one covers; without them there is no overlap."""
     return _overlaps(uv, faces, size)[1]
 
 

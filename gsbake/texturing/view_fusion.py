@@ -1,6 +1,6 @@
-"""Fusing the best views of each texel: exposure gains, weighted median, reweighted mean.
+"""Robust fusion of the best views of each texel: exposure gains, weighted median, reweighted mean.
 
-Deviations are measured on square roots of linear values, which are about even in perception and in camera noise.
+Deviations are measured on square roots of linear values, which are about uniform in perception and in camera noise.
 """
 
 from __future__ import annotations
@@ -13,12 +13,12 @@ Floats = NDArray[np.float32]
 Codes = NDArray[np.uint16]
 
 #: Deviations (of square roots) below this are noise, whatever the spread of a texel's views.
-NOISE = 0.02
-#: Power of a view's weight in the final mean: higher leans on the best view alone (sharper, more seams).
+NOISE_FLOOR = 0.02
+#: Power of a view's weight in the final mean: a higher one favours the best view (sharper, more seams).
 SHARPNESS = 2.0
-#: Texels looked at for the gains.
+#: Texels used to solve for the gains.
 GAIN_TEXELS = 30_000
-#: Rounds of the gain solve.
+#: Rounds of the gain solver.
 GAIN_ROUNDS = 12
 
 
@@ -51,7 +51,7 @@ def fuse(values: Codes, weights: Floats, views: NDArray[np.int16], gains: Floats
     """
     count, keep, channels = values.shape
     out = np.zeros((count, channels), np.float32)
-    seen = np.zeros(count, np.int32)
+    view_count = np.zeros(count, np.int32)
     confidence = np.zeros(count, np.float32)
     for n in numba.prange(count):
         root = np.zeros((channels, keep))
@@ -64,7 +64,7 @@ def fuse(values: Codes, weights: Floats, views: NDArray[np.int16], gains: Floats
                 for c in range(channels):
                     root[c, m] = values[n, k, c] / 65535.0 / np.sqrt(gains[views[n, k], c])
                 m += 1
-        seen[n] = m
+        view_count[n] = m
         if m == 0:
             continue
         deviation = np.zeros(keep)
@@ -74,33 +74,33 @@ def fuse(values: Codes, weights: Floats, views: NDArray[np.int16], gains: Floats
                 deviation[k] += (root[c, k] - centre) ** 2 / channels
         for k in range(m):
             deviation[k] = np.sqrt(deviation[k])
-        spread = NOISE + _median(deviation, weight, m, order)
+        spread = NOISE_FLOOR + _median(deviation, weight, m, order)
         best = 0.0
         for k in range(m):
             best = max(best, weight[k])
-        total, plain = 0.0, 0.0
+        total, support = 0.0, 0.0
         for k in range(m):
-            trust = np.exp(-0.5 * (deviation[k] / spread) ** 2)
-            w = (weight[k] / best) ** SHARPNESS * trust
-            plain += weight[k] / best * trust
+            robust = np.exp(-0.5 * (deviation[k] / spread) ** 2)
+            w = (weight[k] / best) ** SHARPNESS * robust
+            support += weight[k] / best * robust
             total += w
             for c in range(channels):
                 out[n, c] += w * root[c, k] ** 2
         for c in range(channels):
             out[n, c] /= max(total, 1e-12)
-        confidence[n] = 1 - np.exp(-plain)
-    return out, seen, confidence
+        confidence[n] = 1 - np.exp(-support)
+    return out, view_count, confidence
 
 
 def solve_gains(values: Codes, weights: Floats, views: NDArray[np.int16], count: int) -> tuple[Floats, float]:
-    """Gain (count, c) of each view against the others, its geometric mean 1, from texels that several views share; and the share of the
-    views' differences there (mean of absolute logarithms) that goes with the gains.
+    """Gain (count, c) of each view relative to the others, with geometric mean 1, from texels that several views share; and the share of
+    the views' differences there (mean absolute logarithm) that the gains explain.
 
     Alternates between each texel's weighted median and each view's median ratio to it, in logarithms.
     """
     channels = values.shape[2]
-    several = np.flatnonzero((weights > 0).sum(1) >= 3)
-    chosen = several[:: max(1, len(several) // GAIN_TEXELS)]
+    shared = np.flatnonzero((weights > 0).sum(1) >= 3)
+    chosen = shared[:: max(1, len(shared) // GAIN_TEXELS)]
     gains = np.zeros((count, channels))
     if len(chosen) < 100:
         return np.ones((count, channels), np.float32), 0.0
@@ -117,14 +117,14 @@ def solve_gains(values: Codes, weights: Floats, views: NDArray[np.int16], count:
         ratio = logs - centre
         for v in range(count):
             mine = ratio[(view == v) & usable]
-            # Few shared texels say little: shrink towards no gain.
+            # Few shared texels are weak evidence: shrink towards no gain.
             if len(mine):
                 gains[v] = np.median(mine, axis=0) * len(mine) / (len(mine) + 50)
         gains -= gains.mean(0)
 
-    def differing(logs: NDArray[np.float64]) -> float:
+    def difference(logs: NDArray[np.float64]) -> float:
         return float(np.nanmean(np.abs(logs - np.nanmedian(logs, axis=1, keepdims=True))))
 
     gains = np.clip(gains, -1.5, 1.5)
-    explained = 1 - differing(logs - gains[view]) / max(differing(logs), 1e-9)
+    explained = 1 - difference(logs - gains[view]) / max(difference(logs), 1e-9)
     return np.exp(gains).astype(np.float32), max(0.0, explained)

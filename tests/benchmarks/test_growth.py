@@ -1,4 +1,4 @@
-"""What doubling costs, from known powers."""
+"""Factors per doubling of known power laws."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from benchmarks.growth import Cell, per_doubling, summary, with_doublings
 
 
 @pytest.mark.parametrize("power", [0.5, 1.0, 1.6])
-def test_a_power_law_costs_the_same_at_every_step(power: float) -> None:
+def test_a_power_law_has_a_constant_factor(power: float) -> None:
     assert per_doubling((12, 3 * 12**power), (96, 3 * 96**power)) == pytest.approx(2**power)
 
 
@@ -19,7 +19,7 @@ def test_doublings_are_per_curve_and_per_pixel() -> None:
     assert found == {("mesh", 12): None, ("mesh", 24): 2.5, ("bake", 12): None, ("stereo", 200): None, ("stereo", 400): 2.0}
 
 
-def test_the_summary_names_what_is_over_the_bar() -> None:
+def test_the_summary_marks_curves_over_the_maximum() -> None:
     cells = with_doublings(
         [Cell("photos", w, n, s) for w, n, s in (("mesh", 12, 2.0), ("mesh", 24, 5.0), ("bake", 12, 2.0), ("bake", 24, 4.0))]
     )

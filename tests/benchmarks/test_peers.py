@@ -1,4 +1,4 @@
-"""Other tools, played by scripts: what they are asked, and which rows come of it."""
+"""Other tools, replaced by scripts: arguments and resulting rows."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ CENTRES = {str(i): 4.0 * v for i, v in enumerate(np.vstack([np.eye(3), -np.eye(3
 
 @pytest.fixture(autouse=True)
 def _fewer_points(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(benchmarks.truth, "QUERIES", 5_000)
-    monkeypatch.setattr(benchmarks.truth, "ANCHORS", 20_000)
-    monkeypatch.setattr(benchmarks.truth, "LAID", (2_000, 10_000))
+    monkeypatch.setattr(benchmarks.truth, "SAMPLE_COUNT", 5_000)
+    monkeypatch.setattr(benchmarks.truth, "ANCHOR_COUNT", 20_000)
+    monkeypatch.setattr(benchmarks.truth, "ALIGNMENT_POINTS", (2_000, 10_000))
 
 
 @pytest.fixture
 def capture(tmp_path: Path) -> Path:
-    """A box, its cameras, and as `box.ply` what a tool might make of it; the asset and the cameras file lie beside it."""
+    """A box with cameras as ground truth; `box.ply` as a tool's mesh and `cameras.json` are beside it."""
     folder = tmp_path / "capture"
     (folder / "gt").mkdir(parents=True)
     box = trimesh.creation.box((1.0, 0.7, 0.4)).subdivide()
@@ -46,7 +46,7 @@ def script(path: Path, body: str) -> None:
 
 
 def install_openmvs(monkeypatch: pytest.MonkeyPatch, folder: Path, mesh: Path) -> None:
-    """Programs on the PATH that note their words and leave `mesh` where they were told to put theirs."""
+    """Programs on the PATH that log their arguments and copy `mesh` to their output path."""
     leave = f'echo "$0 $*" >> calls\nfor a; do case "$last" in -o) cp {mesh} "${{a%.mvs}}.ply";; esac; last="$a"; done'
     for program in peers.OPENMVS:
         script(folder / program, leave)
@@ -72,7 +72,7 @@ def test_openmvs_gets_a_row_for_every_mesh(tmp_path: Path, capture: Path, monkey
     assert all(r.chamfer_pct is not None and r.chamfer_pct < 0.2 and r.source == "measured" for r in rows)
 
 
-def test_openmvs_that_fails_or_makes_nothing_has_a_row_without_figures(
+def test_failed_or_empty_openmvs_has_a_row_without_figures(
     tmp_path: Path, capture: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     install_openmvs(monkeypatch, tmp_path / "programs", tmp_path / "box.ply")
@@ -101,8 +101,8 @@ def test_pyarchinit_is_run_where_it_is_installed(tmp_path: Path, capture: Path, 
     assert row.chamfer_pct is None
 
 
-def test_a_tool_that_hangs_is_given_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(peers, "LIMIT_SECONDS", 0.2)
+def test_a_tool_beyond_the_time_limit_is_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(peers, "TIMEOUT_SECONDS", 0.2)
     script(tmp_path / "sleeper", "exec sleep 60")
     done, seconds = peers.run_program([tmp_path / "sleeper"], tmp_path)
     assert not done and seconds < 30

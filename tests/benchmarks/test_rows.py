@@ -1,4 +1,4 @@
-"""The table of error against time: kept in CSV, merged, and its Pareto front."""
+"""Table of error against time: CSV file, merging, Pareto front."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ def row(seconds: float, chamfer: float | None, start: str = "hull", **more: obje
     return Row("thing", "gsbake", "preview", start, 100, seconds, chamfer, 0.5, 7.0, 20.0, 300.0, **more)  # type: ignore[arg-type]
 
 
-def test_rows_survive_the_file(tmp_path: Path) -> None:
+def test_csv_round_trip(tmp_path: Path) -> None:
     rows = [row(10.0, 1.5), row(20.0, None), *QUOTED]
     write_csv(tmp_path / "deep" / "t.csv", rows)
     assert sorted(map(str, read_csv(tmp_path / "deep" / "t.csv"))) == sorted(map(str, rows))
@@ -25,7 +25,7 @@ def test_new_rows_replace_their_series_only() -> None:
     assert merged(old, []) == old
 
 
-def test_the_front_leaves_out_what_is_beaten_and_what_has_no_mesh() -> None:
+def test_the_front_has_no_beaten_rows_and_none_without_a_mesh() -> None:
     rows = [row(30.0, 0.5), row(5.0, None), row(10.0, 1.0), row(20.0, 1.2), row(40.0, 0.5)]
     assert [r.seconds for r in front(rows)] == [10.0, 30.0]
     table = markdown(rows + [row(15.0, 0.7, source="quoted")])
@@ -33,7 +33,7 @@ def test_the_front_leaves_out_what_is_beaten_and_what_has_no_mesh() -> None:
     assert "preview, from hull (quoted)" in table
 
 
-def test_a_chart_is_drawn_of_rows_without_some_figures(tmp_path: Path) -> None:
+def test_rows_without_some_figures_have_a_chart(tmp_path: Path) -> None:
     draw(tmp_path / "c.svg", "avocado", [row(10.0, 1.0), row(20.0, None), *QUOTED])
     text = (tmp_path / "c.svg").read_text()
     assert text.count("OpenMVS 2.3 (quoted)") == 1 and "preview, from hull" in text

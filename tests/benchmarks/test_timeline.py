@@ -1,4 +1,4 @@
-"""Checkpoints of error against time: which bake each is, and what becomes of those that cannot be had."""
+"""Error against time: the bake of a checkpoint, and checkpoints that are not available."""
 
 from __future__ import annotations
 
@@ -21,31 +21,31 @@ def test_a_checkpoint_is_a_share_of_the_profile(tmp_path: Path, start: str, ster
     settings = session.profile.profile
     assert (settings.train.iterations, settings.refine.iterations) == (175, 20)
     assert (settings.train.init, settings.stereo.enabled) == (start, stereo)
-    assert session.out == tmp_path / "out" / "thing"  # all starts share one store
+    assert session.out == tmp_path / "out" / "thing"  # all initialisations share one output folder
 
 
-def test_captures_that_are_not_here_are_left_out_with_a_sentence(
+def test_missing_captures_are_skipped_with_a_message(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(timeline, "CAPTURES", tmp_path)
     (tmp_path / "blind").mkdir()
     write_csv(tmp_path / "t.csv", [OLD])
     timeline.main(["--captures", "gone,blind", "--csv", str(tmp_path / "t.csv"), "--charts", str(tmp_path), "--out", str(tmp_path / "out")])
-    said = capsys.readouterr().out
-    assert "gone: left out; " in said and "GSBAKE_CAPTURES" in said and "blind: left out; " in said and "no truth" in said
-    assert "| elsewhere | preview, from hull |" in said  # the front of what was measured before
+    printed = capsys.readouterr().out
+    assert "gone: skipped; " in printed and "GSBAKE_CAPTURES" in printed and "blind: skipped; " in printed and "no ground truth" in printed
+    assert "| elsewhere | preview, from hull |" in printed  # the Pareto front of the rows in the file
     assert read_csv(tmp_path / "t.csv") == [OLD]
 
 
-def test_a_start_that_cannot_be_had_leaves_no_row(
+def test_an_unavailable_initialisation_has_no_row(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     def refuse(*_: object) -> Row:
-        raise UsageError("they start from hull instead (few points).")
+        raise UsageError("the initialisation was hull (few points).")
 
     monkeypatch.setattr(timeline, "run_checkpoint", refuse)
     assert timeline.run_series("thing", tmp_path, "preview", "points", [0.0, 1.0], tmp_path, 1) == []
-    assert capsys.readouterr().out.count("left out; they start from hull instead") == 1
+    assert capsys.readouterr().out.count("skipped; the initialisation was hull") == 1
 
 
 @pytest.mark.slow
@@ -57,6 +57,6 @@ def test_the_built_in_capture_is_measured(tmp_path: Path, capsys: pytest.Capture
     assert [(r.start, r.steps) for r in rows] == [("hull", 0)]
     hull = rows[0]
     assert hull.chamfer_pct is not None and hull.chamfer_pct < 2 and hull.seconds > 0 and hull.peak_mb
-    # No step has moved the sphere: it lies around the object, and refining says so.
-    assert "from sphere: left out; refine: " in capsys.readouterr().out
+    # Without training the sphere lies outside the object, which the refine stage reports.
+    assert "from sphere: skipped; refine: " in capsys.readouterr().out
     assert "smoke, from hull" in (tmp_path / "error-time-built-in.svg").read_text()

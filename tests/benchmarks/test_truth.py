@@ -1,4 +1,4 @@
-"""The evaluator against shapes whose distances are known."""
+"""Error measures on shapes with known distances."""
 
 from __future__ import annotations
 
@@ -32,9 +32,9 @@ AROUND = {str(i): 4.0 * v / np.linalg.norm(v) for i, v in enumerate(np.array(lis
 
 @pytest.fixture(autouse=True)
 def _fewer_points(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(benchmarks.truth, "QUERIES", 8_000)
-    monkeypatch.setattr(benchmarks.truth, "ANCHORS", 40_000)
-    monkeypatch.setattr(benchmarks.truth, "LAID", (5_000, 30_000))
+    monkeypatch.setattr(benchmarks.truth, "SAMPLE_COUNT", 8_000)
+    monkeypatch.setattr(benchmarks.truth, "ANCHOR_COUNT", 40_000)
+    monkeypatch.setattr(benchmarks.truth, "ALIGNMENT_POINTS", (5_000, 30_000))
 
 
 def ball(radius: float = 1.0, subdivisions: int = 5) -> Surface:
@@ -52,16 +52,16 @@ def spiral() -> Surface:
 
 
 @pytest.mark.parametrize(("grown", "fscore"), [(0.01, 1.0), (0.05, 0.0)])
-def test_concentric_balls_are_as_far_apart_as_their_radii(grown: float, fscore: float) -> None:
+def test_distance_of_concentric_spheres_is_the_difference_of_their_radii(grown: float, fscore: float) -> None:
     found = measure(ball(1 + grown), Truth(ball(), AROUND))
-    expected = 100 * grown / (2 * 3**0.5)  # in % of the diagonal of the unit ball's box
+    expected = 100 * grown / (2 * 3**0.5)  # in % of the diagonal of the unit sphere's bounding box
     assert found.chamfer_pct == pytest.approx(expected, rel=0.03)
     assert found.accuracy_pct == pytest.approx(expected, rel=0.03) and found.completeness_pct == pytest.approx(expected, rel=0.03)
     assert found.fscore == fscore
-    assert found.normal_deg < 1.5  # an edge of these balls turns by about 1.8 degrees
+    assert found.normal_deg < 1.5  # adjacent faces of these spheres differ by about 1.8 degrees
 
 
-def test_only_what_the_cameras_see_counts_and_missing_parts_cost_completeness() -> None:
+def test_only_the_visible_surface_counts_and_missing_parts_lower_completeness() -> None:
     whole = ball(subdivisions=4)
     upper = Surface(whole.vertices, whole.faces[whole.corners[:, :, 2].min(1) > 0])
     above = {k: v for k, v in AROUND.items() if v[2] > 2}
@@ -70,7 +70,7 @@ def test_only_what_the_cameras_see_counts_and_missing_parts_cost_completeness() 
     assert found.accuracy_pct < 0.01 < 5 < found.completeness_pct
 
 
-def test_a_turned_face_shows_in_the_normals() -> None:
+def test_normal_error_of_a_rotated_face() -> None:
     plate = Surface(np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]), np.array([[0, 1, 2], [0, 2, 3]]))
     lean = np.radians(5)
     turned = plate.moved(Similarity(rotation=np.array([[1, 0, 0], [0, np.cos(lean), -np.sin(lean)], [0, np.sin(lean), np.cos(lean)]])))
@@ -79,7 +79,7 @@ def test_a_turned_face_shows_in_the_normals() -> None:
     assert found.accuracy_pct == pytest.approx(100 * np.sin(lean) / 2 / 8**0.5, rel=0.03)  # the mean |y| of the plate is a half
 
 
-def test_nearest_points_match_a_dense_search() -> None:
+def test_nearest_points_match_an_exhaustive_search() -> None:
     rng = np.random.default_rng(0)
     corners, points = rng.normal(size=(40, 3, 3)), 2 * rng.normal(size=(40, 3))
     step = np.linspace(0, 1, 201)
@@ -91,7 +91,7 @@ def test_nearest_points_match_a_dense_search() -> None:
     np.testing.assert_allclose(found, expected, atol=0.02)
 
 
-def test_nearest_on_a_folded_triangle_is_on_its_edge() -> None:
+def test_nearest_on_a_degenerate_triangle_is_on_its_edge() -> None:
     flat = np.array([[[0.0, 0, 0], [1, 0, 0], [2, 0, 0]]])  # no area
     np.testing.assert_allclose(nearest_on_faces(np.array([[1.5, 1.0, 0]]), flat), [[1.5, 0, 0]])
 
@@ -103,14 +103,14 @@ def test_distances_to_a_box_are_exact() -> None:
     np.testing.assert_allclose(distance, [0.25, 2**0.5, 0.75**0.5])
 
 
-def test_a_mesh_in_another_frame_is_laid_on_the_truth() -> None:
+def test_a_mesh_in_another_frame_is_aligned_with_the_ground_truth() -> None:
     shape = spiral()
     rng = np.random.default_rng(2)
     rotation = np.linalg.qr(rng.normal(size=(3, 3)))[0]
     rotation *= np.sign(np.linalg.det(rotation))
     away = Similarity(0.37, rotation, np.array([3.0, -1.0, 2.0]))
     centres = {k: away.apply(v) + 0.003 * rng.normal(size=3) for k, v in AROUND.items()}
-    centres["3"] = np.array([50.0, 0, 0])  # solved wrongly
+    centres["3"] = np.array([50.0, 0, 0])  # an outlier
     truth = Truth(shape, AROUND)
     found = align(shape.moved(away), centres, truth).matrix()
     np.testing.assert_allclose(found, away.inverse().matrix(), atol=0.01)
@@ -119,7 +119,7 @@ def test_a_mesh_in_another_frame_is_laid_on_the_truth() -> None:
         align(shape, {"0": centres["0"], "x": centres["1"]}, truth)
 
 
-def test_similarity_never_mirrors() -> None:
+def test_similarity_has_no_reflection() -> None:
     rng = np.random.default_rng(1)
     points = rng.normal(size=(20, 3))
     found = fit_similarity(points, points * [1, 1, -1])
@@ -147,13 +147,13 @@ def test_files_are_read_in_the_world_frame(tmp_path: Path) -> None:
     for name, centre in read_centres(tmp_path / "cameras.json").items():
         np.testing.assert_allclose(centre, AROUND[name])
     assert measure_file(tmp_path / "mesh.ply", capture).chamfer_pct < 1e-3
-    with pytest.raises(UsageError, match="no truth"):
+    with pytest.raises(UsageError, match="no ground truth"):
         read_truth(tmp_path)
     with pytest.raises(UsageError, match="no mesh"):
         read_mesh(tmp_path / "gone.ply")
 
 
-def test_a_mesh_nobody_sees_is_an_error() -> None:
+def test_an_invisible_mesh_is_an_error() -> None:
     inward = ball(subdivisions=2)
     with pytest.raises(UsageError, match="see nothing"):
         measure(Surface(inward.vertices, inward.faces[:, ::-1]), Truth(ball(subdivisions=2), AROUND))

@@ -1,4 +1,4 @@
-"""Reading and posing captures in a folder of the test, keeping what was reported."""
+"""Ingestion and pose estimation in a folder of the test, with recorded reports."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ CAPTURES = Path(os.environ.get("GSBAKE_CAPTURES", Path(__file__).resolve().paren
 
 
 class Done(Recorder):
-    """What a step reported, and the folder it wrote."""
+    """Reports of a step, and its output folder."""
 
     def __init__(self, out: Path) -> None:
         super().__init__()
@@ -30,7 +30,7 @@ class Done(Recorder):
 
 
 class Runner:
-    """Reads a capture and estimates its poses."""
+    """Ingests a capture and estimates its poses."""
 
     def __init__(self, root: Path) -> None:
         self.root = root
@@ -52,20 +52,20 @@ class Runner:
 
 @pytest.fixture
 def runner(tmp_path: Path) -> Runner:
-    """Runs stages below the test's folder."""
+    """Runner of stages in the test's folder."""
     return Runner(tmp_path / "run")
 
 
 @pytest.fixture
 def captures() -> Path:
-    """The shared captures; the test is skipped where they are not."""
+    """The shared captures; the test is skipped where they are missing."""
     if not CAPTURES.is_dir():
-        pytest.skip("shared captures are not here")
+        pytest.skip("the shared captures are missing")
     return CAPTURES
 
 
 def picture(seed: int, height: int = 48, width: int = 64) -> np.ndarray[Any, np.dtype[np.uint8]]:
-    """A smooth random RGB picture, different for every seed."""
+    """A smooth random RGB image of this seed."""
     import cv2
 
     coarse = np.random.default_rng(seed).integers(0, 255, (6, 8, 3), np.uint8)

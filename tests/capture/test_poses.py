@@ -12,15 +12,16 @@ import pytest
 from PIL import Image
 
 from gsbake.capture.posed_photos import PosedPhotos
-from gsbake.capture.sfm.process import Watch, run_job
+from gsbake.capture.sfm.process import JobCallbacks, run_job
 from gsbake.errors import BadInputError, InterruptedRun
 from gsbake.geometry.cameras import Camera, CameraSet
 from gsbake.geometry.ply import write_cloud
 from tests.capture.conftest import Done, Runner
+from tests.support.cameras import look_at
 
 
 def textured_board(size: int = 600) -> np.ndarray[Any, np.dtype[np.uint8]]:
-    """A picture full of corners at several scales."""
+    """An image with corners at several scales."""
     rng = np.random.default_rng(5)
     board = np.zeros((size, size, 3), np.float32)
     for cells in (8, 25, 75, 200):
@@ -29,7 +30,7 @@ def textured_board(size: int = 600) -> np.ndarray[Any, np.dtype[np.uint8]]:
 
 
 def photograph(camera: Camera, board: np.ndarray[Any, Any]) -> np.ndarray[Any, np.dtype[np.uint8]]:
-    """What a camera sees of a board in the plane z = 0 that spans [-1, 1]², with a step in it: the right half lies at z = 0.4."""
+    """Photo of a board that spans [-1, 1]² with a step in depth: the left half at z = 0, the right half at z = 0.4."""
     rays, eye = camera.rays(), camera.centre
     photo = np.full((camera.height, camera.width, 3), 90, np.uint8)
     depth = np.full((camera.height, camera.width), np.inf)
@@ -51,11 +52,7 @@ def board_capture(folder: Path, count: int = 8) -> list[Camera]:
     for i in range(count):
         a = np.radians(-40 + 80 * i / (count - 1))
         eye = np.array([3 * np.sin(a), -1.5 + 0.1 * i, 3 * np.cos(a)])
-        forward = -eye / np.linalg.norm(eye)
-        right = np.cross(forward, (0, 1.0, 0))
-        right /= np.linalg.norm(right)
-        rot = np.stack([right, np.cross(forward, right), forward])
-        camera = Camera(f"b{i}", 320, 240, 380.0, 380.0, 160.0, 120.0, rot, -rot @ eye)
+        camera = look_at(eye, size=(320, 240), focal=380.0, name=f"b{i}", up=(0.0, 1.0, 0.0))
         Image.fromarray(photograph(camera, board)).save(folder / "images" / f"b{i}.png")
         cameras.append(camera)
     return cameras
@@ -114,7 +111,7 @@ def test_given_poses_keep_their_frame_and_points_are_triangulated(tmp_path: Path
     cloud = posed.points()
     assert cloud is not None
     height = world.apply(cloud[0])[:, 2]
-    assert np.median(np.minimum(np.abs(height), np.abs(height - 0.4))) < 0.02  # they lie on the board's two planes
+    assert np.median(np.minimum(np.abs(height), np.abs(height - 0.4))) < 0.02  # on one of the board's two planes
 
 
 def test_photos_of_unrelated_places(tmp_path: Path, runner: Runner) -> None:
@@ -157,7 +154,7 @@ def test_a_stop_kills_the_process(tmp_path: Path) -> None:
             asked.append(time.monotonic())
         return bool(asked)
 
-    assert run_job(job, tmp_path / "out", Watch(lambda part, done, total: parts.append(part), stop)) is None
+    assert run_job(job, tmp_path / "out", JobCallbacks(lambda part, done, total: parts.append(part), stop)) is None
     assert time.monotonic() - asked[0] < 3
     assert parts[0] == "features"
     tails = [Path(f"/proc/{p}/cmdline") for p in os.listdir("/proc") if p.isdigit()] if Path("/proc").is_dir() else []
@@ -168,7 +165,7 @@ def test_a_stop_kills_the_process(tmp_path: Path) -> None:
             continue  # ended meanwhile
 
 
-def test_a_stopped_stage_says_so(tmp_path: Path, runner: Runner, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_stop_request_interrupts_the_stage(tmp_path: Path, runner: Runner, monkeypatch: pytest.MonkeyPatch) -> None:
     board_capture(tmp_path / "cap", 4)
     runner.ingest(tmp_path / "cap")
 
@@ -182,7 +179,7 @@ def test_a_stopped_stage_says_so(tmp_path: Path, runner: Runner, monkeypatch: py
 
 
 def test_masks_centre_the_object(tmp_path: Path, runner: Runner) -> None:
-    """RGBA photos of a ball: the unit sphere's inner nine tenths hold just the ball."""
+    """RGBA photos of a ball: its radius in the unit frame is 0.9."""
     from tests.capture.hull.test_visual_hull import CENTRE, RADIUS, ball_mask, ring
 
     (tmp_path / "images").mkdir()
@@ -198,7 +195,7 @@ def test_masks_centre_the_object(tmp_path: Path, runner: Runner) -> None:
     assert CameraSet.load(done.out / "cameras.json").to_world.scale == pytest.approx(results["radius"] / 0.9)
 
 
-def test_a_mask_that_lacks_a_part_is_mended(tmp_path: Path, runner: Runner) -> None:
+def test_an_incomplete_mask_is_completed(tmp_path: Path, runner: Runner) -> None:
     """A ball with given poses and points; in one photo the mask misses a disc in its middle."""
     from tests.capture.hull.test_visual_hull import CENTRE, RADIUS, ball_mask, ring
 
@@ -219,8 +216,8 @@ def test_a_mask_that_lacks_a_part_is_mended(tmp_path: Path, runner: Runner) -> N
     _, done = runner.poses()
     assert done.line("mask completion").startswith("1 of 16") and "c05" in done.line("mask completion")
     for camera in cameras:
-        mended = cv2.imread(str(done.out / "masks" / f"{camera.name}.png"), cv2.IMREAD_GRAYSCALE)
-        assert mended is not None and ((mended > 127) != (ball_mask(camera) > 127)).mean() < 0.002
+        completed = cv2.imread(str(done.out / "masks" / f"{camera.name}.png"), cv2.IMREAD_GRAYSCALE)
+        assert completed is not None and ((completed > 127) != (ball_mask(camera) > 127)).mean() < 0.002
 
 
 @pytest.mark.slow

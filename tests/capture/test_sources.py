@@ -21,7 +21,7 @@ def test_capture_folder(tmp_path: Path) -> None:
     assert [p.name for p in list_photos(found.photos)] == ["a.JPG", "b.png"]
 
 
-def test_photo_folder_takes_its_parents_masks_and_poses(tmp_path: Path) -> None:
+def test_masks_and_poses_of_the_parent_folder(tmp_path: Path) -> None:
     touch(tmp_path / "photos/a.jpg", tmp_path / "masks/a.png", tmp_path / "sparse/0/cameras.bin")
     found = discover(tmp_path / "photos")
     assert found.masks is not None and found.masks.samefile(tmp_path / "masks")
@@ -33,7 +33,7 @@ def test_photos_beside_their_transforms(tmp_path: Path) -> None:
     assert discover(tmp_path) == Sources(tmp_path, tmp_path / "masks", tmp_path / "transforms.json")
 
 
-def test_reference_data_is_never_looked_at(tmp_path: Path) -> None:
+def test_reference_data_is_never_read(tmp_path: Path) -> None:
     touch(tmp_path / "images/a.jpg", tmp_path / "gt/transforms.json", tmp_path / "gt/masks/a.png", tmp_path / "images/gt/b.jpg")
     assert discover(tmp_path) == Sources(tmp_path / "images")
     assert [p.name for p in list_photos(tmp_path / "images")] == ["a.jpg"]
@@ -63,7 +63,7 @@ def test_bad_overrides(tmp_path: Path) -> None:
     touch(tmp_path / "images/a.jpg", tmp_path / "poses.txt", tmp_path / "empty/x")
     with pytest.raises(BadInputError, match="mask folder"):
         discover(tmp_path, masks=tmp_path / "nomasks")
-    for name, words in (("nope.json", "do not exist"), ("poses.txt", "no known format"), ("empty", "holds no poses")):
+    for name, words in (("nope.json", "do not exist"), ("poses.txt", "unknown format"), ("empty", "holds no poses")):
         with pytest.raises(BadInputError, match=words):
             discover(tmp_path, poses=tmp_path / name)
     with pytest.raises(BadInputError, match="is a file"):

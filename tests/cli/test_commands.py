@@ -1,4 +1,4 @@
-"""The command line on a toy pipeline: what it prints, writes and remembers, and how it exits."""
+"""Command line on a toy pipeline: output, files, stored options and exit codes."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from tests.cli import toy_bake
 
 @dataclass(frozen=True)
 class End:
-    """How a command ended."""
+    """Exit code and output of a command."""
 
     code: int
     out: str
@@ -34,7 +34,7 @@ Run = Callable[..., End]
 
 @pytest.fixture
 def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> Iterator[Run]:
-    """Run a command in this process, in an empty current folder, over the toy stages."""
+    """Run a command on the toy stages, in this process and an empty working folder."""
     import gsbake.api
 
     monkeypatch.setattr(gsbake.api, "REGISTRY", toy_bake.REGISTRY)
@@ -66,7 +66,7 @@ def capture(tmp_path: Path) -> Path:
     return folder
 
 
-def test_run_puts_the_results_and_then_serves_them(run: Run, capture: Path, tmp_path: Path) -> None:
+def test_run_publishes_the_results_and_caches_the_stages(run: Run, capture: Path, tmp_path: Path) -> None:
     end = run("run", capture)
     out = tmp_path / "out" / "tankard"
     assert end.code == 0, end.err
@@ -78,8 +78,8 @@ def test_run_puts_the_results_and_then_serves_them(run: Run, capture: Path, tmp_
     assert lines[1].endswith("faces 30 000") and "all used" not in end.out
     assert [line.split()[0] for line in lines[4:]] == ["Asset", "Warnings", "Report", "Time"]
     assert lines[4].split()[1] == "out/tankard/asset.glb"
-    told = run("run", capture, "--out", "other", "-v").out
-    assert "mesh: Meshing (not run yet)" in told and "ingest: skip.redundant_photos: all used (none twice)" in told
+    verbose = run("run", capture, "--out", "other", "-v").out
+    assert "mesh: Meshing (not run yet)" in verbose and "ingest: skip.redundant_photos: all used (none twice)" in verbose
     again = run("run", capture)
     assert again.out.count("cached") == 4 and again.err == ""
     manifest = json.loads(next(out.glob("stages/ingest/*/manifest.json")).read_text())
@@ -87,7 +87,7 @@ def test_run_puts_the_results_and_then_serves_them(run: Run, capture: Path, tmp_
     assert set(manifest["inputs"]["masks"]["files"]) == {"a.png"} and "gt" not in json.dumps(manifest["inputs"])
 
 
-def test_memory_of_the_output_folder(run: Run, capture: Path, tmp_path: Path) -> None:
+def test_output_folder_stores_the_options(run: Run, capture: Path, tmp_path: Path) -> None:
     assert run("mesh", capture, "--out", "o", "--profile", "preview", "--set", "mesh.faces=500", "--seed", 3).code == 0
     project = json.loads((tmp_path / "o" / "project.json").read_text())
     assert project["photos"] == str(capture / "images") and project["masks"] == str(capture / "masks")
@@ -97,11 +97,11 @@ def test_memory_of_the_output_folder(run: Run, capture: Path, tmp_path: Path) ->
     assert (tmp_path / "o" / "asset.glb").read_text() == "glb ply 500" and end.json["files"]["asset.glb"] == "o/asset.glb"
     assert run("run", "--out", "o", "--set", "mesh.faces=600", "-q").out == ""
     assert (tmp_path / "o" / "asset.glb").read_text() == "glb ply 600"
-    fresh = run("run", capture, "--out", "o", "--json")  # PHOTOS starts anew, with the default profile
+    fresh = run("run", capture, "--out", "o", "--json")  # PHOTOS discards the stored options
     assert fresh.json["stages"][1]["results"] == {"faces": 30000}
 
 
-def test_result_that_is_no_more_is_deleted_unless_edited(run: Run, capture: Path, tmp_path: Path) -> None:
+def test_obsolete_result_is_deleted_unless_edited(run: Run, capture: Path, tmp_path: Path) -> None:
     run("run", capture, "--out", "o")
     assert (tmp_path / "o" / "light.hdr").exists()
     run("run", "--out", "o", "--profile", "preview")
@@ -137,9 +137,9 @@ def test_replace_and_undo(run: Run, capture: Path, tmp_path: Path) -> None:
         "would_replace": ["dense.ply", "mesh.ply"],
     }
     end = run("replace", "mesh", mine, "--out", "o")
-    assert end.code == 0 and "dense.ply, mesh.ply put in place by hand" in end.out
+    assert end.code == 0 and "dense.ply, mesh.ply replaced; `gsbake run` continues from there" in end.out
     end = run("run", "--out", "o")
-    assert "mesh: replaced by hand" in end.out and (tmp_path / "o" / "asset.glb").read_text() == "glb ply mine"
+    assert "mesh: replaced by the user" in end.out and (tmp_path / "o" / "asset.glb").read_text() == "glb ply mine"
     run("replace", "mesh", "--undo", "--out", "o")
     run("run", "--out", "o")
     assert (tmp_path / "o" / "asset.glb").read_text() == "glb ply 30000"
@@ -166,9 +166,12 @@ def test_replace_and_undo(run: Run, capture: Path, tmp_path: Path) -> None:
         (["run", "tankard", "--out", "tankard/images/a.jpg"], 2, "a file of that name exists"),
         (["run", "tankard", "--out", "/proc/nowhere"], 42, "choose another with --out"),
         (["run", "tankard", "--device", "cuda"], 2, "--device cuda is not available"),
+        (["run", "tankard", "--seed", "-1"], 2, "The seed must be a whole number from 0 to 2 147 483 647, not -1."),
+        (["status", "tankard", "--seed", "2147483648"], 2, "from 0 to 2 147 483 647, not 2147483648"),
+        (["run", "tankard", "--set", "loss.mask=inf"], 42, "loss.mask = inf is invalid: it must be a number from 0 to 10 000."),
     ],
 )
-def test_each_mistake_has_its_sentence_and_code(
+def test_each_error_has_one_sentence_and_an_exit_code(
     run: Run, capture: Path, tmp_path: Path, arguments: list[str], code: int, says: str
 ) -> None:
     (tmp_path / "empty").mkdir()
@@ -183,13 +186,13 @@ def test_each_mistake_has_its_sentence_and_code(
     assert machine.code == code and says in machine.json["error"] and machine.json["exit_code"] == code
 
 
-def test_wrong_option_is_usage(run: Run, capture: Path) -> None:
+def test_unknown_option_is_a_usage_error(run: Run, capture: Path) -> None:
     assert run("run", capture, "--fast").code == 2
     assert run("bakery").code == 2
     assert run("run", capture, "--device", "gpu").code == 2
 
 
-def test_unforeseen_failure_is_one_sentence_with_a_traceback_saved(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_internal_error_is_one_sentence_with_a_saved_traceback(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     import gsbake.cli.inspect
 
     monkeypatch.setattr(gsbake.cli.inspect, "shipped", lambda: 1 / 0)
@@ -206,7 +209,7 @@ def test_invert_masks_is_a_setting(run: Run, capture: Path, tmp_path: Path) -> N
     assert next((tmp_path / "o").glob("stages/ingest/*/photos.json")).read_text().endswith("TrueTrue")
 
 
-def test_profiles_lists_and_shows(run: Run) -> None:
+def test_profiles_are_listed_and_shown(run: Run) -> None:
     assert set(run("profiles", "--json").json) == {"smoke", "preview", "relight", "quality", "scan"}
     shown = run("profiles", "smoke", "--set", "mesh.faces=123", "--json").json
     assert shown["mesh.faces"]["value"] == 123 and shown["mesh.faces"]["origin"] == "--set"
@@ -214,7 +217,7 @@ def test_profiles_lists_and_shows(run: Run) -> None:
     assert "Training iterations" in run("profiles", "smoke").out
 
 
-def test_help_imports_nothing_heavy() -> None:
+def test_help_imports_no_large_library() -> None:
     import subprocess
 
     start = "import sys; sys.argv = ['gsbake', '--help']; from gsbake.cli import main"
@@ -225,7 +228,7 @@ def test_help_imports_nothing_heavy() -> None:
     assert loaded.isdisjoint({"torch", "numba", "cv2", "numpy", "scipy", "trimesh", "pydantic", "rich.progress", "gsbake.stages.train"})
 
 
-def test_completion_knows_stages_profiles_and_settings(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_completion_of_stages_profiles_and_settings(monkeypatch: pytest.MonkeyPatch) -> None:
     from gsbake.cli.options import complete_profile, complete_setting, complete_stage
 
     assert complete_profile("pr") == ["preview"] and complete_stage("re") == ["refine", "report"]

@@ -1,4 +1,4 @@
-"""The doctor: advice that fits the fault, and figures in words."""
+"""`gsbake doctor`: findings and advice."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def test_advice_names_the_debian_package() -> None:
     assert doctor.advice_for("xatlas", "", installed=False).startswith("pip install xatlas")
 
 
-def test_library_that_crashes_or_is_missing_is_found(
+def test_crashing_and_missing_libraries_are_found(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "crashing.py").write_text("import os; os.abort()")

@@ -1,4 +1,4 @@
-"""A toy pipeline with gsbake's own stage names and results, for tests of the command line."""
+"""Toy pipeline with gsbake's stage names and results for tests of the command line."""
 
 from __future__ import annotations
 

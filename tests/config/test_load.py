@@ -1,7 +1,10 @@
-"""Profiles: what ships is valid, extends works, and each mistake gets its sentence."""
+"""Loading of profiles: shipped profiles, `extends`, overrides, ranges and error messages."""
 
 from __future__ import annotations
 
+import tomllib
+from collections.abc import Callable
+from fnmatch import fnmatch
 from pathlib import Path
 
 import pytest
@@ -10,6 +13,37 @@ from pydantic import BaseModel
 from gsbake.config.load import DEFAULT, bounds, fields, load_profile, shipped
 from gsbake.config.schema import Profile
 from gsbake.errors import BadInputError, GsbakeError, UsageError
+from gsbake.stages import REGISTRY
+
+Condition = Callable[[Profile], bool]
+
+
+def fits_materials(p: Profile) -> bool:
+    return p.bake.materials == "fit"
+
+
+def trains_materials(p: Profile) -> bool:
+    return p.surfels.shading == "pbr"
+
+
+#: Settings that are read under a condition only.
+CONDITIONS: dict[str, Condition] = {
+    "stereo.[!e]*": lambda p: p.stereo.enabled != "never",
+    "surfels.sh_degree": lambda p: not trains_materials(p),
+    "light.size": lambda p: trains_materials(p) or p.bake.materials in ("fit", "delight"),
+    "train.lr_light": trains_materials,
+    "loss.smoothness": trains_materials,
+    "loss.neutral_light": trains_materials,
+    "refine.prune_distance": lambda p: p.refine.prune == "sdf",
+    "mesh.max_resolution": lambda p: p.mesh.resolution == 0,
+    "bake.fit_*": fits_materials,
+    "bake.smoothness": fits_materials,
+    "bake.*_l1": fits_materials,
+    "bake.neutral_light": fits_materials,
+    "bake.sparsity": fits_materials,
+    "bake.visibility": lambda p: p.bake.materials in ("fit", "delight"),
+    "bake.default_roughness": lambda p: p.bake.materials in ("none", "delight"),
+}
 
 
 def write(path: Path, text: str) -> str:
@@ -36,6 +70,32 @@ def test_every_setting_has_help() -> None:
     assert sum(len(s.model_fields) for s in sections) == len([k for k in fields() if "." in k])
 
 
+@pytest.mark.parametrize("name", sorted(shipped()))
+def test_a_shipped_profile_sets_only_what_a_stage_reads(name: str) -> None:
+    body = tomllib.loads(shipped()[name].read_text())
+    profile = load_profile(name).profile
+    declared = [pattern for stage in REGISTRY.names for pattern in REGISTRY.load(stage).settings]
+    keys = [f"{section}.{key}" for section, values in body.items() if isinstance(values, dict) for key in values]
+    assert keys and all(any(fnmatch(key, pattern) for pattern in declared) for key in keys)
+    unread = [key for key in keys for pattern, read in CONDITIONS.items() if fnmatch(key, pattern) and not read(profile)]
+    assert unread == []
+
+
+def test_conditions_name_settings() -> None:
+    assert all(any(fnmatch(key, pattern) for key in fields()) for pattern in CONDITIONS)
+
+
+def test_every_number_is_finite_and_bounded() -> None:
+    numbers = {key: field for key, field in fields().items() if field.annotation in (int, float)}
+    assert len(numbers) > 40
+    for key, field in numbers.items():
+        limits = {name for m in field.metadata for name in ("ge", "gt", "le", "lt") if getattr(m, name, None) is not None}
+        assert limits in ({"ge", "le"}, {"gt", "le"}), key
+        for value in ("inf", "-inf", "nan", "1e26", "-1", "text"):
+            with pytest.raises(BadInputError, match=rf"--set: {key} = .* is invalid: it must be a (whole )?number (from|above) "):
+                load_profile("smoke", [f"{key}={value}"])
+
+
 def test_extends_origins_and_overrides(tmp_path: Path) -> None:
     write(tmp_path / "base.toml", 'extends = "preview"\n[mesh]\nfaces = 777\nsmoothing_iterations = 1\n')
     mine = write(tmp_path / "mine.toml", 'extends = "base.toml"\n[mesh]\nfaces = 888\n')
@@ -58,16 +118,16 @@ def test_extends_origins_and_overrides(tmp_path: Path) -> None:
         ('[skip]\nredundant_photos = "sometimes"\n', ["skip.redundant_photos = 'sometimes'", "one of auto, always, never"]),
         ("[bake]\nfaces = 5\n", ["'bake.faces'", "the nearest is 'mesh.faces'"]),
         ("faces = 5\n", ["'faces'", "the nearest is 'mesh.faces'"]),
-        ("[mesh]\nfaces = 5\n", ["mesh.faces = 5 is invalid: it must be ≥ 100"]),
+        ("[mesh]\nfaces = 5\n", ["mesh.faces = 5 is invalid: it must be a whole number from 100 to 10 000 000."]),
         ("[bake]\nsize = 1000\n", ["bake.size = 1000", "one of 128, 256"]),
         ('[mesh]\nholes = "leaves"\n', ["mesh.holes = 'leaves'", "one of close, leave", "did you mean 'leave'?"]),
         ('[ingest]\ninvert_masks = "perhaps"\n', ["ingest.invert_masks", "must be true or false"]),
-        ('[train]\niterations = "many"\n', ["train.iterations = 'many'"]),
+        ('[train]\niterations = "many"\n', ["train.iterations = 'many' is invalid: it must be a whole number from 0 to 10 000 000."]),
         ('train = "fast"\n', ["'train'"]),
         ("[train\n", ["is not valid TOML", "line 1"]),
         ('extends = "previw"\n', ['extends = "previw" names no profile', "did you mean 'preview'?"]),
         ("extends = 3\n", ["'extends' must be the name of a profile"]),
-        ('extends = "mine.toml"\n', ["goes round in a circle"]),
+        ('extends = "mine.toml"\n', ["forms a cycle through mine.toml"]),
     ],
 )
 def test_mistakes_in_a_file(tmp_path: Path, text: str, says: list[str]) -> None:
@@ -84,7 +144,13 @@ def test_mistakes_in_a_file(tmp_path: Path, text: str, says: list[str]) -> None:
     ("override", "error", "says"),
     [
         ("train.iteration=5", BadInputError, "--set: there is no setting 'train.iteration'; the nearest is 'train.iterations'."),
-        ("loss.ssim=2", BadInputError, "--set: loss.ssim = 2 is invalid: it must be ≥ 0, ≤ 1."),
+        ("loss.ssim=2", BadInputError, "--set: loss.ssim = 2 is invalid: it must be a number from 0 to 1."),
+        ("loss.mask=inf", BadInputError, "--set: loss.mask = inf is invalid: it must be a number from 0 to 10 000."),
+        ("train.lr_sdf=0", BadInputError, "--set: train.lr_sdf = 0 is invalid: it must be a number above 0, up to 1."),
+        ("loss.mask=1e26", BadInputError, "--set: loss.mask = 1e+26 is invalid: it must be a number from 0 to 10 000."),
+        ("report.views=1e26", BadInputError, "--set: report.views = 1e+26 is invalid: it must be a whole number from 1 to 24."),
+        ("mesh.faces=abc", BadInputError, "--set: mesh.faces = 'abc' is invalid: it must be a whole number from 100 to 10 000 000."),
+        ("poses.fine_features=on?", BadInputError, "--set: poses.fine_features = 'on?' is invalid: it must be one of true, false, auto."),
         ("train.iterations", UsageError, "--set takes section.key=value, not 'train.iterations'."),
     ],
 )
@@ -94,6 +160,13 @@ def test_mistakes_in_overrides(override: str, error: type[GsbakeError], says: st
     assert str(caught.value) == says
 
 
+def test_an_integer_too_long_to_convert_is_shown_in_part(tmp_path: Path) -> None:
+    with pytest.raises(BadInputError, match=r"mesh\.faces = '9{59}… is invalid"):
+        load_profile("smoke", ["mesh.faces=" + 5000 * "9"])
+    with pytest.raises(BadInputError, match="is not valid TOML"):
+        load_profile(write(tmp_path / "long.toml", "[mesh]\nfaces = " + 5000 * "9"))
+
+
 def test_unknown_profile() -> None:
     with pytest.raises(UsageError, match="There is no profile 'relihgt': did you mean 'relight'?"):
         load_profile("relihgt")
@@ -101,7 +174,13 @@ def test_unknown_profile() -> None:
         load_profile("/no/such.toml")
 
 
-def test_bounds_in_words() -> None:
-    known = fields()
-    assert bounds(known["train.iterations"]) == "≥ 0, ≤ 10000000" and bounds(known["mesh.holes"]) == "one of close, leave"
-    assert bounds(known["ingest.invert_masks"]) == "" and bounds(known["poses.source"]) == "one of auto, given, solve"
+@pytest.mark.parametrize(
+    ("key", "allowed"),
+    [
+        ("train.iterations", "a whole number from 0 to 10 000 000"), ("train.lr_sdf", "a number above 0, up to 1"),
+        ("mesh.holes", "one of close, leave"), ("poses.source", "one of auto, given, solve"),
+        ("poses.masked_features", "one of true, false, auto"), ("ingest.invert_masks", "true or false"), ("export.copyright", ""),
+    ],
+)  # fmt: skip
+def test_bounds_in_words(key: str, allowed: str) -> None:
+    assert bounds(fields()[key]) == allowed

@@ -1,4 +1,4 @@
-"""Ray casting against analytic hits and against trimesh's own intersector."""
+"""Ray casting against analytic hits and trimesh's intersector."""
 
 from __future__ import annotations
 
@@ -37,8 +37,8 @@ def test_sphere_distance_and_trimesh_agree() -> None:
     b = (origins * directions).sum(1)
     exact = (-b - np.sqrt(b * b - a * ((origins**2).sum(1) - 1))) / a
     np.testing.assert_allclose(hits.distance * np.sqrt(a), exact * np.sqrt(a), atol=2e-3)  # facets lie inside the sphere
-    theirs = ball.ray.intersects_first(origins, directions)
-    assert (hits.face == theirs).mean() > 0.99
+    reference = ball.ray.intersects_first(origins, directions)
+    assert (hits.face == reference).mean() > 0.99
 
 
 def test_translation_and_units_do_not_matter() -> None:
@@ -57,7 +57,7 @@ def test_occlusion_respects_the_distance() -> None:
     assert not caster.occluded(origin, [[1.0, 0, 0]])[0]
 
 
-def test_many_rays_on_threads_equal_few() -> None:
+def test_result_does_not_depend_on_chunks_and_threads() -> None:
     caster = RayCaster(BOX.vertices, BOX.faces, threads=2)
     rng = np.random.default_rng(0)
     directions = rng.normal(size=(150_000, 3))
@@ -67,19 +67,19 @@ def test_many_rays_on_threads_equal_few() -> None:
     np.testing.assert_array_equal(whole.distance[-1000:], part.distance)
 
 
-def test_depth_is_along_the_axis_through_pixel_centres() -> None:
+def test_depth_is_along_the_axis_at_pixel_centres() -> None:
     camera = Camera("c", 8, 6, 10.0, 10.0, 4.0, 3.0, np.eye(3), np.array([0.0, 0.0, 5.0]))
     depth = RayCaster(BOX.vertices, BOX.faces).depth(camera)
     assert depth.shape == (6, 8) and depth.dtype == np.float32
-    seen = depth > 0
-    np.testing.assert_allclose(depth[seen], 3.5, rtol=1e-5)
+    visible = depth > 0
+    np.testing.assert_allclose(depth[visible], 3.5, rtol=1e-5)
     # Half widths of the front face at z = 3.5 are 0.5 and 1.0: |x - 4| / 10 * 3.5 < 0.5 at centres .5 and 1.5 off the middle column.
     x = np.abs(np.arange(8) + 0.5 - 4) * 0.35 < 0.5
     y = np.abs(np.arange(6) + 0.5 - 3) * 0.35 < 1.0
-    np.testing.assert_array_equal(seen, y[:, None] & x[None, :])
+    np.testing.assert_array_equal(visible, y[:, None] & x[None, :])
 
 
-def test_no_faces_no_rays() -> None:
+def test_no_faces_and_no_rays() -> None:
     empty = RayCaster(np.zeros((0, 3)), np.zeros((0, 3), int))
     assert not empty.first_hit(np.zeros((2, 3)), np.ones((2, 3))).hit.any()
     assert not empty.occluded(np.zeros((2, 3)), np.ones((2, 3))).any()

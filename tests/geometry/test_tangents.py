@@ -1,4 +1,4 @@
-"""Tangents against closed forms, and against the reference implementation."""
+"""MikkTSpace tangents against closed forms and the reference implementation."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ from tests.support.node import run_node
 
 
 def patch(n: int = 12) -> tuple[np.ndarray, np.ndarray]:
-    """Grid parameters (v, 2) in 0..1 and triangles that turn left in (s, t)."""
+    """Grid parameters (v, 2) in 0..1 and triangles with positive winding in (s, t)."""
     s, t = np.meshgrid(np.linspace(0, 1, n), np.linspace(0, 1, n), indexing="xy")
     k = np.arange(n * n).reshape(n, n)
     a, b, c, d = k[:-1, :-1].ravel(), k[:-1, 1:].ravel(), k[1:, 1:].ravel(), k[1:, :-1].ravel()
     return np.stack([s.ravel(), t.ravel()], 1), np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
 
 
-def test_a_plane_with_the_image_upright() -> None:
-    """On the x-z plane of a wall facing -y, u along +x and the image's up along +z."""
+def test_plane_with_upright_image() -> None:
+    """A wall in the x-z plane facing -y, u along +x, image up along +z."""
     grid, faces = patch()
     position = np.column_stack([grid[:, 0], np.zeros(len(grid)), grid[:, 1]])
     normal = np.tile([0.0, -1, 0], (len(grid), 1))
     found = tangents(position, normal, np.column_stack([grid[:, 0], 1 - grid[:, 1]]), faces)
     assert np.allclose(found.tangent, [1, 0, 0, 1], atol=1e-6)
-    # A normal map that leans up in the image (green above one half) leans towards +z.
+    # A normal tilted up in the image (green above one half) tilts towards +z.
     assert np.allclose(frame_to_world([[0, 0.6, 0.8]], normal[:1], found.tangent[:1]), [[0, -0.8, 0.6]], atol=1e-6)
     assert np.array_equal(found.faces, faces)
 
@@ -45,7 +45,7 @@ def test_sphere_in_longitude_and_latitude() -> None:
     assert np.abs((found.tangent[:, :3] * normal).sum(1)).max() < 1e-6
 
 
-def test_mirrored_half_is_split_with_its_own_sign() -> None:
+def test_mirrored_uvs_are_split_with_opposite_sign() -> None:
     grid, faces = patch(9)
     position = np.column_stack([grid[:, 0] - 0.5, grid[:, 1], np.zeros(len(grid))])
     normal = np.tile([0.0, 0, 1], (len(grid), 1))
@@ -57,14 +57,14 @@ def test_mirrored_half_is_split_with_its_own_sign() -> None:
     assert np.allclose(found.tangent[found.faces[~left].ravel()], [1, 0, 0, 1], atol=1e-6)
 
 
-def test_uvs_without_area_still_give_a_frame() -> None:
+def test_degenerate_uvs_give_a_frame() -> None:
     grid, faces = patch(4)
     normal = np.tile([0.0, 0, 1], (len(grid), 1))
     found = tangents(np.column_stack([grid, np.zeros(len(grid))]), normal, np.zeros((len(grid), 2)), faces)
     assert np.allclose(np.linalg.norm(found.tangent[:, :3], axis=1), 1) and np.abs(found.tangent[:, 2]).max() < 1e-6
 
 
-def test_frames_are_inverse_to_each_other() -> None:
+def test_frame_transforms_are_inverse() -> None:
     rng = np.random.default_rng(0)
     vector = rng.normal(size=(50, 3))
     normal = rng.normal(size=(50, 3))
@@ -73,7 +73,7 @@ def test_frames_are_inverse_to_each_other() -> None:
     assert np.allclose(back, vector / np.linalg.norm(vector, axis=1, keepdims=True), atol=1e-9)
 
 
-def test_same_as_the_reference_implementation(tmp_path: Path) -> None:
+def test_equals_the_reference_implementation(tmp_path: Path) -> None:
     """Against mikktspace.c compiled to WebAssembly (npm package `mikktspace`)."""
     ball = trimesh.creation.icosphere(subdivisions=3)
     rng = np.random.default_rng(0)
@@ -81,7 +81,7 @@ def test_same_as_the_reference_implementation(tmp_path: Path) -> None:
     keep = position[faces].mean(1)[:, 2] > 0.2
     faces = faces[keep]
     normal, uv = vertex_normals(position, faces), 0.5 + 0.4 * position[:, :2] + 0.02 * rng.random((len(position), 2))
-    mine = tangents(position, normal, np.column_stack([uv[:, 0], 1 - uv[:, 1]]), faces)
+    result = tangents(position, normal, np.column_stack([uv[:, 0], 1 - uv[:, 1]]), faces)
     body = {"p": position[faces].ravel().tolist(), "n": normal[faces].ravel().tolist(), "t": uv[faces].ravel().tolist()}
     (tmp_path / "in.json").write_text(json.dumps(body))
     script = (
@@ -89,7 +89,7 @@ def test_same_as_the_reference_implementation(tmp_path: Path) -> None:
         "const a=x=>new Float32Array(x);console.log(JSON.stringify(Array.from(m.generateTangents(a(d.p),a(d.n),a(d.t)))))"
     )
     reference = np.array(run_node(script, "mikktspace", tmp_path / "in.json")).reshape(-1, 3, 4)
-    ours = mine.tangent[mine.faces]
+    ours = result.tangent[result.faces]
     assert np.array_equal(ours[..., 3], reference[..., 3])
     angle = np.degrees(np.arccos(np.clip((ours[..., :3] * reference[..., :3]).sum(-1), -1, 1)))
     assert np.quantile(angle, 0.999) < 0.1

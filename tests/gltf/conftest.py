@@ -7,7 +7,7 @@ import pytest
 import trimesh
 
 from gsbake.geometry.tangents import tangents
-from gsbake.gltf.write import GltfImages, GltfMesh, build_glb
+from gsbake.gltf.write import GltfMesh, GltfTextures, build_glb
 from gsbake.imaging.png import encode_png
 from gsbake.texturing.atlas import make_atlas
 
@@ -25,14 +25,14 @@ def mesh() -> GltfMesh:
 
 
 @pytest.fixture(scope="session")
-def images() -> GltfImages:
+def images() -> GltfTextures:
     rng = np.random.default_rng(0)
     base = rng.integers(60, 200, (128, 128, 3), dtype=np.uint8)
     flat = np.tile(np.array([128, 128, 255], np.uint8), (128, 128, 1))
     orm = np.tile(np.array([250, 180, 0], np.uint8), (128, 128, 1))
-    return GltfImages(encode_png(base), encode_png(orm), encode_png(flat))
+    return GltfTextures(encode_png(base), encode_png(orm), encode_png(flat))
 
 
 @pytest.fixture(scope="session")
-def glb(mesh: GltfMesh, images: GltfImages) -> bytes:
+def glb(mesh: GltfMesh, images: GltfTextures) -> bytes:
     return build_glb(mesh, images, "ball", "gsbake test", "me", EXTRAS)

@@ -1,4 +1,4 @@
-"""Every rule of the audit must be able to fail."""
+"""Every audit rule fails for a matching defect."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from PIL.PngImagePlugin import PngInfo
 
 from gsbake.gltf.audit import audit, failed
 from gsbake.gltf.container import pack_glb, unpack_glb
-from gsbake.gltf.write import GltfImages, GltfMesh, build_glb
+from gsbake.gltf.write import GltfMesh, GltfTextures, build_glb
 from gsbake.imaging.png import encode_png
 
 EXTRAS = {"scale": "unknown"}
@@ -24,7 +24,7 @@ def broken(data: bytes) -> set[str]:
     return {f.rule for f in audit(data, "a.glb", 5, 100_000) if not f.passed}
 
 
-def test_a_good_asset_passes(glb: bytes) -> None:
+def test_a_valid_asset_passes(glb: bytes) -> None:
     findings = audit(glb, "a.glb", 5, 100_000)
     assert [f for f in findings if not f.passed and f.severity != "info"] == []
     assert len(findings) > 30
@@ -53,25 +53,25 @@ def put(index: Any, value: Any) -> Callable[[np.ndarray], None]:
         ("faces", put(0, (1, 1, 1)), "no degenerate triangles"),
     ],
 )
-def test_broken_attributes(mesh: GltfMesh, images: GltfImages, name: str, change: Callable[[np.ndarray], Any], rule: str) -> None:
+def test_broken_attributes(mesh: GltfMesh, images: GltfTextures, name: str, change: Callable[[np.ndarray], Any], rule: str) -> None:
     assert rule in broken(build_glb(with_values(mesh, name, change), images, "b", "g", "", EXTRAS))
 
 
-def test_nan_position(mesh: GltfMesh, images: GltfImages, glb: bytes) -> None:
+def test_nan_position(mesh: GltfMesh, images: GltfTextures, glb: bytes) -> None:
     document, binary = unpack_glb(glb, "a")
     changed = bytearray(binary)
     changed[0:4] = np.float32(np.nan).tobytes()
     assert {"finite values", "POSITION bounds"} <= broken(pack_glb(document, bytes(changed)))
 
 
-def test_mirrored_and_overlapping_uvs(mesh: GltfMesh, images: GltfImages) -> None:
+def test_mirrored_and_overlapping_uvs(mesh: GltfMesh, images: GltfTextures) -> None:
     mirrored = replace(mesh, uv=np.column_stack([1 - mesh.uv[:, 0], mesh.uv[:, 1]]).astype(np.float32))
     assert "no mirrored UVs" in broken(build_glb(mirrored, images, "b", "g", "", EXTRAS))
     squeezed = replace(mesh, uv=np.where(mesh.uv > 0.5, mesh.uv - 0.2, mesh.uv).astype(np.float32))
     assert "no overlapping UVs" in broken(build_glb(squeezed, images, "b", "g", "", EXTRAS))
 
 
-def test_tangents_out_of_the_surface(mesh: GltfMesh, images: GltfImages) -> None:
+def test_tangents_out_of_the_surface(mesh: GltfMesh, images: GltfTextures) -> None:
     leaning = replace(mesh, tangent=np.column_stack([mesh.normal, mesh.tangent[:, 3]]).astype(np.float32))
     assert "tangents in the surface" in broken(build_glb(leaning, images, "b", "g", "", EXTRAS))
 
@@ -82,7 +82,7 @@ def pillow(mode: str, size: tuple[int, int] = (128, 128), **options: Any) -> byt
     return out.getvalue()
 
 
-def test_broken_images(mesh: GltfMesh, images: GltfImages) -> None:
+def test_broken_images(mesh: GltfMesh, images: GltfTextures) -> None:
     def rules(**changed: bytes) -> set[str]:
         return broken(build_glb(mesh, replace(images, **changed), "b", "g", "", EXTRAS))
 
@@ -126,6 +126,6 @@ def test_limits(glb: bytes) -> None:
     assert [f.rule for f in failed(list(findings.values()))] == ["triangle count"]
 
 
-def test_a_file_that_is_no_glb() -> None:
+def test_an_unreadable_file() -> None:
     (only,) = audit(b"nothing", "a.glb", 5, 100)
     assert only.rule == "readable GLB" and not only.passed and only.severity == "error"

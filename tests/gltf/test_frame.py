@@ -1,4 +1,4 @@
-"""The asset's frame, and the cameras in it."""
+"""The asset frame, and the cameras in it."""
 
 from __future__ import annotations
 
@@ -28,22 +28,22 @@ def test_given_poses_keep_the_origin_of_the_world() -> None:
     assert np.isclose(np.linalg.det(frame.rotation), 1)
 
 
-def test_solved_poses_stand_on_the_ground() -> None:
+def test_solved_poses_have_their_origin_below_the_object() -> None:
     placed = asset_frame(CameraSet((VIEW,), FRAME, "solved"), POINTS).apply(POINTS)
     assert np.isclose(placed[:, 1].min(), 0)
     assert np.allclose((placed.min(0) + placed.max(0))[[0, 2]], 0)
     assert np.allclose(np.ptp(placed, axis=0), np.ptp(FRAME.apply(POINTS)[:, [0, 2, 1]], axis=0))
 
 
-def test_exported_cameras_see_the_asset_where_the_photos_did() -> None:
+def test_exported_cameras_project_the_asset_to_the_photos_pixels() -> None:
     cameras = CameraSet((VIEW,), FRAME, "solved")
     frame = asset_frame(cameras, POINTS)
     body = transforms_json(cameras, frame, {"shot": "IMG_1.JPG"})
     (entry,) = body["frames"]
     assert entry["file_path"] == "IMG_1.JPG" and body["scale"] == "unknown"
     to_camera = np.linalg.inv(np.array(entry["transform_matrix"]))
-    seen = frame.apply(POINTS) @ to_camera[:3, :3].T + to_camera[:3, 3]
+    local = frame.apply(POINTS) @ to_camera[:3, :3].T + to_camera[:3, 3]
     # OpenGL camera: looks along -z, y up.
-    x = entry["fl_x"] * seen[:, 0] / -seen[:, 2] + entry["cx"]
-    y = entry["fl_y"] * -seen[:, 1] / -seen[:, 2] + entry["cy"]
+    x = entry["fl_x"] * local[:, 0] / -local[:, 2] + entry["cx"]
+    y = entry["fl_y"] * -local[:, 1] / -local[:, 2] + entry["cy"]
     assert np.allclose(np.stack([x, y], 1), VIEW.project(POINTS)[0], atol=1e-6)

@@ -1,4 +1,4 @@
-"""Bake and export, from files to files, on a bumpy sphere whose base colour says where each point lies."""
+"""Bake and export from files to files, on a bumpy sphere whose base colour encodes the position."""
 
 from __future__ import annotations
 
@@ -22,11 +22,12 @@ from gsbake.geometry.tangents import frame_to_world
 from gsbake.gltf.export import ExportOptions, export_asset
 from gsbake.gltf.read import GltfAsset, read_glb
 from gsbake.imaging.exr import read_exr, write_exr
-from gsbake.imaging.srgb import LINEAR, encode_bytes
+from gsbake.imaging.srgb import decode_bytes, encode_bytes
 from gsbake.materials.bake import BakeOptions, bake_textures
 from gsbake.monitor import SILENT, Monitor
 from gsbake.shading.environment import EnvironmentLight
 from gsbake.texturing.texels import rasterise
+from tests.support.cameras import look_at
 from tests.support.recorder import Recorder
 
 SIZE, RADIUS, PHOTO = 256, 0.9, 240
@@ -56,15 +57,7 @@ def colour(p: np.ndarray) -> np.ndarray:
     return 0.45 + 0.3 * p / RADIUS
 
 
-def look(direction: np.ndarray, name: str) -> Camera:
-    z = -direction / np.linalg.norm(direction)
-    x = np.cross(z, [0.2, 0.1, 1.0])
-    x /= np.linalg.norm(x)
-    rotation = np.stack([x, np.cross(z, x), z])
-    return Camera(name, PHOTO, PHOTO, 300, 300, PHOTO / 2, PHOTO / 2, rotation, -rotation @ (-3 * z))
-
-
-def paint(view: Camera) -> np.ndarray:
+def render_view(view: Camera) -> np.ndarray:
     """The smooth sphere as the camera sees it, 8-bit sRGB."""
     ray = view.rays().reshape(-1, 3)
     ray /= np.linalg.norm(ray, axis=1, keepdims=True)
@@ -85,9 +78,9 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     k = np.arange(14) + 0.5
     height, turn = 1 - 2 * k / 14, np.pi * (1 + 5**0.5) * k
     around = np.stack([np.sqrt(1 - height**2) * np.cos(turn), np.sqrt(1 - height**2) * np.sin(turn), height], 1)
-    cameras = tuple(look(d, f"p{i:02d}") for i, d in enumerate(around))
+    cameras = tuple(look_at(3 * d, size=PHOTO, focal=300, name=f"p{i:02d}", up=(0.2, 0.1, 1.0)) for i, d in enumerate(around))
     for camera in cameras:
-        cv2.imwrite(str(folder / "poses/photos" / f"{camera.name}.png"), paint(camera)[..., ::-1])
+        cv2.imwrite(str(folder / "poses/photos" / f"{camera.name}.png"), render_view(camera)[..., ::-1])
     CameraSet(cameras, TO_WORLD, "given", metric=True).save(folder / "poses/cameras.json")
     photos = [{"name": c.name, "source": f"/somewhere/{c.name.upper()}.JPG"} for c in cameras]
     (folder / "ingest/photos.json").write_text(json.dumps({"photos": photos}))
@@ -113,23 +106,23 @@ def unit_points(asset: GltfAsset) -> tuple[np.ndarray, Any, np.ndarray]:
     return TO_WORLD.inverse().apply(world), texels, uv
 
 
-def test_every_file_is_there(run: Path) -> None:
+def test_files(run: Path) -> None:
     assert {p.name for p in (run / "bake").iterdir()} == {"mesh.safetensors", "base_color.exr", "orm.exr", "normal.exr", "coverage.exr"}
     names = {str(p.relative_to(run / "export")) for p in (run / "export").rglob("*") if p.is_file()}
     sheets = {f"previews/{name}.png" for name in ("base_color", "orm", "normal", "uv")}
     assert names == {"asset.glb", "cameras.json", "audit.json"} | sheets
 
 
-def test_base_colour_lies_where_it_belongs(asset: GltfAsset) -> None:
+def test_base_colour_is_at_its_position(asset: GltfAsset) -> None:
     p, texels, _ = unit_points(asset)
     image = asset.image("base_color")
     assert image is not None
-    error = np.abs(LINEAR[image].reshape(-1, 3)[texels.index] - colour(p))
+    error = np.abs(decode_bytes(image).reshape(-1, 3)[texels.index] - colour(p))
     assert error.mean() < 0.005 and np.quantile(error, 0.99) < 0.03
-    assert image.min() > 20  # no black surround, not in the empty texels either
+    assert image.min() > 20  # no black texels, not even outside the charts
 
 
-def test_normal_map_gives_the_true_normals_in_the_assets_frame(asset: GltfAsset) -> None:
+def test_normal_map_gives_the_true_normals_in_the_asset_frame(asset: GltfAsset) -> None:
     p, texels, _ = unit_points(asset)
     n = texels.interpolate(asset.attributes["NORMAL"], asset.faces)
     t = texels.interpolate(asset.attributes["TANGENT"], asset.faces)
@@ -150,7 +143,7 @@ def test_normal_map_gives_the_true_normals_in_the_assets_frame(asset: GltfAsset)
     assert angle.mean() < 1.5 and np.quantile(angle, 0.99) < 4
 
 
-def test_occlusion_is_alone_where_roughness_and_metallic_are_numbers(run: Path, asset: GltfAsset) -> None:
+def test_occlusion_only_texture_with_constant_roughness_and_metallic(run: Path, asset: GltfAsset) -> None:
     _, texels, _ = unit_points(asset)
     occlusion = asset.image("occlusion")
     assert occlusion is not None and "orm" not in asset.roles
@@ -161,16 +154,16 @@ def test_occlusion_is_alone_where_roughness_and_metallic_are_numbers(run: Path, 
     assert (surface["roughnessFactor"], surface["metallicFactor"]) == (0.8, 0.0)
 
 
-def test_colours_without_shading_look_the_same_under_their_light(run: Path, tmp_path: Path) -> None:
+def test_delighted_colours_under_the_estimated_light_match_the_photos(run: Path, tmp_path: Path) -> None:
     out = tmp_path / "bake"
     bake(run, out, materials="delight")
     mesh = load_file(out / "mesh.safetensors")
     texels = rasterise(mesh["uv"], mesh["faces"], SIZE)
     facing, points = (texels.interpolate(mesh[name], mesh["faces"]) for name in ("normal", "position"))
-    base, openness = (read_exr(out / name).reshape(SIZE * SIZE, 3)[texels.index] for name in ("base_color.exr", "orm.exr"))
+    base, occlusion = (read_exr(out / name).reshape(SIZE * SIZE, 3)[texels.index] for name in ("base_color.exr", "orm.exr"))
     light = EnvironmentLight.load(out / "light.safetensors").prefilter().diffuse(torch.as_tensor(facing)).detach().numpy()
-    seen = base * light * openness[:, :1]
-    assert np.abs(seen - colour(points)).mean() < 0.01
+    shaded = base * light * occlusion[:, :1]
+    assert np.abs(shaded - colour(points)).mean() < 0.01
     assert np.abs(base - colour(points)).mean() > 0.01
 
 
@@ -207,13 +200,13 @@ def test_an_asset_over_the_triangle_limit_fails(run: Path, tmp_path: Path) -> No
         export(run, tmp_path / "export", max_triangles=1000)
 
 
-def test_a_damaged_mesh_is_told(run: Path, tmp_path: Path) -> None:
+def test_a_damaged_mesh_is_reported(run: Path, tmp_path: Path) -> None:
     (tmp_path / "mesh.ply").write_bytes((run / "mesh/mesh.ply").read_bytes()[:5000])
     with pytest.raises(BadInputError, match=r"mesh\.ply"):
         bake(run, tmp_path / "bake", tmp_path)
 
 
-def test_masters_are_half_floats_and_come_back(tmp_path: Path) -> None:
+def test_textures_are_half_floats_and_round_trip(tmp_path: Path) -> None:
     image = np.random.default_rng(0).random((5, 7, 3)).astype(np.float16)
     write_exr(tmp_path / "a.exr", image)
     assert np.array_equal(read_exr(tmp_path / "a.exr"), image.astype(np.float32))
@@ -222,12 +215,12 @@ def test_masters_are_half_floats_and_come_back(tmp_path: Path) -> None:
         read_exr(tmp_path / "b.exr")
 
 
-class Painted:
-    """Stands in for the surfel renderer: materials that follow the position, a light from world +x and above."""
+class FakeRenderer:
+    """Replacement of the surfel renderer: materials are functions of the position."""
 
     @staticmethod
-    def load(folder: Path) -> Painted:
-        return Painted()
+    def load(folder: Path) -> FakeRenderer:
+        return FakeRenderer()
 
     def gbuffer(self, camera: Camera) -> dict[str, np.ndarray]:
         ray = camera.rays().reshape(-1, 3)
@@ -244,7 +237,7 @@ class Painted:
 
 
 def test_materials_and_light_of_a_relightable_asset(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("gsbake.texturing.photo_projection.SurfelRenderer", Painted)
+    monkeypatch.setattr("gsbake.texturing.photo_projection.SurfelRenderer", FakeRenderer)
     folder = tmp_path / "run"
     folder.mkdir()
     for name in ("ingest", "poses", "mesh"):
@@ -261,7 +254,7 @@ def test_materials_and_light_of_a_relightable_asset(run: Path, tmp_path: Path, m
     orm, base = asset.image("orm"), asset.image("base_color")
     assert orm is not None and base is not None
     shown = orm.reshape(-1, 3)[texels.index] / 255
-    assert np.abs(LINEAR[base].reshape(-1, 3)[texels.index] - colour(p)).mean() < 0.005
+    assert np.abs(decode_bytes(base).reshape(-1, 3)[texels.index] - colour(p)).mean() < 0.005
     assert np.abs(shown[:, 1] - (0.5 + 0.3 * p[:, 2])).mean() < 0.005
     clear = np.abs(p[:, 0]) > 0.06
     assert np.abs(shown[clear, 2] - (p[clear, 0] > 0)).mean() < 0.01

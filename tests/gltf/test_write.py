@@ -1,4 +1,4 @@
-"""The GLB as others read it."""
+"""The GLB as read by other readers and by gsbake's own."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from gsbake.errors import BadInputError
 from gsbake.gltf.audit import audit, failed
 from gsbake.gltf.container import pack_glb, unpack_glb
 from gsbake.gltf.read import parse_glb
-from gsbake.gltf.write import GltfImages, GltfMesh, build_glb
+from gsbake.gltf.write import GltfMesh, GltfTextures, build_glb
 from gsbake.imaging.png import encode_png
 from gsbake.report.asset import from_gltf
 from tests.support.node import gltf_issues
@@ -31,7 +31,7 @@ def test_trimesh_reads_the_same_mesh(glb: bytes, mesh: GltfMesh) -> None:
     assert read.visual.material.normalTexture.getpixel((0, 0)) == (128, 128, 255)
 
 
-def test_own_reader_gives_back_what_was_written(glb: bytes, mesh: GltfMesh, images: GltfImages) -> None:
+def test_own_reader_round_trip(glb: bytes, mesh: GltfMesh, images: GltfTextures) -> None:
     asset = parse_glb(glb, "ball")
     assert set(asset.attributes) == {"POSITION", "NORMAL", "TANGENT", "TEXCOORD_0"}
     assert np.array_equal(asset.attributes["TANGENT"], mesh.tangent) and np.array_equal(asset.faces, mesh.faces)
@@ -41,19 +41,20 @@ def test_own_reader_gives_back_what_was_written(glb: bytes, mesh: GltfMesh, imag
 
 
 @pytest.mark.parametrize("flat", [True, False])
-def test_light_of_its_own_is_an_emissive_texture(mesh: GltfMesh, images: GltfImages, flat: bool) -> None:
-    glow = np.zeros((128, 128, 3), np.uint8)
-    glow[:64] = (0, 180, 240)
-    data = build_glb(mesh, GltfImages(images.base_color, images.orm, None if flat else images.normal, encode_png(glow)), "lamp", "test")
-    asset = parse_glb(data, "lamp")
+def test_emission_is_an_emissive_texture(mesh: GltfMesh, images: GltfTextures, flat: bool) -> None:
+    emission = np.zeros((128, 128, 3), np.uint8)
+    emission[:64] = (0, 180, 240)
+    textures = GltfTextures(images.base_color, images.orm, None if flat else images.normal, encode_png(emission))
+    data = build_glb(mesh, textures, "emitter", "test")
+    asset = parse_glb(data, "emitter")
     lit = asset.image("emissive")
-    assert lit is not None and np.array_equal(lit, glow)
+    assert lit is not None and np.array_equal(lit, emission)
     (read,) = trimesh.load(io.BytesIO(data), file_type="glb", process=False).geometry.values()
     assert read.visual.material.emissiveTexture.getpixel((0, 0)) == (0, 180, 240)
     assert list(read.visual.material.emissiveFactor) == [1, 1, 1]
 
 
-def test_small_meshes_use_short_indices_and_large_ones_do_not(images: GltfImages) -> None:
+def test_small_meshes_use_short_indices_and_large_ones_do_not(images: GltfTextures) -> None:
     for count, kind in ((65534, 5123), (65535, 5125)):
         column = np.zeros((count, 3), np.float32)
         large = GltfMesh(column, column, np.zeros((count, 4), np.float32), column[:, :2], np.array([[0, 1, count - 1]], np.int32))
@@ -71,10 +72,10 @@ def test_damaged_files_are_named() -> None:
         parse_glb(good, "x.glb")
 
 
-def test_numbers_stand_for_maps_that_are_not_there(mesh: GltfMesh, images: GltfImages) -> None:
+def test_factors_replace_constant_maps(mesh: GltfMesh, images: GltfTextures) -> None:
     occlusion = np.random.default_rng(2).integers(99, 256, (128, 128), np.uint8)
-    plain = GltfImages(images.base_color, encode_png(occlusion), images.normal)
-    data = build_glb(mesh, plain, "ball", "g", extras={"scale": "unknown"}, constants=(0.8, 0.25))
+    plain = GltfTextures(images.base_color, encode_png(occlusion), images.normal)
+    data = build_glb(mesh, plain, "ball", "g", extras={"scale": "unknown"}, factors=(0.8, 0.25))
     asset = parse_glb(data, "ball")
     assert asset.roles == {"base_color": 0, "occlusion": 1, "normal": 2}
     assert not failed(audit(data, "ball", 5.0, 10_000))
@@ -82,7 +83,7 @@ def test_numbers_stand_for_maps_that_are_not_there(mesh: GltfMesh, images: GltfI
     assert drawn is not None and np.allclose(drawn[..., 0], occlusion / 255) and np.allclose(drawn[..., 1:], [0.8, 0.25])
 
 
-def test_an_empty_mesh_is_refused(mesh: GltfMesh, images: GltfImages) -> None:
+def test_an_empty_mesh_is_rejected(mesh: GltfMesh, images: GltfTextures) -> None:
     with pytest.raises(ValueError, match="empty"):
         build_glb(GltfMesh(mesh.position, mesh.normal, mesh.tangent, mesh.uv, mesh.faces[:0]), images, "n", "g")
 

@@ -1,4 +1,4 @@
-"""PNGs read back by another decoder, free of ancillary chunks, and written loudly when they cannot be."""
+"""PNGs decoded by OpenCV, without ancillary chunks; errors when a file cannot be written."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from gsbake.imaging.png import encode_png, write_png
 
 @pytest.mark.parametrize("shape", [(1, 1, 3), (5, 7, 3), (64, 33, 3), (9, 16), (9, 16, 1), (6, 5, 4)])
 def test_opencv_reads_the_same_pixels(shape: tuple[int, ...]) -> None:
-    draw = np.random.default_rng(1)
-    for pixels in (draw.integers(0, 256, shape, np.uint8), np.cumsum(np.ones(shape, np.uint8), 0, np.uint8), np.full(shape, 7, np.uint8)):
+    rng = np.random.default_rng(1)
+    for pixels in (rng.integers(0, 256, shape, np.uint8), np.cumsum(np.ones(shape, np.uint8), 0, np.uint8), np.full(shape, 7, np.uint8)):
         data = encode_png(pixels)
         found = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
         order = [2, 1, 0, 3][: shape[2]] if len(shape) == 3 and shape[2] > 1 else None
         assert found is not None and np.array_equal(found.reshape(shape) if order is None else found[..., order], pixels)
-        kinds = [data[i + 4 : i + 8] for i in chunks(data)]
-        assert set(kinds) == {b"IHDR", b"IDAT", b"IEND"}
+        chunk_types = [data[i + 4 : i + 8] for i in chunks(data)]
+        assert set(chunk_types) == {b"IHDR", b"IDAT", b"IEND"}
 
 
 def chunks(data: bytes) -> list[int]:
-    """Where the chunks of a PNG begin."""
+    """Offsets of the chunks of a PNG."""
     out, at = [], 8
     while at < len(data):
         out.append(at)

@@ -1,4 +1,4 @@
-"""Averages that stop at edges."""
+"""The edge-aware filter."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from gsbake.materials.adjacency import neighbours
-from gsbake.materials.bilateral import REACH, Alike
+from gsbake.materials.bilateral import FILTER_RADIUS, EdgeAwareFilter
 from gsbake.texturing.texels import Texels, rasterise
 
 SIZE = 64
@@ -24,52 +24,52 @@ def chart(*corners: tuple[float, float]) -> Texels:
     return rasterise(np.array(uv), np.concatenate(faces), SIZE)
 
 
-def alike(texels: Texels, shown: NDArray[Any], apart: float = 0.0) -> Alike:
-    """The filter where the texture lies on a plane, its right half moved `apart`, or to the left where that is negative."""
+def make_filter(texels: Texels, colour: NDArray[Any], apart: float = 0.0) -> EdgeAwareFilter:
+    """The filter of a texture on a plane, with its right half moved to the right by `apart`."""
     row, column = np.divmod(texels.index, SIZE)
     at = np.column_stack([column + apart * (column >= SIZE / 2), row, np.zeros(len(row))]).astype(float)
-    return Alike(texels, neighbours(texels, at, np.tile([0.0, 0.0, 1.0], (len(row), 1))), shown)
+    return EdgeAwareFilter(texels, neighbours(texels, at, np.tile([0.0, 0.0, 1.0], (len(row), 1))), colour)
 
 
-def paint(texels: Texels, left: float, right: float) -> NDArray[np.float32]:
+def two_colours(texels: Texels, left: float, right: float) -> NDArray[np.float32]:
     column = texels.index % SIZE
     return np.repeat(np.where(column < 0.3 * SIZE, left, right)[:, None], 3, 1).astype(np.float32)
 
 
 @pytest.mark.parametrize(("right", "crosses"), [(0.5, True), (0.02, False)])
-def test_votes_cross_one_colour_and_stop_at_an_edge(right: float, crosses: bool) -> None:
+def test_filter_stops_at_colour_edges(right: float, crosses: bool) -> None:
     texels = chart((0.1, 0.1))
     column = texels.index % SIZE
-    votes = np.where(column < 0.3 * SIZE, 1.0, 0.0)
-    shared = alike(texels, paint(texels, 0.5, right))(votes)
+    values = np.where(column < 0.3 * SIZE, 1.0, 0.0)
+    filtered = make_filter(texels, two_colours(texels, 0.5, right))(values)
     far = np.abs(column - 0.3 * SIZE) > 5
-    assert (shared[far & (votes == 0)].mean() > 0.2) == crosses
-    assert (shared[far & (votes == 1)].mean() < 0.8) == crosses
+    assert (filtered[far & (values == 0)].mean() > 0.2) == crosses
+    assert (filtered[far & (values == 1)].mean() < 0.8) == crosses
 
 
 @pytest.mark.parametrize(("apart", "share"), [(0.0, False), (-3.0, True)])
-def test_charts_share_across_a_seam_only(apart: float, share: bool) -> None:
+def test_filter_crosses_seams_between_adjacent_charts_only(apart: float, share: bool) -> None:
     texels = chart((0.05, 0.1), (0.5, 0.1))  # three texels between them in the texture
-    votes = (texels.index % SIZE < SIZE / 2).astype(float)
-    shared = alike(texels, np.full((len(texels), 3), 0.5), apart)(votes)
-    assert (shared[votes == 0].mean() > 0.2) == share
-    assert (shared[votes == 1].mean() < 0.8) == share
+    values = (texels.index % SIZE < SIZE / 2).astype(float)
+    filtered = make_filter(texels, np.full((len(texels), 3), 0.5), apart)(values)
+    assert (filtered[values == 0].mean() > 0.2) == share
+    assert (filtered[values == 1].mean() < 0.8) == share
 
 
-def test_what_is_even_stays_and_nothing_is_lost() -> None:
+def test_constants_and_sums_are_preserved() -> None:
     texels, rng = chart((0.1, 0.1)), np.random.default_rng(0)
-    same = alike(texels, rng.uniform(size=(len(texels), 3)))
-    np.testing.assert_allclose(same(np.full(len(texels), 0.7)), 0.7, atol=1e-9)
-    votes = rng.uniform(size=len(texels))
-    np.testing.assert_allclose(same(votes).sum(), votes.sum(), rtol=1e-9)
+    filter_ = make_filter(texels, rng.uniform(size=(len(texels), 3)))
+    np.testing.assert_allclose(filter_(np.full(len(texels), 0.7)), 0.7, atol=1e-9)
+    values = rng.uniform(size=len(texels))
+    np.testing.assert_allclose(filter_(values).sum(), values.sum(), rtol=1e-9)
 
 
-def test_along_one_colour_votes_fall_off_with_the_reach() -> None:
+def test_decay_on_a_uniform_colour_follows_the_radius() -> None:
     strip = rasterise(np.array([(0, 0.4), (1, 0.4), (1, 0.5), (0, 0.5)]), np.array([[0, 1, 2], [0, 2, 3]]), 256)
     row, column = np.divmod(strip.index, 256)
     at = np.column_stack([column, row, np.zeros(len(row))]).astype(float)
-    same = Alike(strip, neighbours(strip, at, np.tile([0.0, 0.0, 1.0], (len(row), 1))), np.full((len(row), 3), 0.5))
-    shared = same((column == 128).astype(float))
-    # (1 − REACH² ∂²) u = δ between walls 127 texels away, through which nothing goes
-    fall = np.cosh((127 - 10) / REACH) / np.cosh((127 - 40) / REACH)
-    assert shared[column == 138].mean() / shared[column == 168].mean() == pytest.approx(fall, rel=0.02)
+    filter_ = EdgeAwareFilter(strip, neighbours(strip, at, np.tile([0.0, 0.0, 1.0], (len(row), 1))), np.full((len(row), 3), 0.5))
+    filtered = filter_((column == 128).astype(float))
+    # (1 − FILTER_RADIUS² ∂²) u = δ with reflecting boundaries 127 texels away
+    fall = np.cosh((127 - 10) / FILTER_RADIUS) / np.cosh((127 - 40) / FILTER_RADIUS)
+    assert filtered[column == 138].mean() / filtered[column == 168].mean() == pytest.approx(fall, rel=0.02)

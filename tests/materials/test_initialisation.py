@@ -1,4 +1,4 @@
-"""Which of several whole fits is kept: told on fits whose score on held-out photos is known beforehand."""
+"""Choice of the initial roughness and validation of metals, on fits with known held-out PSNR."""
 
 from __future__ import annotations
 
@@ -9,29 +9,30 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from gsbake.materials.fit import FitSchedule, Fitted
-from gsbake.materials.initialisation import DOUBTED, RIVAL, TRIALS, Choice, best_fit, rivals
+from gsbake.materials.fit import Fitted
+from gsbake.materials.initialisation import CANDIDATE_MARGIN, METAL_MARGIN, TRIAL_ROUGHNESS, ChosenFit, best_fit, roughness_candidates
+from gsbake.materials.options import FitSchedule
 from gsbake.shading.environment import EnvironmentLight
 
 N = 4
-#: Photos only have a length here.
+#: Stand-ins for photos; only their length is used.
 PHOTOS: Any = [range(10)] * 4
 
 
 @dataclass
-class Known:
-    """A fit that shows held-out photos to `scores[roughness]` dB, with metals `gain` dB more than without, and `bare` less as it is."""
+class KnownFit:
+    """A fit with held-out PSNR `scores[roughness]`, `gain` dB more with metals, and `loss` dB less with metallic set to 0."""
 
     roughness: float
     scores: dict[float, float]
     gain: float = 0.0
-    bare: float = 0.0
+    loss: float = 0.0
     runs: list[tuple[float, bool]] = field(default_factory=list)
     metals: bool = False
 
     def run(self, photos: Any, held: Any, schedule: FitSchedule, each: Any = None) -> Fitted:
         metals = schedule.metallic and not schedule.diffuse
-        self.metals = metals and self.gain + self.bare != 0
+        self.metals = metals and self.gain + self.loss != 0
         self.runs.append((self.roughness, metals))
         score = self.scores[self.roughness] + (self.gain if self.metals else 0)
         metal = np.full(N, self.metals)
@@ -39,46 +40,46 @@ class Known:
         return Fitted(values, np.zeros((N, 3)), np.ones(N), np.zeros((N, 3)), EnvironmentLight(4), score if held else None, metal, 0, ())
 
     def psnr(self, photos: Any, values: NDArray[Any]) -> float:
-        assert (values[:, 4] == 0).all() and np.allclose(values[:, :3], 0.25)  # without metallic, as bright
-        return self.scores[self.roughness] + self.gain - self.bare
+        assert (values[:, 4] == 0).all() and np.allclose(values[:, :3], 0.25)  # metallic 0, same diffuse reflectance
+        return self.scores[self.roughness] + self.gain - self.loss
 
 
 def chosen(
-    trials: dict[float, float], scores: dict[float, float], held: Any = PHOTOS, matte: bool = False, **known: Any
-) -> tuple[Choice, list[tuple[float, bool]]]:
-    """What `best_fit` takes, and the whole fits it made as (roughness, metals)."""
+    trials: dict[float, float], scores: dict[float, float], held: Any = PHOTOS, diffuse: bool = False, **known: Any
+) -> tuple[ChosenFit, list[tuple[float, bool]]]:
+    """The result of `best_fit`, and the full fits made as (roughness, metals)."""
     runs: list[tuple[float, bool]] = []
-    make: Any = lambda roughness: Known(roughness, scores, runs=runs, **known)  # noqa: E731
-    return best_fit(make, PHOTOS, held, 10, 0, trials, matte), runs
+    make: Any = lambda roughness: KnownFit(roughness, scores, runs=runs, **known)  # noqa: E731
+    return best_fit(make, PHOTOS, held, 10, 0, trials, diffuse), runs
 
 
-def test_close_starts_are_rivals() -> None:
-    assert rivals({0.2: 21.0, 0.45: 21.0 + 0.5 * RIVAL, 0.8: 21.0 - 0.6 * RIVAL}) == [0.45, 0.2]
-    assert rivals({}) == []
+def test_close_trials_are_candidates() -> None:
+    assert roughness_candidates({0.2: 21.0, 0.45: 21.0 + 0.5 * CANDIDATE_MARGIN, 0.8: 21.0 - 0.6 * CANDIDATE_MARGIN}) == [0.45, 0.2]
+    assert roughness_candidates({}) == []
 
 
-def test_held_out_photos_choose_between_rivals() -> None:
+def test_held_out_photos_choose_between_candidates() -> None:
     choice, runs = chosen({0.2: 21.0, 0.45: 20.5, 0.8: 15.0}, {0.2: 22.0, 0.45: 23.0})
     assert choice.roughness == 0.45 and runs == [(0.2, True), (0.45, True)] and choice.fits == 2
-    assert "fitted in full 22.00 dB from 0.2, 23.00 dB from 0.45" in choice.why and choice.metals is None
+    assert "full fits: 22.00 dB from 0.2, 23.00 dB from 0.45" in choice.evidence and choice.metal_evidence is None
     choice, runs = chosen({0.2: 21.0, 0.45: 20.5}, {0.2: 22.0, 0.45: 23.0}, held=[])
-    assert choice.roughness == 0.2 and runs == [(0.2, True)]  # nobody to judge
+    assert choice.roughness == 0.2 and runs == [(0.2, True)]  # no validation
 
 
-@pytest.mark.parametrize(("matte", "start"), [(True, TRIALS[-1]), (False, TRIALS[1])])
-def test_without_trials(matte: bool, start: float) -> None:
-    choice, runs = chosen({}, {start: 30.0}, matte=matte)
-    assert choice.roughness == start and runs == [(start, not matte)]
+@pytest.mark.parametrize(("diffuse", "start"), [(True, TRIAL_ROUGHNESS[-1]), (False, TRIAL_ROUGHNESS[1])])
+def test_without_trials(diffuse: bool, start: float) -> None:
+    choice, runs = chosen({}, {start: 30.0}, diffuse=diffuse)
+    assert choice.roughness == start and runs == [(start, not diffuse)]
 
 
-def test_metals_that_photos_need_are_not_doubted() -> None:
-    choice, runs = chosen({0.2: 21.0}, {0.2: 22.0}, gain=1.0, bare=DOUBTED + 0.1)
-    assert choice.fitted.metal.all() and choice.fits == 1 and choice.metals is None
+def test_metals_with_clear_gain_are_accepted() -> None:
+    choice, runs = chosen({0.2: 21.0}, {0.2: 22.0}, gain=1.0, loss=METAL_MARGIN + 0.1)
+    assert choice.fitted.metal.all() and choice.fits == 1 and choice.metal_evidence is None
 
 
-@pytest.mark.parametrize(("gain", "stay"), [(0.2, True), (-0.2, False)])
-def test_doubted_metals_stay_where_a_fit_without_is_worse(gain: float, stay: bool) -> None:
-    choice, runs = chosen({0.2: 21.0}, {0.2: 22.0}, gain=gain, bare=DOUBTED - 0.1)
+@pytest.mark.parametrize(("gain", "accepted"), [(0.2, True), (-0.2, False)])
+def test_metals_are_rejected_where_a_fit_without_is_better(gain: float, accepted: bool) -> None:
+    choice, runs = chosen({0.2: 21.0}, {0.2: 22.0}, gain=gain, loss=METAL_MARGIN - 0.1)
     assert runs == [(0.2, True), (0.2, False)] and choice.fits == 2
-    assert choice.fitted.metal.all() == stay and choice.metals is not None
-    assert f"{22 + gain:.2f} dB with them, fitted without to 22.00 dB" in choice.metals
+    assert choice.fitted.metal.all() == accepted and choice.metal_evidence is not None
+    assert f"{22 + gain:.2f} dB with metals, 22.00 dB fitted without" in choice.metal_evidence

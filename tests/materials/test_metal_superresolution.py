@@ -11,36 +11,36 @@ from numpy.typing import NDArray
 from scipy.optimize import lsq_linear
 
 from gsbake.materials.metal_superresolution import (
-    HUE,
-    Seen,
-    _likely,
-    _metal,
-    _of_calm_hue,
-    _parts,
-    _repeated,
-    _solved,
-    metal_places,
-    sharpened,
+    HUE_RADIUS,
+    MetalPixels,
+    _correlated,
+    _metal_colour,
+    _metal_or_black,
+    _photo_systems,
+    _solve,
+    _with_local_hue,
+    metal_regions,
+    superresolved,
 )
-from gsbake.materials.metallic import Evidence, Line, told
+from gsbake.materials.metallic import LinearShading, PhotoSamples, unclipped_weights
 from gsbake.texturing.texels import Texels
 
 SIZE = 32
 GOLD = np.array([0.9, 0.7, 0.4], np.float32)
 ROW, COLUMN = np.divmod(np.arange(SIZE * SIZE), SIZE)
-#: A grille: which texels are holes, its base colour, and which texels lie well inside the photos.
+#: Perforated metal: which texels are holes, its base colour, and which texels lie well inside the photos.
 HOLE = (COLUMN % 6 < 3) & (ROW % 6 < 3)
-GRILLE = np.where(HOLE[:, None], 0.0, GOLD).astype(np.float32)
+PERFORATED = np.where(HOLE[:, None], 0.0, GOLD).astype(np.float32)
 INNER = (np.minimum(COLUMN, ROW) > 3) & (np.maximum(COLUMN, ROW) < SIZE - 5)
 
 
-def everywhere() -> Texels:
+def full_texture() -> Texels:
     n = SIZE * SIZE
     return Texels(SIZE, np.arange(n), np.zeros(n, np.int32), np.zeros((n, 3), np.float32), np.ones(n, bool))
 
 
-def photos(base: NDArray[np.float32], count: int = 30, noise: float = 0.0) -> list[Seen]:
-    """Photos whose pixels are the means of squares of 3 x 3 texels, each photo with a grid and a reflection of its own."""
+def photos(base: NDArray[np.float32], count: int = 30, noise: float = 0.0) -> list[MetalPixels]:
+    """Photos whose pixels are the means of squares of 3 x 3 texels, each photo with its own grid and reflection."""
     rng = np.random.default_rng(5)
     out = []
     for _ in range(count):
@@ -50,46 +50,47 @@ def photos(base: NDArray[np.float32], count: int = 30, noise: float = 0.0) -> li
         slope = np.repeat(rng.uniform(0.1, 0.9, (len(corner), 1)), 3, 1).astype(np.float32)
         offset = np.full_like(slope, 0.02)
         colour = slope * base[texel].mean(1) + offset + rng.normal(scale=noise, size=slope.shape)
-        seen = Evidence(texel[:, 4], colour.astype(np.float32), np.ones(len(corner), np.float32), np.zeros(len(corner), np.int32), never)
+        weight, block = np.ones(len(corner), np.float32), np.zeros(len(corner), np.int32)
+        samples = PhotoSamples(texel[:, 4], colour.astype(np.float32), weight, block, never)
         column, row = (at.ravel() for at in np.meshgrid(np.arange(len(x)), np.arange(len(y))))
-        out.append(Seen(column, row, texel, np.ones(texel.shape, bool), seen, Line(slope, offset)))
+        out.append(MetalPixels(column, row, texel, np.ones(texel.shape, bool), samples, LinearShading(slope, offset)))
     return out
 
 
 def never(base: float, roughness: NDArray[np.float32], metallic: float) -> NDArray[np.float32]:
-    raise AssertionError("the lines are known")
+    raise AssertionError("shading is known")
 
 
-def test_a_grille_finer_than_the_pixels_comes_back() -> None:
-    texels = everywhere()
-    values = np.tile(np.append(GRILLE.mean(0), [0.2, 0.8]).astype(np.float32), (len(texels), 1))
+def test_perforation_finer_than_pixels_is_recovered() -> None:
+    texels = full_texture()
+    values = np.tile(np.append(PERFORATED.mean(0), [0.2, 0.8]).astype(np.float32), (len(texels), 1))
     values[::2, 3] = 0.3
-    place = np.ones(len(texels), bool)
-    out = sharpened(values, texels, place, photos(GRILLE, 60, 0.002))
-    before, after = (np.abs(x[INNER, :3] - GRILLE[INNER]).mean() for x in (values, out))
+    region = np.ones(len(texels), bool)
+    out = superresolved(values, texels, region, photos(PERFORATED, 60, 0.002))
+    before, after = (np.abs(x[INNER, :3] - PERFORATED[INNER]).mean() for x in (values, out))
     assert after < 0.15 * before
     assert (out[INNER & HOLE, 4] == 0).all() and (out[INNER & ~HOLE, 4] == 1).all()
     np.testing.assert_array_equal(out[:, 3], np.where(out[:, 4] == 1, values[:, 3], 1))
     values[:, 3] = 0.2
-    assert (sharpened(values, texels, place, photos(GRILLE, 60, 0.002))[:, 3] == values[:, 3]).all()
+    assert (superresolved(values, texels, region, photos(PERFORATED, 60, 0.002))[:, 3] == values[:, 3]).all()
 
 
-def test_the_steps_approach_bounded_least_squares() -> None:
+def test_solver_approaches_bounded_least_squares() -> None:
     """One value per row of texels in the middle channel, against SciPy's solver."""
     rng = np.random.default_rng(0)
-    texels = everywhere()
+    texels = full_texture()
     n = len(texels)
     truth = np.repeat(np.repeat(rng.uniform(0.2, 0.9, n // 16), 16)[:, None], 3, 1).astype(np.float32)
-    seen = photos(truth, 40)
+    metal_pixels = photos(truth, 40)
     values = np.concatenate([np.full((n, 3), 0.5, np.float32), np.zeros((n, 1), np.float32), np.ones((n, 1), np.float32)], 1)
-    out = _solved(_parts(seen, np.ones(n, bool)), values[:, :3])
+    out = _solve(_photo_systems(metal_pixels, np.ones(n, bool)), values[:, :3])
     rows, right = [], []
-    for photo in seen:
-        weight = np.sqrt(told(photo.evidence)[:, 1])
+    for photo in metal_pixels:
+        weight = np.sqrt(unclipped_weights(photo.samples)[:, 1])
         matrix = np.zeros((len(weight), n))
         np.put_along_axis(matrix, photo.texel, 1 / 9, 1)
-        rows.append(matrix * (weight * photo.line.slope[:, 1])[:, None])
-        right.append(weight * (photo.evidence.colour - photo.line.offset)[:, 1])
+        rows.append(matrix * (weight * photo.shading.slope[:, 1])[:, None])
+        right.append(weight * (photo.samples.colour - photo.shading.offset)[:, 1])
     best = lsq_linear(np.concatenate(rows), np.concatenate(right), (0, 1)).x
     covered = np.abs(np.concatenate(rows)).sum(0) > 1
 
@@ -101,89 +102,89 @@ def test_the_steps_approach_bounded_least_squares() -> None:
     assert left(best) < left(out[:, 1])
 
 
-def test_hue_comes_from_around_and_brightness_stays() -> None:
-    texels = everywhere()
+def test_hue_is_averaged_and_brightness_is_kept() -> None:
+    texels = full_texture()
     rng = np.random.default_rng(1)
     bright = rng.uniform(0.3, 0.8, (len(texels), 1))
-    stained = (bright * GOLD / GOLD.mean() * rng.uniform(0.8, 1.2, (len(texels), 3))).clip(0, 1).astype(np.float32)
-    out = _of_calm_hue(stained, texels, np.ones(len(texels), bool))
-    inner = np.minimum(COLUMN, ROW) > HUE
+    hue_noise = (bright * GOLD / GOLD.mean() * rng.uniform(0.8, 1.2, (len(texels), 3))).clip(0, 1).astype(np.float32)
+    out = _with_local_hue(hue_noise, texels, np.ones(len(texels), bool))
+    inner = np.minimum(COLUMN, ROW) > HUE_RADIUS
     hue = out[inner] / out[inner].mean(1, keepdims=True)
-    assert hue.std(0).max() < 0.3 * (stained[inner] / stained[inner].mean(1, keepdims=True)).std(0).max()
-    assert np.abs(out - stained).mean(1)[inner].mean() < 0.08
-    np.testing.assert_allclose(out[inner].mean(1), stained[inner].mean(1), atol=0.05)
+    assert hue.std(0).max() < 0.3 * (hue_noise[inner] / hue_noise[inner].mean(1, keepdims=True)).std(0).max()
+    assert np.abs(out - hue_noise).mean(1)[inner].mean() < 0.08
+    np.testing.assert_allclose(out[inner].mean(1), hue_noise[inner].mean(1), atol=0.05)
 
 
-def test_metal_without_holes_and_paint_are_left_alone() -> None:
-    texels = everywhere()
+def test_solid_metal_and_dielectrics_are_unchanged() -> None:
+    texels = full_texture()
     values = np.random.default_rng(2).uniform(0.2, 0.8, (len(texels), 5)).astype(np.float32)
-    place = COLUMN < SIZE // 2
+    region = COLUMN < SIZE // 2
     even = np.full((len(texels), 3), 0.7, np.float32)
-    np.testing.assert_array_equal(sharpened(values, texels, place, photos(even)), values)
+    np.testing.assert_array_equal(superresolved(values, texels, region, photos(even)), values)
     pierced = even * ~HOLE[:, None]
-    out = sharpened(values, texels, place, photos(pierced.astype(np.float32)))
-    np.testing.assert_array_equal(out[~place], values[~place])
-    assert (out[place] != values[place]).mean() > 0.5
+    out = superresolved(values, texels, region, photos(pierced.astype(np.float32)))
+    np.testing.assert_array_equal(out[~region], values[~region])
+    assert (out[region] != values[region]).mean() > 0.5
 
 
-def test_noise_is_drawn_to_metal_or_hole() -> None:
-    texels = everywhere()
-    everything = np.ones(len(texels), bool)
+def test_binary_prior_reduces_noise() -> None:
+    texels = full_texture()
+    all_texels = np.ones(len(texels), bool)
     values = np.tile(np.array([0.4, 0.4, 0.4, 0.2, 0.8], np.float32), (len(texels), 1))
-    seen = photos(GRILLE, 30, 0.08)
-    alone = _solved(_parts(seen, everything), values[:, :3])
-    drawn = sharpened(values, texels, everything, seen)[:, :3]
-    before, after = (np.abs(x[INNER] - GRILLE[INNER]).mean() for x in (alone, drawn))
+    metal_pixels = photos(PERFORATED, 30, 0.08)
+    alone = _solve(_photo_systems(metal_pixels, all_texels), values[:, :3])
+    drawn = superresolved(values, texels, all_texels, metal_pixels)[:, :3]
+    before, after = (np.abs(x[INNER] - PERFORATED[INNER]).mean() for x in (alone, drawn))
     assert after < 0.7 * before
 
 
 @pytest.mark.parametrize("bright", [0.9, 0.15])
-def test_what_is_likely_is_the_metal_around_or_black(bright: float) -> None:
-    texels = everywhere()
+def test_binary_prior_is_local_metal_or_black(bright: float) -> None:
+    texels = full_texture()
     shown = np.where(HOLE[:, None], 0.15 * bright * GOLD, bright * GOLD).astype(np.float32)
-    out = _likely(shown, texels, np.ones(len(texels), bool))
+    out = _metal_or_black(shown, texels, np.ones(len(texels), bool))
     assert (out[HOLE] == 0).all()
     np.testing.assert_allclose(out[~HOLE], np.tile(bright * GOLD, (int((~HOLE).sum()), 1)), rtol=0.02)
 
 
-def test_bars_that_are_blurred_stay_as_many() -> None:
-    texels = everywhere()
+def test_share_of_blurred_bars_is_kept() -> None:
+    texels = full_texture()
     x, y = COLUMN / 5.3, ROW / 6.1
     bar = np.hypot(x - np.round(x), y - np.round(y)) > 0.35
     sharp = np.where(bar[:, None], GOLD, 0).astype(np.float32)
     shown = cv2.GaussianBlur(texels.image(sharp), (0, 0), 1.5).reshape(-1, 3)
-    everything = np.ones(len(texels), bool)
+    all_texels = np.ones(len(texels), bool)
     inner = (np.minimum(COLUMN, ROW) > 6) & (np.maximum(COLUMN, ROW) < SIZE - 7)
-    out, metal = _likely(shown, texels, everything), _metal(shown, texels, everything)
+    out, metal = _metal_or_black(shown, texels, all_texels), _metal_colour(shown, texels, all_texels)
     halves = np.where(2 * shown.mean(1, keepdims=True) > metal.mean(1, keepdims=True), metal, 0)
     assert out[inner].mean() == pytest.approx(shown[inner].mean(), rel=0.06)
     assert halves[inner].mean() > 1.12 * shown[inner].mean()
 
 
-def test_photos_that_are_brighter_or_dimmer_than_shaded_tell_the_same_grille() -> None:
-    texels = everywhere()
-    values = np.tile(np.append(GRILLE.mean(0), [0.2, 0.8]).astype(np.float32), (len(texels), 1))
+def test_gains_of_photos_do_not_change_the_pattern() -> None:
+    texels = full_texture()
+    values = np.tile(np.append(PERFORATED.mean(0), [0.2, 0.8]).astype(np.float32), (len(texels), 1))
     rng = np.random.default_rng(6)
-    seen = []
-    for photo in photos(GRILLE, 60, 0.002):
+    metal_pixels = []
+    for photo in photos(PERFORATED, 60, 0.002):
         off = np.float32(2 ** rng.uniform(-1, 1))
-        seen.append(replace(photo, line=Line(off * photo.line.slope, off * photo.line.offset)))
-    out = sharpened(values, texels, np.ones(len(texels), bool), seen)
+        metal_pixels.append(replace(photo, shading=LinearShading(off * photo.shading.slope, off * photo.shading.offset)))
+    out = superresolved(values, texels, np.ones(len(texels), bool), metal_pixels)
     assert (out[INNER & HOLE, 4] == 0).mean() > 0.98 and (out[INNER & ~HOLE, 4] == 1).mean() > 0.95
-    assert np.abs(out[INNER, :3] - GRILLE[INNER]).mean() < 0.3 * np.abs(values[INNER, :3] - GRILLE[INNER]).mean()
+    assert np.abs(out[INNER, :3] - PERFORATED[INNER]).mean() < 0.3 * np.abs(values[INNER, :3] - PERFORATED[INNER]).mean()
 
 
-def test_a_pattern_is_what_both_halves_show() -> None:
-    texels = everywhere()
+def test_pattern_must_be_in_both_halves() -> None:
+    texels = full_texture()
     rng = np.random.default_rng(7)
     same, one, other = rng.uniform(0.2, 0.8, (3, len(texels))).astype(np.float32)
-    everything = np.ones(len(texels), bool)
-    assert _repeated(texels, everything, 0.6 * same + 0.4 * one, 0.6 * same + 0.4 * other).all()
-    assert not _repeated(texels, everything, one, other).any()
+    all_texels = np.ones(len(texels), bool)
+    assert _correlated(texels, all_texels, 0.6 * same + 0.4 * one, 0.6 * same + 0.4 * other).all()
+    assert not _correlated(texels, all_texels, one, other).any()
 
 
-@pytest.mark.parametrize(("share", "place"), [(0.6, True), (0.1, False)])
-def test_a_pattern_is_one_place(share: float, place: bool) -> None:
-    texels = everywhere()
+@pytest.mark.parametrize(("share", "region"), [(0.6, True), (0.1, False)])
+def test_pattern_is_one_region(share: float, region: bool) -> None:
+    texels = full_texture()
     metal = np.random.default_rng(3).uniform(size=len(texels)) < share
-    assert (metal_places(texels, metal).mean() > 0.9) == place
+    assert (metal_regions(texels, metal).mean() > 0.9) == region

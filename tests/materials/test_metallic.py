@@ -1,4 +1,4 @@
-"""Paint and metal told apart under a known light."""
+"""Metal detection under a known light."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from gsbake.materials.metallic import DARKEST_METAL, LEAST_PHOTOS, Evidence, as_around, find_metals
+from gsbake.materials.metallic import MIN_METAL_ALBEDO, MIN_PHOTOS, PhotoSamples, find_metals, majority_vote
 from gsbake.shading.environment import EnvironmentLight
 from gsbake.shading.split_sum import shade
 from tests.support.monte_carlo import render
@@ -18,7 +18,7 @@ TEXELS, PHOTOS = 60, 24
 
 
 def windows(directions: NDArray[np.float64]) -> NDArray[np.float64]:
-    """A room with four windows of different colours."""
+    """Radiance of a room with four windows of different colours."""
     out = np.full((len(directions), 3), 0.1)
     for k, (axis, colour) in enumerate(
         (((1, 0, 0.3), (4, 3, 2)), ((-1, 0.5, 0), (1, 3, 4)), ((0, -1, 0.4), (3, 3, 3)), ((0, 0.2, 1), (2, 4, 2)))
@@ -29,7 +29,7 @@ def windows(directions: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 class Wall:
-    """Texels with normals of their own under one light, seen from many sides."""
+    """Texels with individual normals under one light, in many photos."""
 
     def __init__(self) -> None:
         rng = np.random.default_rng(3)
@@ -46,8 +46,8 @@ class Wall:
             constant = (torch.as_tensor(base), torch.as_tensor(rough), torch.full((TEXELS,), metallic))
             return np.asarray(shade(self.normal, towards, *constant, self.tables).numpy())
 
-    def photos(self, base: NDArray[np.float32], roughness: float, metallic: float) -> list[Evidence]:
-        """What photos of that material are, and how to shade any other."""
+    def photos(self, base: NDArray[np.float32], roughness: float, metallic: float) -> list[PhotoSamples]:
+        """Photos of a material, with functions that shade any other."""
         found = []
         for towards in self.towards:
 
@@ -55,11 +55,11 @@ class Wall:
                 return self.colours(towards, np.full((TEXELS, 3), value, np.float32), rough, metal)
 
             colour = self.colours(towards, base, np.full(TEXELS, roughness, np.float32), metallic)
-            found.append(Evidence(np.arange(TEXELS), colour, np.ones(TEXELS, np.float32), np.zeros(TEXELS, np.int32), shaded))
+            found.append(PhotoSamples(np.arange(TEXELS), colour, np.ones(TEXELS, np.float32), np.zeros(TEXELS, np.int32), shaded))
         return found
 
-    def reference(self, base: NDArray[np.float32], roughness: float, metallic: float) -> list[Evidence]:
-        """The same, the photos taken by the Monte Carlo renderer, which shares no code with what explains them."""
+    def reference(self, base: NDArray[np.float32], roughness: float, metallic: float) -> list[PhotoSamples]:
+        """The same with photos of the Monte Carlo renderer, which shares no code with the detection."""
         normal = self.normal.numpy().astype(np.float64)
         shown = [render(normal, t.numpy(), base, np.full(TEXELS, roughness), np.full(TEXELS, metallic), windows) for t in self.towards]
         return [replace(e, colour=c.astype(np.float32)) for e, c in zip(self.photos(base, roughness, metallic), shown, strict=True)]
@@ -76,34 +76,34 @@ def test_metals_in_reference_photos(wall: Wall) -> None:
     assert len(metals.texel) == TEXELS
     assert np.abs(metals.base - gold).mean() < 0.05
     assert np.abs(metals.roughness - 0.35).max() < 0.21  # the next value tried
-    paint = np.random.default_rng(1).uniform(0.1, 0.8, (TEXELS, 3)).astype(np.float32)
+    dielectric = np.random.default_rng(1).uniform(0.1, 0.8, (TEXELS, 3)).astype(np.float32)
     for roughness in (0.1, 0.35, 0.9):
-        assert len(find_metals(wall.reference(paint, roughness, 0.0), np.full(TEXELS, roughness, np.float32)).texel) == 0
+        assert len(find_metals(wall.reference(dielectric, roughness, 0.0), np.full(TEXELS, roughness, np.float32)).texel) == 0
 
 
-def test_metal_is_found_with_its_colour_and_roughness(wall: Wall) -> None:
+def test_metal_is_detected_with_colour_and_roughness(wall: Wall) -> None:
     gold = np.tile(np.array([1.0, 0.77, 0.34], np.float32), (TEXELS, 1))
     metals = find_metals(wall.photos(gold, 0.35, 1.0), np.full(TEXELS, 0.8, np.float32))
     assert len(metals.texel) == TEXELS
-    np.testing.assert_allclose(metals.base, gold, atol=1e-3)  # no noise: least squares gives it back
+    np.testing.assert_allclose(metals.base, gold, atol=1e-3)  # no noise: least squares is exact
     np.testing.assert_allclose(metals.roughness, 0.35)
 
 
 @pytest.mark.parametrize("roughness", [0.1, 0.35, 0.9])
-def test_paint_is_left_alone(wall: Wall, roughness: float) -> None:
-    paint = np.random.default_rng(1).uniform(0.1, 0.8, (TEXELS, 3)).astype(np.float32)
-    assert len(find_metals(wall.photos(paint, roughness, 0.0), np.full(TEXELS, roughness, np.float32)).texel) == 0
+def test_dielectric_is_not_metal(wall: Wall, roughness: float) -> None:
+    dielectric = np.random.default_rng(1).uniform(0.1, 0.8, (TEXELS, 3)).astype(np.float32)
+    assert len(find_metals(wall.photos(dielectric, roughness, 0.0), np.full(TEXELS, roughness, np.float32)).texel) == 0
 
 
-def test_black_gloss_is_no_dark_metal(wall: Wall) -> None:
+def test_glossy_black_is_not_metal(wall: Wall) -> None:
     black = np.full((TEXELS, 3), 0.004, np.float32)
     photos = wall.photos(black, 0.1, 0.0)
-    # A metal of base colour .04 reflects nearly as black gloss does: only what metals can look like rules it out.
-    assert DARKEST_METAL > 0.04
+    # A metal of base colour .04 looks nearly like glossy black: only the lower bound of metals excludes it.
+    assert MIN_METAL_ALBEDO > 0.04
     assert len(find_metals(photos, np.full(TEXELS, 0.5, np.float32)).texel) == 0
 
 
-def test_texels_hardly_seen_are_left_alone(wall: Wall) -> None:
+def test_texels_with_little_weight_are_undecided(wall: Wall) -> None:
     gold = np.tile(np.array([1.0, 0.77, 0.34], np.float32), (TEXELS, 1))
     weight = np.where(np.arange(TEXELS) < 5, 1e-3, 1).astype(np.float32)
     dim = [replace(e, weight=weight) for e in wall.photos(gold, 0.2, 1.0)]
@@ -111,41 +111,41 @@ def test_texels_hardly_seen_are_left_alone(wall: Wall) -> None:
     assert found.texel.min() == 5
 
 
-def test_what_few_photos_saw_is_left_alone(wall: Wall) -> None:
+def test_texels_in_few_photos_are_undecided(wall: Wall) -> None:
     gold = np.tile(np.array([1.0, 0.77, 0.34], np.float32), (TEXELS, 1))
     photos = wall.photos(gold, 0.2, 1.0)
     own = np.full(TEXELS, 0.2, np.float32)
-    assert len(find_metals(photos[: LEAST_PHOTOS - 1], own).texel) == 0
-    assert len(find_metals(photos[:LEAST_PHOTOS], own).texel) == TEXELS
+    assert len(find_metals(photos[: MIN_PHOTOS - 1], own).texel) == 0
+    assert len(find_metals(photos[:MIN_PHOTOS], own).texel) == TEXELS
 
 
 def test_neighbours_decide_together(wall: Wall) -> None:
-    """One texel of metal among paint is outvoted, and one of paint among metal: the metal's own colour is kept."""
+    """One texel of metal among dielectrics is outvoted, and one dielectric among metal; the metal keeps its own colour."""
     gold = np.tile(np.array([1.0, 0.77, 0.34], np.float32), (TEXELS, 1))
     own = np.full(TEXELS, 0.2, np.float32)
-    metal, paint = wall.photos(gold, 0.2, 1.0), wall.photos(gold, 0.2, 0.0)
+    metal, dielectric = wall.photos(gold, 0.2, 1.0), wall.photos(gold, 0.2, 0.0)
 
-    def all_alike(left: NDArray[np.float64]) -> NDArray[np.float64]:
-        return np.full(TEXELS, left.sum())
+    def global_sum(values: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.full(TEXELS, values.sum())
 
-    for few, many, found in ((metal, paint, 0), (paint, metal, TEXELS)):
+    for few, many, found in ((metal, dielectric, 0), (dielectric, metal, TEXELS)):
         mixed = [replace(m, colour=np.where(np.arange(TEXELS)[:, None] == 7, f.colour, m.colour)) for f, m in zip(few, many, strict=True)]
-        assert len(find_metals(mixed, own, all_alike).texel) == found
+        assert len(find_metals(mixed, own, global_sum).texel) == found
 
 
-def test_a_spoiled_place_goes_with_its_surroundings() -> None:
+def test_majority_vote_removes_isolated_texels() -> None:
     place = np.arange(40)
     kernel = np.exp(-np.abs(place[:, None] - place) / 3.0)
     better = (place >= 20) & (place != 30) | (place == 8)
     known = place != 35
-    found = as_around(better, known, lambda x: kernel @ x)
+    found = majority_vote(better, known, lambda x: kernel @ x)
     np.testing.assert_array_equal(np.flatnonzero(found), [*range(20, 35), *range(36, 40)])
 
 
-def test_what_is_clipped_at_white_does_not_hide_a_metal(wall: Wall) -> None:
+def test_clipped_pixels_do_not_hide_a_metal(wall: Wall) -> None:
     gold = np.tile(np.array([1.0, 0.77, 0.34], np.float32), (TEXELS, 1))
 
-    def four_times(e: Evidence) -> Evidence:
+    def four_times(e: PhotoSamples) -> PhotoSamples:
         return replace(e, colour=np.minimum(4 * e.colour, 1), shade=lambda base, rough, metal: 4 * e.shade(base, rough, metal))
 
     photos = [four_times(e) for e in wall.photos(gold, 0.2, 1.0)]

@@ -1,4 +1,4 @@
-"""What a glossy thing reflects of itself: which texel a mirror shows, and that it does not end as paint."""
+"""Reflections of the object on itself: the texel hit, and that they do not end up in base colour."""
 
 from __future__ import annotations
 
@@ -9,24 +9,26 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from gsbake.geometry.cameras import Camera
+from gsbake.config.schema import Bake
 from gsbake.geometry.raycast import RayCaster
 from gsbake.imaging.srgb import encode
 from gsbake.materials.adjacency import neighbours
-from gsbake.materials.fit import FitSchedule, FitSurface, MaterialFit, Priors
+from gsbake.materials.fit import FitSurface, MaterialFit
+from gsbake.materials.options import FitSchedule, Priors
 from gsbake.materials.pixels import PixelReader, Pixels
-from gsbake.materials.reflections import Mirrors
+from gsbake.materials.reflections import ReflectionTracer
 from gsbake.materials.visibility import Visibility
 from gsbake.shading.environment import EnvironmentLight
 from gsbake.shading.split_sum import shade
 from gsbake.texturing.texels import rasterise
+from tests.support.cameras import look_at
 
 Doubles = NDArray[np.float64]
 SIZE = 64
 
 
 class Corner:
-    """A floor 2 × 2 at z = 0 and a wall 1 high on its edge y = 0, each with half of the texture, seen from above at several turns."""
+    """A floor 2 × 2 at z = 0 and a wall 1 high on its edge y = 0, each with half of the texture, in photos from above."""
 
     def __init__(self) -> None:
         self.vertices = np.array([[-1, 0, 0], [1, 0, 0], [1, 2, 0], [-1, 2, 0], [1, 0, 0], [-1, 0, 0], [-1, 0, 1], [1, 0, 1]], float)
@@ -42,17 +44,16 @@ class Corner:
         """The pixels of photo `k` of 16, black."""
         turn, high = np.pi / 2 + 1.1 * np.sin(2.4 * k), 0.3 + 0.7 * k / 16
         away = np.array([np.cos(turn) * np.cos(high), np.sin(turn) * np.cos(high), np.sin(high)])
-        right = np.array([-np.sin(turn), np.cos(turn), 0])
-        R = np.stack([right, np.cross(-away, right), -away])
-        camera = Camera("", 64, 64, 110, 110, 32, 32, R, -R @ (np.array([0, 0.7, 0.3]) + 4 * away))
+        target = np.array([0, 0.7, 0.3])
+        camera = look_at(target + 4 * away, target, size=64, focal=110)
         pixels = PixelReader(self.caster, self.uv, self.texels, 3.0).read(camera, np.zeros((64, 64, 3), np.uint8), None)
-        return Mirrors(self.caster, self.uv, self.texels, self.at, self.normal, 1e-3).traced(pixels) if traced else pixels
+        return ReflectionTracer(self.caster, self.uv, self.texels, self.at, self.normal, 1e-3).trace(pixels) if traced else pixels
 
     def mirrored(self, pixels: Pixels) -> tuple[NDArray[np.bool_], Doubles, Doubles]:
         """Which pixels show mostly floor, where they are, and where the mirrored view meets the plane of the wall: by hand."""
-        at = np.einsum("nk,nkd->nd", pixels.share, self.at[pixels.texel])
-        floor = np.einsum("nk,nk->n", pixels.share, self.floor[pixels.texel]) > 0.99
-        ray = pixels.towards * [-1, -1, 1]
+        at = np.einsum("nk,nkd->nd", pixels.bilinear, self.at[pixels.texel])
+        floor = np.einsum("nk,nk->n", pixels.bilinear, self.floor[pixels.texel]) > 0.99
+        ray = pixels.view * [-1, -1, 1]
         with np.errstate(divide="ignore", invalid="ignore"):
             far = np.where(ray[:, 1] < 0, -at[:, 1] / ray[:, 1], np.inf)
         return floor, at, at + far[:, None].clip(0, 100) * ray
@@ -64,62 +65,62 @@ def corner() -> Corner:
 
 
 @pytest.mark.parametrize("k", [0, 5, 11])
-def test_mirror_shows_the_texel_that_the_law_of_reflection_says(corner: Corner, k: int) -> None:
+def test_reflected_ray_hits_the_expected_texel(corner: Corner, k: int) -> None:
     pixels = corner.read(k, traced=True)
-    assert pixels.met is not None
+    assert pixels.reflected_texel is not None
     floor, _, there = corner.mirrored(pixels)
     inside = floor & (np.abs(there[:, 0]) < 0.95) & (there[:, 2] < 0.95)
     outside = floor & ((np.abs(there[:, 0]) > 1.05) | (there[:, 2] > 1.05))
     assert inside.sum() > 30 and outside.sum() > 30
-    assert (pixels.met[outside] == -1).all()
-    met = pixels.met[inside]
+    assert (pixels.reflected_texel[outside] == -1).all()
+    met = pixels.reflected_texel[inside]
     assert (met >= 0).mean() > 0.97  # next to the wall a ray may start behind it
     met, there = met[met >= 0], there[inside][met >= 0]
     assert (~corner.floor[met]).all()
     assert np.linalg.norm(corner.at[met] - there, axis=1).max() < 0.08  # a texel is .065 wide
 
 
-def test_pixels_know_nothing_of_reflections_that_were_not_traced(corner: Corner) -> None:
-    assert corner.read(0, traced=False).met is None
+def test_untraced_pixels_have_no_reflected_texel(corner: Corner) -> None:
+    assert corner.read(0, traced=False).reflected_texel is None
     traced = corner.read(0, traced=True)
-    assert traced.met is not None
-    few = traced.thinned(100)
-    assert few.met is not None and len(few.met) == len(few)
+    assert traced.reflected_texel is not None
+    few = traced.subsampled(100)
+    assert few.reflected_texel is not None and len(few.reflected_texel) == len(few)
 
 
-def test_wall_mirrored_in_a_dark_floor_is_not_its_paint(corner: Corner) -> None:
+def test_reflection_does_not_change_base_colour(corner: Corner) -> None:
     """Both lit by an even sky; the floor, smooth and nearly black, shows the wall's orange by the law of reflection."""
     light = EnvironmentLight.from_function(lambda d: np.ones((len(d), 3)), 16)
     tables, n = light.prefilter(), len(corner.texels)
-    paint = np.where(corner.floor[:, None], [0.02, 0.02, 0.02], [0.9, 0.4, 0.05])
+    base_color = np.where(corner.floor[:, None], [0.02, 0.02, 0.02], [0.9, 0.4, 0.05])
     visibility = Visibility.trace(corner.texels, corner.uv, corner.caster, corner.normal, 128, 1e-3, 0.1)
     white = light.radiance().detach().numpy()
-    openness = visibility.openness(white)
-    irradiance = openness[:, None] * np.ones((1, 3), np.float32)
-    irradiance = irradiance + visibility.bounced(irradiance, paint.astype(np.float32))
+    visible_share = visibility.visible_share(white)
+    irradiance = visible_share[:, None] * np.ones((1, 3), np.float32)
+    irradiance = irradiance + visibility.indirect_irradiance(irradiance, base_color.astype(np.float32))
 
     def photo(k: int, traced: bool) -> Pixels:
         pixels = corner.read(k, traced)
         floor, _, there = corner.mirrored(pixels)
         blocked = floor & (np.abs(there[:, 0]) < 1) & (there[:, 2] < 1)
         normal, diffuse, spread = (
-            torch.as_tensor(np.einsum("nk,nkc->nc", pixels.share, x[pixels.texel])).float()
-            for x in (corner.normal, paint * irradiance, irradiance)
+            torch.as_tensor(np.einsum("nk,nkc->nc", pixels.bilinear, x[pixels.texel])).float()
+            for x in (corner.normal, base_color * irradiance, irradiance)
         )
-        view, m = torch.as_tensor(pixels.towards), len(pixels)
-        gloss = shade(normal, view, torch.zeros(m, 3), torch.full((m,), 0.1), torch.zeros(m), tables).detach()
+        view, m = torch.as_tensor(pixels.view), len(pixels)
+        specular = shade(normal, view, torch.zeros(m, 3), torch.full((m,), 0.1), torch.zeros(m), tables).detach()
         wall = torch.tensor([0.94, 0.44, 0.09]) * spread.mean()
-        gloss = torch.where(torch.as_tensor(blocked)[:, None], gloss * wall, gloss)
-        return replace(pixels, colour=encode((diffuse + gloss).numpy()).astype(np.float32))
+        specular = torch.where(torch.as_tensor(blocked)[:, None], specular * wall, specular)
+        return replace(pixels, colour=encode((diffuse + specular).numpy()).astype(np.float32))
 
     def error(traced: bool) -> float:
         pairs = neighbours(corner.texels, corner.at, corner.normal)
         start = np.full((n, 3), 0.3)
-        surface = FitSurface(corner.texels, corner.at, pairs, corner.normal, openness, start, visibility)
-        fit = MaterialFit(surface, 8, Priors(), 0.2)
+        surface = FitSurface(corner.texels, corner.at, pairs, corner.normal, visible_share, start, visibility)
+        fit = MaterialFit(surface, 8, Priors.of(Bake()), 0.2)
         photos = [photo(k, traced) for k in range(16)]
         fitted = fit.run(photos, [], FitSchedule(120, metallic=False, emission=False))
         known = corner.floor & (fitted.weight > 0.3) & (corner.at[:, 1] < 0.8)
-        return float(np.abs(encode(fitted.values[known, :3]) - encode(paint[known])).mean())
+        return float(np.abs(encode(fitted.values[known, :3]) - encode(base_color[known])).mean())
 
     assert error(True) < 0.7 * error(False)

@@ -1,4 +1,4 @@
-"""Which photos see which places of a mesh, and whether those look the same in them."""
+"""Visibility of points on a mesh, and view dependence of their brightness."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ import numpy as np
 import trimesh
 
 from gsbake.capture.posed_photos import View
-from gsbake.capture.view_dependence import looks_diffuse
+from gsbake.capture.view_dependence import is_diffuse
 from gsbake.geometry.raycast import RayCaster
-from gsbake.materials.view_dependence import MeshWatch, seen_on_mesh
+from gsbake.materials.view_dependence import MeshBrightness, visible_on_mesh
 from tests.meshing.scenes import camera_at, cameras_around
 
 
@@ -20,39 +20,39 @@ def two_balls() -> tuple[trimesh.Trimesh, RayCaster]:
     return mesh, RayCaster(mesh.vertices, mesh.faces, 1)
 
 
-def test_hidden_averted_and_masked_places_are_not_seen() -> None:
+def test_occluded_averted_and_masked_points_are_not_visible() -> None:
     mesh, caster = two_balls()
     camera = camera_at(np.array([3.0, 0.01, 0.02]), "front", 200)
     normals = np.array([[1.0, 0, 0], [0.7, 0.7, 0.14], [-1.0, 0, 0], [0.1, 0, 0.995], [0.7, -0.7, 0.14]])
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     points = 0.5 * normals
-    seen = seen_on_mesh(camera, None, points, normals, caster, 1.5)
-    assert seen.tolist() == [False, True, False, False, True]  # behind the small ball, seen, averted, grazing, seen
+    visible = visible_on_mesh(camera, None, points, normals, caster, 1.5)
+    assert visible.tolist() == [False, True, False, False, True]  # occluded, visible, averted, grazing, visible
     pixel, _ = camera.project(points)
     mask = np.zeros((camera.height, camera.width), np.uint8)
     column = round(pixel[1, 0])
     mask[:, max(0, column - 8) : column + 8] = 255
-    assert seen_on_mesh(camera, mask, points, normals, caster, 1.5).tolist() == [False, True, False, False, False]
+    assert visible_on_mesh(camera, mask, points, normals, caster, 1.5).tolist() == [False, True, False, False, False]
 
 
-def photographed(glossy: bool) -> tuple[bool, str]:
-    """The verdict on the larger ball, lit from above; glossy: from wherever the camera stands."""
+def measured(glossy: bool) -> tuple[bool, str]:
+    """Whether the larger sphere is diffuse, lit from above; `glossy`: lit from the camera."""
     ball = trimesh.creation.icosphere(subdivisions=5, radius=0.5)
     caster = RayCaster(ball.vertices, ball.faces, 1)
     points, faces = trimesh.sample.sample_surface(ball, 1500, seed=0)
-    watch = MeshWatch(points, ball.face_normals[faces], caster, 1.0)
+    brightness = MeshBrightness(points, ball.face_normals[faces], caster, 1.0)
     for camera in cameras_around():
         hits = caster.first_hit(camera.centre[None], camera.rays().reshape(-1, 3))
         at = np.nan_to_num(caster.points(hits)) / 0.5
         light = camera.centre / np.linalg.norm(camera.centre) if glossy else np.array([0.0, 0, 1])
         grey = np.where(hits.hit, 110 + 70 * (at @ light), 0).reshape(camera.height, camera.width)
         rgb = np.repeat(np.clip(grey, 0, 255).astype(np.uint8)[..., None], 3, 2)
-        watch.add(View(camera, rgb, np.where(hits.hit, 255, 0).astype(np.uint8).reshape(rgb.shape[:2])))
-    return looks_diffuse(*watch.changes())
+        brightness.add(View(camera, rgb, np.where(hits.hit, 255, 0).astype(np.uint8).reshape(rgb.shape[:2])))
+    return is_diffuse(*brightness.statistics())
 
 
-def test_light_fixed_to_the_object_is_diffuse_light_that_moves_is_not() -> None:
-    holds, evidence = photographed(glossy=False)
+def test_fixed_light_is_diffuse_and_moving_light_is_not() -> None:
+    holds, evidence = measured(glossy=False)
     assert holds, evidence
-    holds, evidence = photographed(glossy=True)
+    holds, evidence = measured(glossy=True)
     assert not holds, evidence

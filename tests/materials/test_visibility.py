@@ -1,4 +1,4 @@
-"""What the object keeps from itself, against closed forms and an independent path tracer."""
+"""Visibility and indirect light against closed forms and an independent path tracer."""
 
 from __future__ import annotations
 
@@ -10,24 +10,26 @@ import torch
 import trimesh
 from numpy.typing import NDArray
 
-from gsbake.geometry.cameras import Camera
+from gsbake.config.schema import Bake
 from gsbake.geometry.raycast import RayCaster
 from gsbake.imaging.srgb import encode
 from gsbake.materials.adjacency import neighbours
-from gsbake.materials.fit import FitSchedule, FitSurface, MaterialFit, Priors
+from gsbake.materials.fit import FitSurface, MaterialFit
+from gsbake.materials.options import FitSchedule, Priors
 from gsbake.materials.pixels import PixelReader, Pixels
 from gsbake.materials.visibility import Visibility, directions
 from gsbake.shading import cubemap
 from gsbake.shading.environment import EnvironmentLight
 from gsbake.shading.split_sum import shade
 from gsbake.texturing.texels import Texels, rasterise
+from tests.support.cameras import look_at
 
 Doubles = NDArray[np.float64]
 WHITE = EnvironmentLight.from_function(lambda d: np.ones((len(d), 3)), 16).radiance().detach().numpy()
 
 
 class Quads:
-    """Rectangles (corner, edge, edge) facing along edge × edge, each with a cell of the texture of its own; `extra` meshes only block."""
+    """Rectangles (corner, edge, edge) facing along edge × edge, each with its own cell of the texture; `extra` meshes only occlude."""
 
     def __init__(
         self, *quads: tuple[list[float], list[float], list[float]], extra: trimesh.Trimesh | None = None, count: int = 256
@@ -52,7 +54,7 @@ class Quads:
             coordinates = np.concatenate([coordinates, np.zeros((len(extra.vertices), 2))])
             vertices = np.concatenate([vertices, extra.vertices])
         self.uv, self.caster = coordinates, RayCaster(vertices, triangles, 1)
-        self.visibility = Visibility.trace(self.texels, coordinates, self.caster, self.normal, count, offset=1e-4, reach=0.1)
+        self.visibility = Visibility.trace(self.texels, coordinates, self.caster, self.normal, count, offset=1e-4, radius=0.1)
 
 
 def perpendicular(beside: Doubles, high: float, away: Doubles) -> Doubles:
@@ -67,53 +69,53 @@ def corner() -> Quads:
     return Quads(([0, 0, 0], [2, 0, 0], [0, 2, 0]), ([2, 0, 0], [-2, 0, 0], [0, 0, 1]))
 
 
-def test_wall_takes_its_form_factor_from_an_even_sky(corner: Quads) -> None:
+def test_occlusion_of_uniform_light_is_the_form_factor(corner: Quads) -> None:
     floor = (corner.quad == 0) & (corner.at[:, 1] > 0.15)
     x, y = corner.at[floor, 0].clip(1e-3, 2 - 1e-3), corner.at[floor, 1]
     taken = perpendicular(x, 1.0, y) + perpendicular(2 - x, 1.0, y)
-    kept = 1 - corner.visibility.openness(WHITE)[floor]
+    blocked = 1 - corner.visibility.visible_share(WHITE)[floor]
     assert taken.max() > 0.35
-    assert np.abs(kept - taken).max() < 0.03
-    assert kept.mean() == pytest.approx(taken.mean(), abs=0.004)
+    assert np.abs(blocked - taken).max() < 0.03
+    assert blocked.mean() == pytest.approx(taken.mean(), abs=0.004)
 
 
-def test_wall_lights_the_floor_by_its_form_factor(corner: Quads) -> None:
+def test_indirect_light_follows_the_form_factor(corner: Quads) -> None:
     floor = (corner.quad == 0) & (corner.at[:, 1] > 0.15)
     x, y = corner.at[floor, 0].clip(1e-3, 2 - 1e-3), corner.at[floor, 1]
     taken = perpendicular(x, 1.0, y) + perpendicular(2 - x, 1.0, y)
     wall = (corner.quad == 1)[:, None]
-    gained = corner.visibility.bounced(np.tile([2.0, 1.0, 0.5], (len(wall), 1)), np.where(wall, [0.8, 0.4, 0.2], 0.0))
+    gained = corner.visibility.indirect_irradiance(np.tile([2.0, 1.0, 0.5], (len(wall), 1)), np.where(wall, [0.8, 0.4, 0.2], 0.0))
     assert np.abs(gained[floor] - taken[:, None] * [1.6, 0.4, 0.1]).max() < 0.05
     assert gained[wall[:, 0]].max() == 0  # the floor is black
 
 
-def test_light_in_a_closed_box_is_bounced_twice() -> None:
+def test_closed_box_has_two_bounces() -> None:
     """Every ray inside meets a wall: 1 becomes ρ at the first and ρ + ρ² at the second bounce, whatever the shape."""
     box = Quads(
         ([0, 0, 0], [1, 0, 0], [0, 1, 0]), ([0, 0, 2], [0, 1, 0], [1, 0, 0]), ([0, 0, 0], [0, 1, 0], [0, 0, 2]),
         ([1, 0, 0], [0, 0, 2], [0, 1, 0]), ([0, 0, 0], [0, 0, 2], [1, 0, 0]), ([0, 1, 0], [1, 0, 0], [0, 0, 2]),
     )  # fmt: skip
-    assert box.visibility.openness(WHITE).max() < 1e-6
+    assert box.visibility.visible_share(WHITE).max() < 1e-6
     ones = np.ones((len(box.texels), 3))
-    gained = box.visibility.bounced(ones, 0.5 * ones)
+    gained = box.visibility.indirect_irradiance(ones, 0.5 * ones)
     assert np.median(gained) == pytest.approx(0.75, abs=0.02)
     assert np.abs(gained - 0.75).max() < 0.06
 
 
-def test_lamp_casts_shadow_to_the_other_side_only() -> None:
+def test_directional_light_casts_shadow_on_the_far_side_only() -> None:
     thin = trimesh.creation.box((0.02, 4, 0.5), trimesh.transformations.translation_matrix([0, 0, 0.25]))
     scene = Quads(([-1, -1, 0], [2, 0, 0], [0, 2, 0]), extra=thin)
-    lamp = np.array([1, 0, 1]) / np.sqrt(2)
-    light = EnvironmentLight.from_function(lambda d: (1e-3 + 50 * np.exp(400 * (d @ lamp - 1)))[:, None] * np.ones(3), 32)
-    openness = scene.visibility.openness(light.radiance().detach().numpy())
+    direction = np.array([1, 0, 1]) / np.sqrt(2)
+    light = EnvironmentLight.from_function(lambda d: (1e-3 + 50 * np.exp(400 * (d @ direction - 1)))[:, None] * np.ones(3), 32)
+    visible_share = scene.visibility.visible_share(light.radiance().detach().numpy())
     x = scene.at[:, 0]
     # At 45° a wall of height .5 shades the floor up to .5 behind it; cells of the directions are some 7° in radius.
-    assert openness[x > 0.1].min() > 0.97
-    assert openness[(x > -0.3) & (x < -0.1)].max() < 0.1
-    assert openness[x < -0.8].min() > 0.9
+    assert visible_share[x > 0.1].min() > 0.97
+    assert visible_share[(x > -0.3) & (x < -0.1)].max() < 0.1
+    assert visible_share[x < -0.8].min() > 0.9
 
 
-def test_shadow_of_a_ball_as_a_path_tracer_sees_it() -> None:
+def test_shadow_of_a_sphere_agrees_with_path_tracing() -> None:
     centre, radius = np.array([0.1, -0.1, 0.8]), 0.5
     ball = trimesh.creation.icosphere(subdivisions=4, radius=radius)
     ball.apply_translation(centre)
@@ -123,7 +125,7 @@ def test_shadow_of_a_ball_as_a_path_tracer_sees_it() -> None:
         return (0.2 + np.maximum(0, d @ np.array([0.6, 0.0, 0.8])) ** 8)[:, None] * np.array([1.0, 0.5, 0.2])
 
     light = EnvironmentLight.from_function(sky, 32)
-    openness = scene.visibility.openness(light.radiance().detach().numpy())
+    visible_share = scene.visibility.visible_share(light.radiance().detach().numpy())
     rng = np.random.default_rng(2)
     ray = rng.normal(size=(4000, 3))
     ray = ray / np.linalg.norm(ray, axis=1, keepdims=True) + [0, 0, 1]
@@ -137,18 +139,18 @@ def test_shadow_of_a_ball_as_a_path_tracer_sees_it() -> None:
         out.append((value * ~blocked).sum() / value.sum())
     truth = np.array(out)
     assert truth.min() < 0.5 and truth.max() > 0.9
-    assert np.sqrt(((openness[some] - truth) ** 2).mean()) < 0.03
-    assert np.abs(openness[some] - truth).max() < 0.1
+    assert np.sqrt(((visible_share[some] - truth) ** 2).mean()) < 0.03
+    assert np.abs(visible_share[some] - truth).max() < 0.1
 
 
-def test_open_surface_keeps_nothing() -> None:
+def test_open_surface_is_unoccluded() -> None:
     scene = Quads(([-1, -1, 0], [2, 0, 0], [0, 2, 0]), count=32)
-    assert scene.visibility.openness(WHITE).min() == 1
+    assert scene.visibility.visible_share(WHITE).min() == 1
     ones = np.ones((len(scene.texels), 3))
-    assert scene.visibility.bounced(ones, ones).max() == 0
+    assert scene.visibility.indirect_irradiance(ones, ones).max() == 0
 
 
-def test_directions_are_even_in_every_copy() -> None:
+def test_every_copy_of_directions_is_uniform() -> None:
     copies = directions(128).astype(np.float64)
     assert np.allclose(np.linalg.norm(copies, axis=2), 1, atol=1e-6)
     assert np.abs(copies.mean(1)).max() < 0.01
@@ -158,7 +160,7 @@ def test_directions_are_even_in_every_copy() -> None:
 
 
 class Tray:
-    """An open box of two paints under a lamp from one side, its irradiance path-traced with random rays, seen from 12 places."""
+    """An open box of two base colours under light from one side, its irradiance path-traced with random rays, in 12 photos."""
 
     def __init__(self) -> None:
         self.box = Quads(
@@ -168,11 +170,11 @@ class Tray:
             ([-1.1, -1.1, -0.1], [2.2, 0, 0], [0, 0, 1.1]), count=128,
         )  # fmt: skip
         texels, at, normal = self.box.texels, self.box.at, self.box.normal
-        lamp = np.array([0.55, 0.3, 0.78])
-        light = EnvironmentLight.from_function(lambda d: (0.3 + 10 * np.exp(40 * (d @ lamp - 1)))[:, None] * np.ones(3), 32)
+        direction = np.array([0.55, 0.3, 0.78])
+        light = EnvironmentLight.from_function(lambda d: (0.3 + 10 * np.exp(40 * (d @ direction - 1)))[:, None] * np.ones(3), 32)
         cube = light.radiance().detach().numpy().reshape(-1, 3)
         stripe = np.sin(6 * at[:, 0] + 3 * at[:, 2]) * np.sin(5 * at[:, 1] - 4 * at[:, 2]) > 0
-        self.paint = np.where(stripe[:, None], [0.75, 0.35, 0.2], [0.35, 0.6, 0.7])
+        self.base_color = np.where(stripe[:, None], [0.75, 0.35, 0.2], [0.35, 0.6, 0.7])
         slot = np.full(texels.size**2, -1)
         slot[texels.index] = np.arange(len(texels))
         rng, rounds = np.random.default_rng(4), 200
@@ -189,42 +191,41 @@ class Tray:
         for _ in range(4):
             gained = np.zeros_like(direct)
             for start, met in links:
-                gained[start] += self.paint[met] * irradiance[met] / rounds
+                gained[start] += self.base_color[met] * irradiance[met] / rounds
             irradiance = direct + gained
         self.inside = self.box.quad < 5
         reader, tables = PixelReader(self.box.caster, self.box.uv, texels, 4.0), light.prefilter()
-        self.photos = [self.photo(reader, tables, k, self.paint * irradiance) for k in range(12)]
+        self.photos = [self.photo(reader, tables, k, self.base_color * irradiance) for k in range(12)]
 
     def photo(self, reader: PixelReader, tables: object, k: int, diffuse: Doubles) -> Pixels:
         turn, high = 2.4 * k, 0.3 + 1.1 * k / 12
         centre = 5 * np.array([np.cos(turn) * np.cos(high), np.sin(turn) * np.cos(high), np.sin(high)])
-        right = np.array([-np.sin(turn), np.cos(turn), 0])
-        R = np.stack([right, np.cross(-centre / 5, right), -centre / 5])
-        blank = reader.read(Camera("", 64, 64, 100, 100, 32, 32, R, -R @ centre), np.zeros((64, 64, 3), np.uint8), None)
-        colour, normal = (np.einsum("nk,nkc->nc", blank.share, x[blank.texel]) for x in (diffuse, self.box.normal))
+        blank = reader.read(look_at(centre, size=64, focal=100), np.zeros((64, 64, 3), np.uint8), None)
+        colour, normal = (np.einsum("nk,nkc->nc", blank.bilinear, x[blank.texel]) for x in (diffuse, self.box.normal))
         n = len(blank)
-        gloss = shade(torch.as_tensor(normal).float(), torch.as_tensor(blank.towards), torch.zeros(n, 3), torch.full((n,), 0.5),
+        specular = shade(torch.as_tensor(normal).float(), torch.as_tensor(blank.view), torch.zeros(n, 3), torch.full((n,), 0.5),
                       torch.zeros(n), tables)  # type: ignore[arg-type]  # fmt: skip
-        return replace(blank, colour=encode(colour + gloss.detach().numpy()))
+        return replace(blank, colour=encode(colour + specular.detach().numpy()))
 
-    def error(self, visibility: Visibility | None, bounce: bool, parsimony: float = 0.0) -> float:
-        """Mean error of the fitted paint (sRGB) inside the box, brightness aside."""
-        priors = replace(Priors(), parsimony=parsimony)
+    def error(self, visibility: Visibility | None, indirect: bool, sparsity: float = 0.0) -> float:
+        """Mean error of the fitted base colour (sRGB) inside the box, up to a gain."""
+        priors = replace(Priors.of(Bake()), sparsity=sparsity)
         texels = self.box.texels
-        ambient = np.ones(len(texels)) if visibility is None else visibility.openness(WHITE)
+        ambient = np.ones(len(texels)) if visibility is None else visibility.visible_share(WHITE)
         start = np.full((len(texels), 3), 0.4)
         pairs = neighbours(texels, self.box.at, self.box.normal)
-        surface = FitSurface(texels, self.box.at, pairs, self.box.normal, ambient, start, visibility, bounce)
+        surface = FitSurface(texels, self.box.at, pairs, self.box.normal, ambient, start, visibility, indirect)
         fitted = MaterialFit(surface, 16, priors, 0.5).run(self.photos, [], FitSchedule(120))
         known = fitted.weight > 0.3
-        gain = (fitted.values[known, :3] * self.paint[known]).sum(0) / (fitted.values[known, :3] ** 2).sum(0)
+        gain = (fitted.values[known, :3] * self.base_color[known]).sum(0) / (fitted.values[known, :3] ** 2).sum(0)
         known &= self.inside
-        return float(np.abs(encode(fitted.values[known, :3] * gain) - encode(self.paint[known])).mean())
+        return float(np.abs(encode(fitted.values[known, :3] * gain) - encode(self.base_color[known])).mean())
 
 
-def test_shadow_and_bounced_light_do_not_end_as_paint() -> None:
+def test_shadows_and_indirect_light_stay_out_of_base_colour() -> None:
     tray = Tray()
-    bare, shadows, bounced = tray.error(None, False), tray.error(tray.box.visibility, False), tray.error(tray.box.visibility, True)
-    assert shadows < 0.9 * bare
-    assert bounced < 0.9 * shadows
-    assert tray.error(tray.box.visibility, True, Priors().parsimony) < 0.9 * bounced
+    visibility = tray.box.visibility
+    none, direct, indirect = tray.error(None, False), tray.error(visibility, False), tray.error(visibility, True)
+    assert direct < 0.9 * none
+    assert indirect < 0.9 * direct
+    assert tray.error(visibility, True, Priors.of(Bake()).sparsity) < 0.9 * indirect

@@ -1,4 +1,4 @@
-"""Analytic shapes seen by known cameras: depth maps by sphere tracing, independent of the code under test."""
+"""Analytic shapes and cameras: depth maps by sphere tracing, independent of the code under test."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsbake.geometry.cameras import Camera
+from tests.support.cameras import look_at
 
 Array = NDArray[np.float64]
 Shape = Callable[[Array], Array]
@@ -36,12 +37,8 @@ def cylinder(p: Array) -> Array:
 
 def camera_at(eye: Array, name: str, size: int = 160) -> Camera:
     """A camera at `eye` that looks at the origin, z up."""
-    z = -eye / np.linalg.norm(eye)
-    x = np.cross(z, [0, 0, 1.0])
-    x /= np.linalg.norm(x)
-    rotation = np.stack([x, np.cross(z, x), z])
     # The principal point is off the middle on purpose.
-    return Camera(name, size, size - 10, size * 1.2, size * 1.2, size / 2 + 1.3, size / 2 - 6.7, rotation, -rotation @ eye)
+    return look_at(eye, size=(size, size - 10), focal=size * 1.2, name=name, shift=(1.3, -1.7))
 
 
 def cameras_around(elevations: tuple[float, ...] = (-35, 10, 50), each: int = 6, size: int = 160) -> list[Camera]:

@@ -1,4 +1,4 @@
-"""The mesh stage from files to files: surfels laid on a torus, rendered by the real renderer, meshed, compared with the torus."""
+"""Mesh extraction end to end: surfels on a torus are rendered, meshed and compared with the torus."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from tests.support.recorder import Recorder
 
 
 def run(root: Path, out: Path, monitor: Recorder | None = None, surfels: str = "refine", **mesh: Any) -> Any:
-    """The figures of one run."""
+    """The results of one run."""
     out.mkdir()
     options = MeshOptions(Mesh(**mesh), train_size=120)
     return extract_mesh(root / "poses", root / surfels, out, options, scratch=out.parent, monitor=monitor or Recorder())
@@ -41,14 +41,14 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
     points = np.random.default_rng(0).uniform(-0.9, 0.9, (9000, 3))
     for _ in range(12):
         points -= torus(points)[:, None] * gradient(torus, points)
-    # Random points leave gaps at their mean spacing (0.023); discs nearly twice as wide cover them, as trained ones do.
+    # Random points have gaps of about their mean spacing (0.023); discs nearly twice as wide cover them, like trained surfels.
     surfels = create(points, gradient(torus, points), np.full(len(points), 0.04), None, "colour", 0, 0.0, 4.0)
     surfels.save(root / "refine" / "surfels.safetensors")
     return root
 
 
 @pytest.mark.parametrize("field", ["tsdf", "imls"])
-def test_torus_comes_back(capture: Path, tmp_path: Path, field: str) -> None:
+def test_torus_is_reconstructed(capture: Path, tmp_path: Path, field: str) -> None:
     monitor, out = Recorder(), tmp_path / "out"
     results = run(capture, out, monitor, field=field, faces=3000, max_resolution=80)
     dense, low = (trimesh.load(out / name, process=False) for name in ("dense.ply", "mesh.ply"))
@@ -61,7 +61,7 @@ def test_torus_comes_back(capture: Path, tmp_path: Path, field: str) -> None:
     assert results["decimation_error_cells"] < 2 and not monitor.warnings
     assert {"field resolution", "truncation"} <= set(monitor.decisions)
     assert "surfel spacing" in monitor.decisions["field resolution"][1]
-    assert list(tmp_path.iterdir()) == [out]  # the depth cache is gone
+    assert list(tmp_path.iterdir()) == [out]  # the depth cache is removed
     assert sorted(p.name for p in out.iterdir()) == ["dense.ply", "mesh.ply"]
 
 
@@ -87,13 +87,13 @@ def test_without_masks_the_table_is_removed(tmp_path: Path, support: str) -> Non
     monitor, out = Recorder(), tmp_path / "out"
     results = run(tmp_path, out, monitor, faces=3000, max_resolution=80, support_plane=support)
     mesh = trimesh.load(out / "mesh.ply", process=False)
-    across = np.linalg.norm(np.asarray(mesh.vertices)[:, :2], axis=1).max()
+    max_radius = np.linalg.norm(np.asarray(mesh.vertices)[:, :2], axis=1).max()
     if support == "keep":
-        assert "support plane" not in monitor.decisions and across > 0.95
+        assert "support plane" not in monitor.decisions and max_radius > 0.95
         return
     assert monitor.decisions["support plane"][0] == "removed"
     assert mesh.is_watertight and results["components"] == 1
-    assert across == pytest.approx(0.77, abs=2 * results["cell"])
+    assert max_radius == pytest.approx(0.77, abs=2 * results["cell"])
     assert mesh.bounds[0][2] == pytest.approx(floor, abs=results["cell"])
     assert mesh.bounds[1][2] == pytest.approx(0.22, abs=results["cell"])
 

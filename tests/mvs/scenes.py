@@ -1,4 +1,4 @@
-"""A textured sphere or plane seen by known cameras: exact depths and photos by ray casting, independent of the code under test."""
+"""A textured sphere or plane with known cameras: exact depths and photos by ray casting, independent of the code under test."""
 
 from __future__ import annotations
 
@@ -6,19 +6,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsbake.geometry.cameras import Camera
-from gsbake.mvs.pyramids import Photo, levels
+from gsbake.mvs.pyramids import Photo, image_pyramid
+from tests.support.cameras import look_at
 
 Array = NDArray[np.float64]
 RADIUS = 0.7
 
 
 def camera_at(eye: Array, name: str, width: int = 220, height: int = 190) -> Camera:
-    """Looks at the origin, z up; the principal point is off the middle on purpose."""
-    z = -eye / np.linalg.norm(eye)
-    x = np.cross(z, [0, 0, 1.0])
-    x /= np.linalg.norm(x)
-    rotation = np.stack([x, np.cross(z, x), z])
-    return Camera(name, width, height, width * 1.5, width * 1.5, width / 2 + 2.3, height / 2 - 1.7, rotation, -rotation @ eye)
+    """A camera facing the origin, z up, with an off-centre principal point."""
+    return look_at(eye, size=(width, height), focal=width * 1.5, name=name, shift=(2.3, -1.7))
 
 
 def arc(count: int = 5, step: float = 11.0, **size: int) -> list[Camera]:
@@ -31,13 +28,13 @@ def arc(count: int = 5, step: float = 11.0, **size: int) -> list[Camera]:
 
 
 def texture(points: Array) -> Array:
-    """Grey 0..255 by position: waves of many directions, the finest about 8 pixels long."""
+    """Solid texture (grey, 0..255): waves in many directions, wavelengths from about 8 pixels."""
     rng = np.random.default_rng(3)
     total = np.zeros(points.shape[:-1])
     for scale in (15, 30, 50, 75):
         for _ in range(4):
-            way = rng.normal(size=3)
-            total += np.sin(points @ (way * scale / np.linalg.norm(way)) + rng.uniform(0, 6))
+            direction = rng.normal(size=3)
+            total += np.sin(points @ (direction * scale / np.linalg.norm(direction)) + rng.uniform(0, 6))
     return np.clip(128 + 18 * total, 0, 255)
 
 
@@ -56,12 +53,12 @@ def plane_depth(camera: Camera) -> Array:
 
 
 def photo(camera: Camera, depth: Array, flat: bool = False) -> Photo:
-    """What the camera sees of a surface at `depth`; grey everywhere when `flat`."""
+    """The camera's photo of a surface at `depth` (h, w); uniform grey when `flat`."""
     points = camera.centre + depth[..., None] * camera.rays()
     grey = np.where(depth > 0, 128.0 if flat else texture(points), 0)
     return Photo(camera, grey.round().astype(np.uint8), (depth > 0).astype(np.uint8))
 
 
 def sphere_photos(cameras: list[Camera], flat: bool = False) -> list[list[Photo]]:
-    """All photos of the sphere at all sizes."""
-    return [levels(photo(c, sphere_depth(c), flat)) for c in cameras]
+    """Image pyramids of the sphere."""
+    return [image_pyramid(photo(c, sphere_depth(c), flat)) for c in cameras]

@@ -1,4 +1,4 @@
-"""A ball with a bowl cut out of it: its visual hull is the whole ball, and depths that see into the bowl open it."""
+"""Carving of a ball with a bowl: the visual hull is the whole ball, and depths inside the bowl carve it."""
 
 from __future__ import annotations
 
@@ -10,25 +10,26 @@ from numpy.typing import NDArray
 
 from gsbake.capture.hull.visual_hull import Hull
 from gsbake.geometry.cameras import Camera
-from gsbake.mvs.carving import count_votes, open_hull, seen_through
+from gsbake.mvs.carving import carve_hull, count_empty_rays, count_votes
 from gsbake.mvs.depth_maps import z_depth
 from tests.mvs.scenes import RADIUS, camera_at, sphere_depth
 
 Array = NDArray[np.float64]
-#: The bowl: a ball of this radius around this point is cut out.
+#: Centre and radius of the ball that is subtracted.
 BOWL, HOLLOW = np.array([RADIUS + 0.18, 0.0, 0.0]), 0.35
 CELLS = 64
 
 
 def views() -> list[Camera]:
     """Twelve cameras around +x, at most 50 degrees from it, and six behind."""
-    ways = [(1, 0.5 * np.cos(a), 0.5 * np.sin(a)) for a in np.arange(6)] + [(1, np.cos(a), np.sin(a)) for a in np.arange(6) + 0.5]
-    ways += [(-1, np.cos(a), np.sin(a)) for a in np.arange(6)]
-    return [camera_at(3.0 * np.array(w) / np.linalg.norm(w), f"{i:02d}", 110, 95) for i, w in enumerate(ways)]
+    directions = [(1, 0.5 * np.cos(a), 0.5 * np.sin(a)) for a in np.arange(6)]
+    directions += [(1, np.cos(a), np.sin(a)) for a in np.arange(6) + 0.5]
+    directions += [(-1, np.cos(a), np.sin(a)) for a in np.arange(6)]
+    return [camera_at(3.0 * np.array(d) / np.linalg.norm(d), f"{i:02d}", 110, 95) for i, d in enumerate(directions)]
 
 
 def ball() -> Hull:
-    """The exact distance from the whole ball."""
+    """The exact signed distance of the whole ball."""
     cell = 2 / CELLS
     axis = (np.arange(CELLS) + 0.5) * cell - 1
     field = np.linalg.norm(np.stack(np.meshgrid(axis, axis, axis, indexing="ij")), axis=0) - RADIUS
@@ -36,7 +37,7 @@ def ball() -> Hull:
 
 
 def bowl_depth(camera: Camera) -> Array:
-    """z-depth (h, w) of the ball without the bowl: where the ray enters the ball inside the bowl it goes on to the bowl's far side."""
+    """z-depth (h, w) of the ball minus the bowl: rays that enter through the bowl's opening hit its far side."""
     depth, rays = sphere_depth(camera), camera.rays()
     entry = camera.centre + depth[..., None] * rays
     in_bowl = (depth > 0) & (np.linalg.norm(entry - BOWL, axis=-1) < HOLLOW)
@@ -46,7 +47,7 @@ def bowl_depth(camera: Camera) -> Array:
     return np.where(in_bowl, far, depth)
 
 
-def test_votes_are_those_of_the_cells_one_by_one() -> None:
+def test_votes_match_projected_cells() -> None:
     cameras = views()[:5]
     hull = ball()
     depths = [bowl_depth(c).astype(np.float32) for c in cameras]
@@ -61,23 +62,23 @@ def test_votes_are_those_of_the_cells_one_by_one() -> None:
             u, v = np.floor(pixel[0]).astype(int)
             if 0 <= u < camera.width and 0 <= v < camera.height and depth[v, u] > 0:
                 gaps.append(depth[v, u] - z[0])
-        sure = np.abs(np.abs(gaps) - hull.cell / 2) > 1e-4  # single precision may fall to either side of a bound
+        sure = np.abs(np.abs(gaps) - hull.cell / 2) > 1e-4  # not decided by rounding
         if sure.all():
             assert air[tuple(cell)] == sum(g > hull.cell / 2 for g in gaps)
             assert surface[tuple(cell)] == sum(abs(g) <= hull.cell / 2 for g in gaps)
 
 
-def test_the_bowl_is_opened_and_nothing_else() -> None:
+def test_only_the_bowl_is_carved() -> None:
     hull, cameras = ball(), views()
-    opened = open_hull(hull, cameras, [bowl_depth(c).astype(np.float32) for c in cameras])
+    opened = carve_hull(hull, cameras, [bowl_depth(c).astype(np.float32) for c in cameras])
     axis = hull.lower[0] + (np.arange(CELLS) + 0.5) * hull.cell
     cells = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1)
     solid, in_bowl = hull.field < 0, HOLLOW - np.linalg.norm(cells - BOWL, axis=-1)
     now = opened.hull.occupancy
-    assert opened.made == 1 and opened.share == pytest.approx((solid & (in_bowl > 0)).sum() / solid.sum(), rel=0.4)
-    assert not now[solid & (in_bowl > 1.5 * hull.cell)].any()  # air, a cell and a half from the wall
-    assert now[solid & (in_bowl < -1.5 * hull.cell)].all()  # nothing taken elsewhere
-    # The new surface is up to a cell before the wall, and faces the same way.
+    assert opened.carved_regions == 1 and opened.share == pytest.approx((solid & (in_bowl > 0)).sum() / solid.sum(), rel=0.4)
+    assert not now[solid & (in_bowl > 1.5 * hull.cell)].any()  # free space, 1.5 cells from the wall
+    assert now[solid & (in_bowl < -1.5 * hull.cell)].all()  # nothing carved elsewhere
+    # The new surface is up to a cell before the wall, with the same orientation.
     points, normals = opened.hull.surface_points(4000, 0)
     floor = np.linalg.norm(points - BOWL, axis=1) < HOLLOW + hull.cell
     floor &= np.linalg.norm(points, axis=1) < RADIUS - 2 * hull.cell
@@ -88,57 +89,57 @@ def test_the_bowl_is_opened_and_nothing_else() -> None:
     assert (normals[floor] * towards).sum(1).mean() > 0.9
 
 
-def test_mirror_images_open_nothing() -> None:
-    # What a glossy ball mirrors is matched behind its surface, from every side at another place.
+def test_mirror_images_are_not_carved() -> None:
+    # Reflections on a specular ball match behind its surface, at a different location in every view.
     rng = np.random.default_rng(5)
     hull, cameras = ball(), views()
     depths = [np.where(d > 0, d + rng.uniform(0.1, 0.6), 0).astype(np.float32) for d in map(sphere_depth, cameras)]
-    opened = open_hull(hull, cameras, depths)
-    assert opened.made == 0 and opened.refused >= 1 and opened.share == 0
+    opened = carve_hull(hull, cameras, depths)
+    assert opened.carved_regions == 0 and opened.unsupported_regions >= 1 and opened.share == 0
     assert opened.hull is hull
 
 
-def test_what_silhouettes_speak_against_stays() -> None:
-    # A mirror image that all photos agree on: a ball within the ball. Every depth speaks for it, only the outlines do not.
+def test_silhouette_violations_are_not_carved() -> None:
+    # A consistent mirror image: a smaller ball inside the ball. All depths agree with it, only silhouettes do not.
     hull, cameras = ball(), views()
     smaller = [Camera(**{**vars(c), "t": c.t / 0.8}) for c in cameras]
     depths = [(0.8 * sphere_depth(c)).astype(np.float32) for c in smaller]
-    opened = open_hull(hull, cameras, depths)
-    assert opened.made == 0 and opened.holed >= 1 and opened.hull is hull
+    opened = carve_hull(hull, cameras, depths)
+    assert opened.carved_regions == 0 and opened.silhouette_violations >= 1 and opened.hull is hull
 
 
-def test_a_ray_is_seen_through_where_nothing_is_left_on_it() -> None:
+def test_rays_are_empty_without_remaining_cells() -> None:
     hull = ball()
     middle = np.array([[CELLS // 2, CELLS // 2, CELLS // 2]])
     camera = camera_at(np.array([3.0, 0, 0]), "a", 110, 95)
     left = np.zeros(hull.field.shape, bool)
-    assert seen_through(middle, left, hull, [camera, camera]).tolist() == [2]
-    for along in (5, CELLS - 5):  # before it and behind it
+    assert count_empty_rays(middle, left, hull, [camera, camera]).tolist() == [2]
+    for along in (5, CELLS - 5):  # before and behind the cell
         left[:] = False
         left[along, CELLS // 2 - 1 : CELLS // 2 + 2, CELLS // 2 - 1 : CELLS // 2 + 2] = True
-        assert seen_through(middle, left, hull, [camera]).tolist() == [0]
+        assert count_empty_rays(middle, left, hull, [camera]).tolist() == [0]
     left[:] = False
-    left[:, : CELLS // 2 - 4] = True  # beside it
-    assert seen_through(middle, left, hull, [camera]).tolist() == [1]
+    left[:, : CELLS // 2 - 4] = True  # beside the ray
+    assert count_empty_rays(middle, left, hull, [camera]).tolist() == [1]
     away = camera_at(np.array([3.0, 0, 0]), "b", 4, 4)
-    assert seen_through(np.array([[CELLS // 2, 0, 0]]), left, hull, [away]).tolist() == [0]  # outside the frame: not known
+    assert count_empty_rays(np.array([[CELLS // 2, 0, 0]]), left, hull, [away]).tolist() == [0]  # outside the frame: unknown
 
 
-def test_without_depths_the_hull_stays() -> None:
+def test_hull_is_unchanged_without_depths() -> None:
     hull = ball()
-    assert open_hull(hull, [], []).hull is hull
+    assert carve_hull(hull, [], []).hull is hull
     cameras = views()
-    assert open_hull(hull, cameras, [np.zeros((c.height, c.width), np.float32) for c in cameras]).share == 0
+    assert carve_hull(hull, cameras, [np.zeros((c.height, c.width), np.float32) for c in cameras]).share == 0
 
 
-def test_depths_of_planes_where_they_are_wanted() -> None:
+def test_depths_of_selected_planes() -> None:
     camera = camera_at(np.array([3.0, 0, 0]), "a", 4, 1)
     plane = np.zeros((1, 4, 3), np.float32)
     plane[..., 2] = [0.5, 0.5, 0.25, 0.0]
     assert z_depth(camera, plane, np.array([[False, True, True, True]])).tolist() == [[0.0, 2.0, 4.0, 0.0]]
 
 
-def test_a_hull_comes_back_from_disk(tmp_path: Path) -> None:
+def test_hull_round_trip(tmp_path: Path) -> None:
     hull = ball()
     hull.save(tmp_path / "hull.npz")
     again = Hull.load(tmp_path / "hull.npz")

@@ -1,4 +1,4 @@
-"""Planes found on photos of a known sphere: depth, masks, degenerate inputs, and the same result on any number of threads."""
+"""Matching, consistency and fusion on photos of a known sphere: accuracy, masks, degenerate inputs, independence of threads."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from gsbake.mvs.coarse_to_fine import find_planes
-from gsbake.mvs.consistency import agreement
+from gsbake.mvs.consistency import check_consistency
 from gsbake.mvs.depth_bounds import depth_bounds, seed_depths
-from gsbake.mvs.depth_maps import DepthMap, candidates, confirmed, inverse_depth, read_depth, trusted
+from gsbake.mvs.depth_maps import DepthMap, consistent_pixels, filter_depth_map, inverse_depth, matched_pixels, read_depth
 from gsbake.mvs.fusion import fuse
-from gsbake.mvs.outliers import find_ghosts, without_ghosts
+from gsbake.mvs.outliers import find_outliers, remove_outliers
 from gsbake.mvs.point_cloud import StereoCloud
 from tests.mvs.scenes import RADIUS, arc, sphere_depth, sphere_photos
 
@@ -18,9 +18,9 @@ from tests.mvs.scenes import RADIUS, arc, sphere_depth, sphere_photos
 def find(photos, i, seed=0, others=None):
     coarse = photos[i][0]
     bounds = depth_bounds(coarse.camera, coarse.inside, None)
-    none = np.zeros(bounds[0].shape, np.float32)
-    around = [j for j in range(len(photos)) if j != i] if others is None else others
-    return find_planes(photos[i], [photos[j] for j in around], bounds, none, 2, seed)
+    no_seeds = np.zeros(bounds[0].shape, np.float32)
+    sources = [j for j in range(len(photos)) if j != i] if others is None else others
+    return find_planes(photos[i], [photos[j] for j in sources], bounds, no_seeds, 2, seed)
 
 
 @pytest.fixture(scope="module")
@@ -37,19 +37,20 @@ def test_depth_of_the_sphere(scene) -> None:
         depth = 1 / np.maximum(inverse_depth(cameras[i], planes[i].plane), 1e-6)
         sure = (planes[i].cost < 0.3) & (truth > 0)
         assert sure.sum() > 0.5 * (truth > 0).sum()
-        assert np.median(np.abs(depth - truth)[sure]) < 0.004  # of a distance of 2.3: a fifth of a pixel's disparity
+        assert np.median(np.abs(depth - truth)[sure]) < 0.004  # at a distance of 2.3: .2 pixels of disparity
         assert not (planes[i].cost[photos[i][-1].inside == 0] < 1).any()  # nothing outside the mask
         assert np.isfinite(planes[i].plane).all() and np.isfinite(planes[i].cost).all()
 
 
 def test_maps_and_points_lie_on_the_sphere(scene, tmp_path) -> None:
     cameras, photos, planes = scene
-    good = [candidates(p.cost) for p in planes]
+    good = [matched_pixels(p.cost) for p in planes]
     asked = [[j for j in range(5) if j != i] for i in range(5)]
-    found = [agreement(cameras[i], planes[i].plane, good[i], [(cameras[j], planes[j].plane, good[j]) for j in asked[i]]) for i in range(5)]
-    maps = [trusted(cameras[i], planes[i].cost, found[i], 2, None) for i in range(5)]
+    others = [[(cameras[j], planes[j].plane, good[j]) for j in asked[i]] for i in range(5)]
+    found = [check_consistency(cameras[i], planes[i].plane, good[i], others[i]) for i in range(5)]
+    maps = [filter_depth_map(cameras[i], planes[i].cost, found[i], 2, None) for i in range(5)]
     cloud = fuse(maps, asked, lambda i: np.repeat(photos[i][-1].grey[..., None], 3, 2), lambda i: None)
-    assert 500 < len(cloud) < sum((m.confidence > 0).sum() for m in maps)  # each place once
+    assert 500 < len(cloud) < sum((m.confidence > 0).sum() for m in maps)  # without duplicates
     off = np.linalg.norm(cloud.points, axis=1) - RADIUS
     assert np.median(np.abs(off)) < 0.002 and np.quantile(np.abs(off), 0.95) < 0.012
     outward = (cloud.normals * cloud.points).sum(1) / np.linalg.norm(cloud.points, axis=1)
@@ -65,44 +66,44 @@ def test_maps_and_points_lie_on_the_sphere(scene, tmp_path) -> None:
     assert ((depth > 0) == (sure > 0)).all() and np.abs(depth - sphere_depth(cameras[2]))[depth > 0].mean() < 0.005
 
 
-def test_averaging_agreeing_views_helps(scene) -> None:
+def test_averaging_consistent_views_reduces_the_error(scene) -> None:
     cameras, _, planes = scene
-    good = [candidates(p.cost) for p in planes]
-    found = agreement(cameras[2], planes[2].plane, good[2], [(cameras[j], planes[j].plane, good[j]) for j in (0, 1, 3, 4)])
-    sure = found.agreeing >= 3
+    good = [matched_pixels(p.cost) for p in planes]
+    found = check_consistency(cameras[2], planes[2].plane, good[2], [(cameras[j], planes[j].plane, good[j]) for j in (0, 1, 3, 4)])
+    sure = found.consistent >= 3
     truth = sphere_depth(cameras[2])[sure]
-    own = trusted(cameras[2], planes[2].cost, found, 1, None)
+    own = filter_depth_map(cameras[2], planes[2].cost, found, 1, None)
     alone, mean = (inverse_depth(cameras[2], p) for p in (planes[2].plane, own.plane))
     assert np.abs(1 / mean[sure] - truth).mean() < np.abs(1 / alone[sure] - truth).mean()
 
 
-def test_a_view_that_sees_through_contradicts(scene) -> None:
-    """A patch moved 10 % towards its camera: the others see the sphere behind it."""
+def test_free_space_violations(scene) -> None:
+    """A patch moved 10 % towards its camera: other views see the sphere behind it."""
     cameras, _, planes = scene
     moved = planes[2].plane.copy()
     moved[55:65, 65:75] *= 1.1
-    good = [candidates(p.cost) for p in planes]
-    found = agreement(cameras[2], moved, good[2], [(cameras[j], planes[j].plane, good[j]) for j in (1, 3)])
-    patch = found.through[56:64, 66:74]
-    assert np.median(patch) >= 1 and not confirmed(found, 1)[56:64, 66:74].any()
-    assert np.median(found.through[good[2] > 0]) == 0
+    good = [matched_pixels(p.cost) for p in planes]
+    found = check_consistency(cameras[2], moved, good[2], [(cameras[j], planes[j].plane, good[j]) for j in (1, 3)])
+    patch = found.violations[56:64, 66:74]
+    assert np.median(patch) >= 1 and not consistent_pixels(found, 1)[56:64, 66:74].any()
+    assert np.median(found.violations[good[2] > 0]) == 0
 
 
-def test_no_neighbours_gives_nothing() -> None:
+def test_no_depths_without_source_views() -> None:
     photos = sphere_photos(arc(1))
     planes = find(photos, 0)
     assert (planes.cost == 1).all() and not planes.plane.any()
-    found = agreement(photos[0][-1].camera, planes.plane, candidates(planes.cost), [])
-    assert not trusted(photos[0][-1].camera, planes.cost, found, 1, None).confidence.any()
+    found = check_consistency(photos[0][-1].camera, planes.plane, matched_pixels(planes.cost), [])
+    assert not filter_depth_map(photos[0][-1].camera, planes.cost, found, 1, None).confidence.any()
 
 
-def test_flat_photos_give_nothing() -> None:
+def test_no_depths_without_texture() -> None:
     photos = sphere_photos(arc(3), flat=True)
     planes = find(photos, 1)
-    assert (candidates(planes.cost) > 0).mean() < 0.02 and np.isfinite(planes.plane).all()
+    assert (matched_pixels(planes.cost) > 0).mean() < 0.02 and np.isfinite(planes.plane).all()
 
 
-def test_same_seed_same_planes_on_any_threads(scene) -> None:
+def test_planes_do_not_depend_on_threads(scene) -> None:
     from concurrent.futures import ThreadPoolExecutor
 
     _, photos, planes = scene
@@ -113,7 +114,7 @@ def test_same_seed_same_planes_on_any_threads(scene) -> None:
         np.testing.assert_array_equal(a.cost, b.cost)
 
 
-def test_bounds_hold_the_surface() -> None:
+def test_bounds_contain_the_surface() -> None:
     camera = arc(1)[0]
     truth = sphere_depth(camera)
     low, high = depth_bounds(camera, (truth > 0).astype(np.uint8), None)
@@ -126,7 +127,7 @@ def test_hull_bounds_are_tighter() -> None:
 
     cameras = [*arc(5, 30), *arc(5, 70)]
     masks = [((sphere_depth(c) > 0) * 255).astype(np.uint8) for c in cameras]
-    hull = Hull.of(cameras, masks, np.zeros(3), 1.0, 64)
+    hull = Hull.from_masks(cameras, masks, np.zeros(3), 1.0, 64)
     camera, truth = cameras[2], sphere_depth(cameras[2])
     inside = (truth > 0).astype(np.uint8)
     low, high = depth_bounds(camera, inside, hull)
@@ -139,7 +140,7 @@ def test_hull_bounds_are_tighter() -> None:
     assert (high[held] < ball[1][held]).mean() > 0.95
 
 
-def test_seeds_take_the_nearest_point() -> None:
+def test_seed_is_the_nearest_point() -> None:
     camera = arc(1)[0]
     middle = camera.centre + 2.0 * camera.rays()[60, 70]
     behind = camera.centre + 2.6 * camera.rays()[60, 70]
@@ -148,8 +149,8 @@ def test_seeds_take_the_nearest_point() -> None:
     assert seeds[66, 70] == 0 and not seed_depths(camera, np.zeros((0, 3)), 3).any()
 
 
-def test_a_piece_alone_deep_under_the_hull_is_dropped(scene) -> None:
-    """A mirror image: a patch of depths far behind the surface; the surface itself and a patch beside it stay."""
+def test_isolated_component_deep_inside_the_hull_is_removed(scene) -> None:
+    """A mirror image: a patch of depths far behind the surface. The surface itself stays."""
     from gsbake.capture.hull.visual_hull import Hull
 
     cameras, _, _ = scene
@@ -165,8 +166,8 @@ def test_a_piece_alone_deep_under_the_hull_is_dropped(scene) -> None:
     grid = np.stack(np.meshgrid(*[(np.arange(n) + 0.5) * 2.2 / n - 1.1] * 3, indexing="ij"), -1)
     field = (np.linalg.norm(grid, axis=-1) - RADIUS).astype(np.float32)
     hull = Hull(field < 0, np.full(3, -1.1), 2.2 / n, field)
-    ghosts = find_ghosts(cloud, hull)
-    kept = without_ghosts(one, ghosts)
-    assert 120 <= ghosts.points < 126 and (kept.confidence[90:100, 100:112] == 0).all()
-    assert (kept.confidence > 0).sum() == (depth > 0).sum() - ghosts.points
-    assert find_ghosts(cloud, None).points < 6  # nothing is known of the hull: only tiny pieces fall
+    outliers = find_outliers(cloud, hull)
+    kept = remove_outliers(one, outliers)
+    assert 120 <= outliers.points < 126 and (kept.confidence[90:100, 100:112] == 0).all()
+    assert (kept.confidence > 0).sum() == (depth > 0).sum() - outliers.points
+    assert find_outliers(cloud, None).points < 6  # without a hull only tiny components are removed

@@ -1,4 +1,4 @@
-"""The stereo stage from files to files: what it writes, what it skips, going on after an interruption, and surfels started from it."""
+"""The stereo stage: files, skipping, resume after interruption, and initialisation of surfels from its results."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from gsbake.config.schema import Profile, Stereo
 from gsbake.errors import InterruptedRun
 from gsbake.geometry.cameras import CameraSet
 from gsbake.mvs.depth_maps import read_depth
-from gsbake.mvs.initial_points import in_air, start_points, thin
+from gsbake.mvs.initial_points import in_free_space, initial_points, voxel_downsample
 from gsbake.mvs.point_cloud import StereoCloud
 from gsbake.mvs.stereo import run_stereo
-from gsbake.mvs.view_selection import choose
+from gsbake.mvs.view_selection import select_views
 from tests.mvs.scenes import RADIUS, arc, camera_at, photo, sphere_depth
 from tests.support.recorder import Recorder
 
-#: Half of the ring is dense enough to be matched; the other photos only bound the hull.
+#: Half of the ring is dense enough for matching; the other photos only bound the hull.
 CAMERAS = [
     *arc(5),
     *[camera_at(3.0 * np.array(d) / np.linalg.norm(d), f"far{i}") for i, d in enumerate([(-1, 0.4, 0.2), (-1, -0.8, -0.2), (0, 1, -1.2)])],
@@ -54,7 +54,7 @@ def done(poses: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, d
     return out, run(poses, out)
 
 
-def test_what_it_writes(done: tuple[Path, dict[str, Any]]) -> None:
+def test_files_and_figures(done: tuple[Path, dict[str, Any]]) -> None:
     out, results = done
     cloud = StereoCloud.load(out / "points.ply")
     assert results["points"] == len(cloud) > 1000 and 0.1 < results["confirmed_share"] < 1
@@ -69,15 +69,15 @@ def test_what_it_writes(done: tuple[Path, dict[str, Any]]) -> None:
         assert ((confidence > 0) == known).all() and confidence.max() <= 1
 
 
-def test_the_hull_goes_with_it(poses: Path, done: tuple[Path, dict[str, Any]]) -> None:
+def test_carved_hull(poses: Path, done: tuple[Path, dict[str, Any]]) -> None:
     kept, whole = Hull.load(done[0] / "hull.npz"), visual_hull(PosedPhotos.open(poses))
-    # A ball has no concave place: what is taken away lies outside the ball, where few photos bound the hull.
+    # A ball has no concavity: only cells outside it are carved, where few photos bound the hull.
     assert not (kept.occupancy & ~whole.occupancy).any()
     points = kept.lower + (np.argwhere(whole.occupancy & ~kept.occupancy) + 0.5) * kept.cell
     assert (np.linalg.norm(points, axis=1) > RADIUS - kept.cell).all()
 
 
-def test_it_continues_where_it_stopped(poses: Path, done: tuple[Path, dict[str, Any]], tmp_path: Path) -> None:
+def test_resume_after_interruption(poses: Path, done: tuple[Path, dict[str, Any]], tmp_path: Path) -> None:
     with pytest.raises(InterruptedRun):
         run(poses, tmp_path / "cut", Recorder(("matching", 3)), tmp_path / "scratch")
     kept = {p.name: p.stat().st_mtime_ns for p in (tmp_path / "scratch" / "planes").glob("*.npy") if ".tmp" not in p.name}
@@ -88,7 +88,7 @@ def test_it_continues_where_it_stopped(poses: Path, done: tuple[Path, dict[str, 
     assert (tmp_path / "again" / "hull.npz").read_bytes() == (done[0] / "hull.npz").read_bytes()
 
 
-def test_it_is_skipped(poses: Path, tmp_path: Path) -> None:
+def test_skipping(poses: Path, tmp_path: Path) -> None:
     assert run(poses, tmp_path / "never", enabled="never") == {"points": 0} and not list((tmp_path / "never").iterdir())
     few, monitor = tmp_path / "few", Recorder()
     few.mkdir()
@@ -96,55 +96,55 @@ def test_it_is_skipped(poses: Path, tmp_path: Path) -> None:
     assert run(few, tmp_path / "auto", monitor) == {"points": 0} and "3 photos" in monitor.decisions["stereo"][1]
 
 
-def test_start_is_stereo_and_hull_in_its_holes(poses: Path, done: tuple[Path, dict[str, Any]]) -> None:
+def test_initial_points_are_stereo_and_hull_in_its_holes(poses: Path, done: tuple[Path, dict[str, Any]]) -> None:
     posed = PosedPhotos.open(poses)
-    begun = start_points(posed, done[0], 1500, 0)
-    assert begun is not None
-    assert 500 < begun.stereo <= 1500 and len(begun.points) > begun.stereo
-    off = np.linalg.norm(begun.points, axis=1) - RADIUS
-    assert np.median(np.abs(off[: begun.stereo])) < 0.003
-    from_stereo, from_hull = begun.points[: begun.stereo], begun.points[begun.stereo :]
-    # The matched side looks along +x; the hull fills the other one.
+    initial = initial_points(posed, done[0], 1500, 0)
+    assert initial is not None
+    assert 500 < initial.stereo <= 1500 and len(initial.points) > initial.stereo
+    off = np.linalg.norm(initial.points, axis=1) - RADIUS
+    assert np.median(np.abs(off[: initial.stereo])) < 0.003
+    from_stereo, from_hull = initial.points[: initial.stereo], initial.points[initial.stereo :]
+    # The matched side faces +x; the hull fills the other one.
     assert from_stereo[:, 0].mean() > 0.3 > from_hull[:, 0].mean()
-    assert ((begun.normals * begun.points).sum(1) > 0).mean() > 0.95
-    assert start_points(posed, poses, 100, 0) is None  # no stereo there
+    assert ((initial.normals * initial.points).sum(1) > 0).mean() > 0.95
+    assert initial_points(posed, poses, 100, 0) is None  # no stereo there
 
 
-def test_surfels_begin_from_stereo(poses: Path, done: tuple[Path, dict[str, Any]]) -> None:
-    from gsbake.surfels.initialisation import begin
+def test_surfels_are_initialised_from_stereo(poses: Path, done: tuple[Path, dict[str, Any]]) -> None:
+    from gsbake.surfels.initialisation import initialise_surfels
 
     profile = Profile()
     train = profile.train.model_copy(update={"init_surfels": 800})
-    surfels, kind, why = begin(PosedPhotos.open(poses), train, profile.surfels, 0, done[0])
+    surfels, kind, why = initialise_surfels(PosedPhotos.open(poses), train, profile.surfels, 0, done[0])
     assert kind == "stereo" and "stereo points" in why and len(surfels) > 400
-    _, kind, _ = begin(PosedPhotos.open(poses), train, profile.surfels, 0, poses)
+    _, kind, _ = initialise_surfels(PosedPhotos.open(poses), train, profile.surfels, 0, poses)
     assert kind == "hull"
 
 
-def test_points_before_a_measured_depth_are_air(poses: Path) -> None:
+def test_points_before_a_measured_depth_are_in_free_space(poses: Path) -> None:
     maps = [(c, sphere_depth(c).astype(np.float32)) for c in CAMERAS[:5]]
     points = np.array([[0.9, 0, 0], [0.69, 0, 0], [0.5, 0, 0], [-0.7, 0, 0]])
-    assert in_air(points, iter(maps), 0.05).tolist() == [True, False, False, False]
-    assert not in_air(points, iter(maps[:1]), 0.05).any()
+    assert in_free_space(points, iter(maps), 0.05).tolist() == [True, False, False, False]
+    assert not in_free_space(points, iter(maps[:1]), 0.05).any()
 
 
-def test_thinning_is_even_and_keeps_both_sides_of_a_sheet() -> None:
+def test_downsampling_is_even_and_keeps_both_sides_of_a_sheet() -> None:
     rng = np.random.default_rng(0)
     crowd = np.concatenate([rng.uniform(0, 1, (3000, 2)), rng.uniform(0, 0.2, (9000, 2))])
     points = np.concatenate([np.c_[crowd, np.zeros(12000)], np.c_[crowd, np.full(12000, 1e-3)]])
     normals = np.zeros((24000, 3))
     normals[:12000, 2], normals[12000:, 2] = -1, 1
-    kept, turned, _ = thin(points, normals, np.full((24000, 3), 0.5), np.ones(24000), 800)
+    kept, turned, _ = voxel_downsample(points, normals, np.full((24000, 3), 0.5), np.ones(24000), 800)
     assert 500 < len(kept) <= 800 and (turned[:, 2] > 0.99).sum() == pytest.approx(len(kept) / 2, rel=0.05)
-    assert (kept[:, :2].max(1) < 0.2).mean() < 0.12  # the crowded corner is 4 % of the area
+    assert (kept[:, :2].max(1) < 0.2).mean() < 0.12  # the dense corner is 4 % of the area
 
 
-def test_neighbours_are_five_to_thirty_degrees_away() -> None:
+def test_source_views_are_five_to_thirty_degrees_away() -> None:
     ring = [camera_at(3 * np.array([np.cos(a), np.sin(a), 0.1]), str(i)) for i, a in enumerate(np.radians(np.arange(0, 360, 10)))]
-    matched, asked = choose(ring, np.zeros((1, 3)), None, 4, 8)
+    matched, asked = select_views(ring, np.zeros((1, 3)), None, 4, 8)
     for i in range(36):
         apart = [min((i - j) % 36, (j - i) % 36) * 10 for j in matched[i]]
         assert max(apart) <= 30 and len(matched[i]) == 4
         assert any((j - i) % 36 < 18 for j in matched[i]) and any((i - j) % 36 < 18 for j in matched[i])  # both sides
         assert asked[i][:4] == matched[i] and len(asked[i]) == 8
-    assert choose([ring[0], ring[18]], np.zeros((1, 3)), None, 4, 8)[0] == [[], []]
+    assert select_views([ring[0], ring[18]], np.zeros((1, 3)), None, 4, 8)[0] == [[], []]

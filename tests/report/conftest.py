@@ -1,4 +1,4 @@
-"""A tiny finished run: a grey ball before eight cameras."""
+"""A small finished run: a grey ball seen by eight cameras."""
 
 from __future__ import annotations
 
@@ -14,10 +14,11 @@ import pytest
 
 from gsbake.config.schema import Report
 from gsbake.geometry.cameras import Camera, CameraSet, Similarity
-from gsbake.gltf.write import GltfImages, GltfMesh, build_glb
+from gsbake.gltf.write import GltfMesh, GltfTextures, build_glb
 from gsbake.report.write import ReportOptions, write_report
 from gsbake.shading.environment import EnvironmentLight
 from tests.report.shapes import ball
+from tests.support.cameras import look_at
 from tests.support.recorder import Recorder
 
 #: World (Z-up) to glTF (+Y up), by the contract of the export.
@@ -28,7 +29,7 @@ SIZE, VIEWS, RADIUS = 64, 8, 0.7
 
 @dataclass
 class Finished:
-    """A finished run: the folders of its stages, the folder for the report, and what the report's step reported."""
+    """A finished run: folders of its stages, output folder of the report, and the recorded reports."""
 
     folders: dict[str, Path]
     out: Path
@@ -36,7 +37,7 @@ class Finished:
     monitor: Recorder = field(default_factory=Recorder)
 
     def report(self) -> dict[str, Any]:
-        """Write the report; its figures."""
+        """Write the report; returns its figures."""
         return write_report(self.folders, self.out, self.options, monitor=self.monitor)
 
 
@@ -48,15 +49,11 @@ def png(image: np.ndarray) -> bytes:
 
 def look_at_origin(name: str, centre: np.ndarray) -> Camera:
     """Camera in a Z-up frame."""
-    forward = -centre / np.linalg.norm(centre)
-    right = np.cross(forward, [0, 0, 1.0])
-    right /= np.linalg.norm(right)
-    rotation = np.stack([right, np.cross(forward, right), forward])
-    return Camera(name, SIZE, SIZE, 70.0, 70.0, SIZE / 2, SIZE / 2, rotation, -rotation @ centre)
+    return look_at(centre, size=SIZE, focal=70.0, name=name)
 
 
 def photo_of_ball(camera: Camera, colour: int) -> tuple[np.ndarray, np.ndarray]:
-    """Photo and mask of the ball in the unit frame by the closed form of a ray and a sphere, 4 x 4 samples a pixel; clutter behind."""
+    """Photo and mask of the ball in the unit frame by analytic ray–sphere intersection, 4 x 4 samples per pixel; random background."""
     fine = camera.scaled(4 * SIZE, 4 * SIZE)
     rays = fine.rays()
     rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
@@ -83,7 +80,7 @@ def make_run(tmp_path: Path) -> Callable[..., Finished]:
                 "inputs": {"photos": {"path": "/data/grey_ball/images"}} if stage == "ingest" else {},
             }  # fmt: skip
             (folder / "manifest.json").write_text(json.dumps(manifest))
-        # The unit frame is turned, scaled and moved with respect to the world.
+        # The unit frame is rotated, scaled and translated with respect to the world.
         turn = cv2.Rodrigues(np.array([0.3, -0.5, 0.9]))[0]
         to_world = Similarity(2.5, turn, np.array([0.4, -0.2, 1.1]))
         heights = np.linspace(-0.4, 0.8, VIEWS)
@@ -112,7 +109,7 @@ def make_run(tmp_path: Path) -> Callable[..., Finished]:
         grey = np.full((8, 8, 3), 188, np.uint8)
         orm = np.broadcast_to(np.uint8([0, 255, 255]), (8, 8, 3))  # BGR: metallic 0, roughness 1, occlusion 1
         flat = np.broadcast_to(np.uint8([255, 128, 128]), (8, 8, 3))
-        data = build_glb(mesh, GltfImages(png(grey), png(orm), png(flat)), "ball", "test")
+        data = build_glb(mesh, GltfTextures(png(grey), png(orm), png(flat)), "ball", "test")
         (folders["export"] / "asset.glb").write_bytes(data)
         frames = [
             {

@@ -1,4 +1,4 @@
-"""Small textured meshes with known answers."""
+"""Small analytic textured meshes."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from gsbake.report.render import Asset
 
 
 def quad(base: np.ndarray, **more: object) -> Asset:
-    """A square of edge 2 in the plane z = 0 facing +Z, texture upright as seen from +Z with +Y up."""
+    """Square of edge 2 in the plane z = 0 facing +Z, texture upright as seen from +Z with +Y up."""
     position = np.array([[-1, 1, 0], [1, 1, 0], [1, -1, 0], [-1, -1, 0]], float)
     uv = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], np.float32)
     normal = np.tile(np.float32([0, 0, 1]), (4, 1))
@@ -19,7 +19,7 @@ def quad(base: np.ndarray, **more: object) -> Asset:
 
 
 def ball(radius: float = 1.0, rows: int = 96, grey: float = 0.5, **more: object) -> Asset:
-    """A sphere about the origin by latitude and longitude, smooth normals."""
+    """UV sphere about the origin with smooth normals."""
     theta, phi = np.linspace(0, np.pi, rows + 1), np.linspace(0, 2 * np.pi, 2 * rows + 1)
     t, p = np.meshgrid(theta, phi, indexing="ij")
     normal = np.stack([np.sin(t) * np.sin(p), np.cos(t), np.sin(t) * np.cos(p)], -1).reshape(-1, 3)
@@ -32,6 +32,6 @@ def ball(radius: float = 1.0, rows: int = 96, grey: float = 0.5, **more: object)
 
 
 def front_camera(distance: float, size: int, focal: float, name: str = "front") -> Camera:
-    """A camera on +Z looking along −Z with +Y up in the picture."""
+    """Camera on +Z looking along −Z with +Y up in the image."""
     rotation = np.diag([1.0, -1.0, -1.0])
     return Camera(name, size, size, focal, focal, size / 2, size / 2, rotation, -rotation @ np.array([0, 0, distance]))

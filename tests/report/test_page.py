@@ -1,4 +1,4 @@
-"""The HTML page: whole, escaped, offline; the charts: well-formed and to scale."""
+"""HTML page (complete, escaped, offline) and SVG charts (well-formed, to scale)."""
 
 from __future__ import annotations
 
@@ -18,38 +18,38 @@ from gsbake.report.html import (
     Comparison,
     Decision,
     Figure,
-    LeftOut,
     Light,
     Page,
     Panel,
+    SkipDecision,
     StageRow,
-    Warned,
+    StageWarning,
     hdr_base64,
+    image_uri,
     inline_script,
-    picture_uri,
     render_page,
 )
 
 GREY = np.full((8, 12, 3), 0.5, np.float32)
-URI = picture_uri(GREY)
+URI = image_uri(GREY)
 
 EMPTY = Page(
     title="a & b <mug>", lead="3 photos", figures=(Figure("PSNR", "27.1 dB", "8 photos"),), warnings=(), model="", lights=(),
-    comparisons=(), comparison_note="", relit_title="Under other light", relit=(), relit_note="", maps=(), maps_note="", audit=(),
-    curves=(), curves_note="", left_out=(), decisions=(), stages=(), time_chart="", memory_chart="", run_note="", footer="gsbake",
+    comparisons=(), comparison_note="", relit_title="Under other environments", relit=(), relit_note="", maps=(), maps_note="", audit=(),
+    curves=(), curves_note="", skip_decisions=(), decisions=(), stages=(), time_chart="", memory_chart="", run_note="", footer="gsbake",
 )  # fmt: skip
 
 FULL = replace(
     EMPTY,
-    warnings=(Warned("poses", "<script>alert(1)</script>"),),
+    warnings=(StageWarning("poses", "<script>alert(1)</script>"),),
     model=base64.b64encode(b"glTF").decode(),
     lights=(Light("Studio", hdr_base64(GREY)),),
     comparisons=(Comparison("IMG_1", URI, URI, 27.123, 0.9234, True), Comparison("IMG_2", URI, URI, 21.0, 0.8, False)),
-    relit=(Panel("Sunset", "front", picture_uri(GREY, GREY[..., 0])),),
+    relit=(Panel("Sunset", "front", image_uri(GREY, GREY[..., 0])),),
     maps=(Panel("Base colour", "1024", URI),),
     audit=(Check("triangles", "pass", "29 998"), Check("size", "fail", "9 MB")),
     curves=(lines([Curve("train", [0, 1, 2], [20, 21, 22])], "PSNR"),),
-    left_out=(LeftOut("skip.converged_steps", "train", "stopped", "gain < 0.05 dB", "about 12 s"),),
+    skip_decisions=(SkipDecision("skip.converged_steps", "train", "stopped", "gain < 0.05 dB", "about 12 s"),),
     decisions=(Decision("poses", "structure from motion", "skipped", "poses given"),),
     stages=(StageRow("Training", "12 s", (("Results", (("psnr", "27.1"),)), ("Settings", ()))),),
     time_chart=bars([Bar("train", 12, "12 s", (("steps", 9.0), ("eval", 3.0)))], "time"),
@@ -58,7 +58,7 @@ FULL = replace(
 
 
 class Outline(HTMLParser):
-    """Tags with attributes, text outside scripts, and whether every element was closed."""
+    """Tags with attributes, text outside scripts, and open elements."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -102,7 +102,7 @@ def test_nothing_is_fetched(page: Page) -> None:
     assert styles and not any(word in text for text in styles for word in ("url(", "@import"))
 
 
-def test_sections_come_with_their_data() -> None:
+def test_sections_without_data_are_omitted() -> None:
     ids = {attrs.get("id") for _, attrs in outline(render_page(FULL)).tags}
     assert {"asset", "quality", "relit", "maps", "audit", "training", "run", "model", "light-1"} <= ids
     bare = outline(render_page(EMPTY))
@@ -117,42 +117,42 @@ def test_text_is_escaped_and_figures_are_shown() -> None:
     html = render_page(FULL)
     text = " ".join(outline(html).text)
     assert "a & b <mug>" in text and "<script>alert(1)</script>" in text and "<script>alert" not in html
-    for words in ("27.12 dB", "0.923", "used in training", "poses given", "29 998", "27.1", "skip.converged_steps", "gain < 0.05", "12 s"):
+    for words in ("27.12 dB", "0.923", "training photo", "poses given", "29 998", "27.1", "skip.converged_steps", "gain < 0.05", "12 s"):
         assert words in text
 
 
-def test_model_and_viewer_are_inside() -> None:
+def test_model_and_viewer_are_inlined() -> None:
     html = render_page(FULL)
     found = re.search(r'<script id="model" type="text/plain">(.*?)</script>', html, re.DOTALL)
     assert found and base64.b64decode(found[1]) == b"glTF"
     assert "ModelViewerElement" in html and "ModelViewerElement" not in render_page(EMPTY)
 
 
-def test_script_text_cannot_leave_its_element() -> None:
+def test_script_text_cannot_close_its_element() -> None:
     text = str(inline_script("a = '</script><!-- <script>';"))
     assert "</script" not in text and "<!--" not in text
     viewer = re.findall(r"<script>(.*?)</script>", render_page(FULL), re.DOTALL)
     assert len(viewer) == 2 and len(viewer[0]) > 900_000 and viewer[1].startswith('"use strict"')
 
 
-def test_pictures_keep_their_values() -> None:
+def test_encoded_images_keep_their_values() -> None:
     ramp = np.linspace(0, 1, 64, dtype=np.float32)[None, :, None] * np.ones((16, 1, 3), np.float32)
     for alpha, kind in ((None, "image/jpeg"), (np.ones((16, 64), np.float32), "image/webp")):
-        head, data = picture_uri(ramp, alpha).split(",")
+        head, data = image_uri(ramp, alpha).split(",")
         assert head == f"data:{kind};base64"
         back = cv2.imdecode(np.frombuffer(base64.b64decode(data), np.uint8), cv2.IMREAD_UNCHANGED)
         np.testing.assert_allclose(back[..., :3] / 255, ramp, atol=0.04)
-    red = picture_uri(np.full((16, 16, 3), 0.5, np.float32) * np.float32([2, 0, 0]))
+    red = image_uri(np.full((16, 16, 3), 0.5, np.float32) * np.float32([2, 0, 0]))
     back = cv2.imdecode(np.frombuffer(base64.b64decode(red.split(",")[1]), np.uint8), cv2.IMREAD_COLOR)
     assert back[8, 8, 2] > 245 and back[8, 8, :2].max() < 12
 
 
-def test_hdr_keeps_radiance() -> None:
+def test_hdr_file_keeps_radiance() -> None:
     light = np.array([[[0.1, 2.0, 30.0]] * 8] * 4, np.float32)
     data = base64.b64decode(hdr_base64(light))
     assert data.startswith(b"#?RADIANCE") or data.startswith(b"#?RGBE")
     back = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-    # One exponent for the three channels: the error is 1/256 of the largest.
+    # Shared exponent of the three channels: the error is 1/256 of the largest.
     np.testing.assert_allclose(back[..., ::-1], light, atol=30 / 256 * 1.01)
 
 
@@ -164,7 +164,7 @@ def test_bars_are_to_scale() -> None:
     assert float(parts[0].get("width", "0")) == pytest.approx(0.6 * whole[0], abs=0.2)
     assert float(parts[1].get("x", "0")) == pytest.approx(float(parts[0].get("x", "0")) + 0.6 * whole[0], abs=0.2)
     assert any("b & c" in (t.text or "") for t in root.iter("text"))
-    ET.fromstring(bars([Bar("a", 0.0, "0 s", (("x", 0.0),))], "nothing took time"))
+    ET.fromstring(bars([Bar("a", 0.0, "0 s", (("x", 0.0),))], "no times"))
 
 
 def test_lines_rise_when_values_rise_and_skip_gaps() -> None:
@@ -192,7 +192,7 @@ def test_log_ticks() -> None:
     np.testing.assert_allclose(log_ticks(4e-3, 2), [1e-2, 3e-2, 1e-1, 3e-1, 1])
 
 
-def test_labels_tell_ticks_apart() -> None:
+def test_labels_distinguish_ticks() -> None:
     assert labels([20.32, 20.34]) == ["20.32", "20.34"]
     assert labels([0.0, 500.0, 1000.0]) == ["0", "500", "1k"]
     assert labels([1e-4, 2e-4]) == ["1e-4", "2e-4"] and labels([3.0]) == ["3"]
@@ -201,7 +201,7 @@ def test_labels_tell_ticks_apart() -> None:
     assert len(shown) >= 2 and len(set(shown)) == len(shown)
 
 
-def test_long_curves_are_thinned() -> None:
+def test_long_curves_are_downsampled() -> None:
     x = list(range(30_000))
     root = ET.fromstring(lines([Curve("a", x, [float(i) for i in x])], "t"))
     points = str(next(root.iter("polyline")).get("points")).split()

@@ -1,4 +1,4 @@
-"""The mesh renderer against closed forms: projection, coverage, texture lookup, normal maps, shading, filtering."""
+"""Renderer against closed forms: projection, coverage, texture sampling, normal maps, shading, filtering."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pytest
 from gsbake.geometry.cameras import Camera
 from gsbake.imaging.sampling import bilinear
 from gsbake.imaging.srgb import decode, encode
-from gsbake.report.lights import PROCEDURAL, LitShader, procedural
+from gsbake.report.lights import PROCEDURAL_LIGHTS, LitShader, procedural
 from gsbake.report.render import Asset, Renderer, unlit
 from gsbake.shading.environment import EnvironmentLight
 from tests.report.shapes import ball, front_camera, quad
@@ -28,14 +28,14 @@ def test_bilinear_centres_midpoints_and_wrap() -> None:
     np.testing.assert_allclose(bilinear(image, uv)[:, 0], [0, 5, 0.5, 2, 1.5, 0], atol=1e-6)
 
 
-def test_texture_lands_where_it_should() -> None:
+def test_texture_coordinates() -> None:
     base = np.zeros((2, 2, 3))
     base[0, 0], base[0, 1], base[1, 0], base[1, 1] = (1, 0, 0), (0, 1, 0), (0, 0, 1), (1, 1, 1)
     # Distance 4, focal 60: the square covers 2 · 60 / 4 = 30 of 40 pixels.
     picture = Renderer(quad(base)).draw(front_camera(4, 40, 60), unlit, samples=1)
     assert picture.alpha.sum() == 900
     assert picture.alpha[5:35, 5:35].min() == 1
-    # Texel centres lie a quarter in: pixel 5 + 7 has its centre at u = 7.5 / 30. v = 0 is the texture's top row, on top in the picture.
+    # Texel centres are at u = 1/4 and 3/4: pixel 5 + 7 has its centre at u = 7.5 / 30. v = 0 is the top row of texture and image.
     np.testing.assert_allclose(picture.rgb[12, 12], [1, 0, 0], atol=1e-3)
     np.testing.assert_allclose(picture.rgb[12, 27], [0, 1, 0], atol=1e-3)
     np.testing.assert_allclose(picture.rgb[27, 12], [0, 0, 1], atol=1e-3)
@@ -50,18 +50,18 @@ def test_sphere_covers_the_area_of_its_cone() -> None:
     inside = np.hypot(xs - 64, ys - 64) < radius - 2
     assert picture.alpha[inside].min() == 1
     np.testing.assert_allclose(picture.rgb[inside], encode(np.array(0.5)), atol=1e-4)
-    # The normal at a pixel is where its ray first meets the sphere.
+    # The normal at a pixel is the first intersection of its ray with the unit sphere.
     ray = np.array([(80.5 - 64) / 180, -(50.5 - 64) / 180, -1.0])
     a, b, c = ray @ ray, 2 * ray[2] * 4, 15.0
     hit = np.array([0, 0, 4.0]) + ray * (-b - math.sqrt(b * b - 4 * a * c)) / (2 * a)
     np.testing.assert_allclose(picture.normal[50, 80], hit, atol=5e-3)
 
 
-def test_edges_mix_in_linear_light() -> None:
+def test_edges_are_averaged_in_linear_radiance() -> None:
     base = np.zeros((2, 2, 3))
     base[:, 0] = 1.0
     sharp = np.repeat(np.repeat(base, 64, 0), 64, 1)  # left half white, right half black
-    camera = front_camera(4, 41, 60)  # odd: the border runs through the middle of column 20
+    camera = front_camera(4, 41, 60)  # odd: the edge runs through the centre of column 20
     picture = Renderer(quad(sharp)).draw(camera, unlit, samples=4)
     np.testing.assert_allclose(picture.rgb[20, 20], encode(np.array(0.5)), atol=0.03)
 
@@ -71,7 +71,7 @@ def linear_light(a: float, b: tuple[float, float, float]) -> EnvironmentLight:
 
 
 def diffuse(asset_of: object, shader: LitShader) -> np.ndarray:
-    """Mean linear colour in the picture's middle, less that of the same asset in black: the diffuse part alone."""
+    """Mean linear radiance at the centre minus that of the same asset in black: the diffuse part."""
     out = []
     for grey in (0.6, 0.0):
         picture = Renderer(asset_of(grey)).draw(front_camera(4, 32, 40), shader)  # type: ignore[operator]
@@ -83,23 +83,23 @@ ROUGH = np.broadcast_to(np.float32([1, 1, 0]), (4, 4, 3)).copy()
 
 
 @pytest.mark.parametrize("tilt", [(0.0, 0.0), (0.5, 0.0), (0.0, 0.5), (-0.4, 0.3)])
-def test_normal_map_bends_towards_its_tangents(tilt: tuple[float, float]) -> None:
-    # Radiance a + b·d has irradiance π (a + 2/3 b·n): the shading tells the normal. +X of the map is the tangent, +Y the picture's up.
+def test_normal_map_in_tangent_space(tilt: tuple[float, float]) -> None:
+    # Radiance a + b·d has irradiance π (a + 2/3 b·n), which determines the normal. +X of the map is the tangent, +Y up in the image.
     n = np.array([*tilt, math.sqrt(1 - tilt[0] ** 2 - tilt[1] ** 2)])
-    bent = np.broadcast_to(n.astype(np.float32), (4, 4, 3)).copy()
+    local_normal = np.broadcast_to(n.astype(np.float32), (4, 4, 3)).copy()
     b = (0.2, 0.25, 0.1)
     got = diffuse(
-        lambda grey: quad(np.full((4, 4, 3), grey), orm=ROUGH, normal_map=bent),
+        lambda grey: quad(np.full((4, 4, 3), grey), orm=ROUGH, normal_map=local_normal),
         LitShader(linear_light(0.5, b)),
     )
     np.testing.assert_allclose(got, 0.6 * (0.5 + 2 / 3 * n @ np.array(b)), rtol=0.02)
 
 
 def test_mirrored_tangent_frame() -> None:
-    bent = np.broadcast_to(np.float32([0, 0.6, 0.8]), (4, 4, 3)).copy()
+    local_normal = np.broadcast_to(np.float32([0, 0.6, 0.8]), (4, 4, 3)).copy()
 
     def mirrored(grey: float) -> Asset:
-        plain = quad(np.full((4, 4, 3), grey), orm=ROUGH, normal_map=bent)
+        plain = quad(np.full((4, 4, 3), grey), orm=ROUGH, normal_map=local_normal)
         tangent = np.tile(np.float32([1, 0, 0, -1]), (4, 1))
         return Asset(plain.position, plain.normal, tangent, plain.uv, plain.faces, plain.base_color, plain.orm, plain.normal_map)
 
@@ -108,7 +108,7 @@ def test_mirrored_tangent_frame() -> None:
 
 
 def test_light_frame_and_occlusion() -> None:
-    # The light is brightest along its own +X; turned so that the asset's +Z is the light's +X, the square faces it.
+    # The environment is brightest along its +X; the rotation maps the asset's +Z, the normal of the square, to it.
     turn = np.array([[0, 0, 1.0], [1, 0, 0], [0, 1, 0]])
     light = linear_light(0.5, (0.3, 0, 0))
     got = diffuse(lambda grey: quad(np.full((4, 4, 3), grey), orm=ROUGH), LitShader(light, turn))
@@ -118,14 +118,14 @@ def test_light_frame_and_occlusion() -> None:
     np.testing.assert_allclose(got, 0.3 * (0.5 + 2 / 3 * 0.3), rtol=0.02)
 
 
-def test_light_of_its_own_is_added_to_what_it_reflects() -> None:
-    glow = np.full((4, 4, 3), (0.0, 0.1, 0.3), np.float32)
-    for strength, light in ((0.0, 0.0), (1.0, 0.25)):
-        shown = Renderer(quad(np.full((4, 4, 3), light), emissive=strength * glow)).draw(front_camera(4, 40, 60), unlit, samples=1)
-        np.testing.assert_allclose(decode(shown.rgb[20, 20]), light + strength * glow[0, 0], atol=1e-4)
+def test_emission_is_added_to_reflected_radiance() -> None:
+    emission = np.full((4, 4, 3), (0.0, 0.1, 0.3), np.float32)
+    for strength, base in ((0.0, 0.0), (1.0, 0.25)):
+        shown = Renderer(quad(np.full((4, 4, 3), base), emissive=strength * emission)).draw(front_camera(4, 40, 60), unlit, samples=1)
+        np.testing.assert_allclose(decode(shown.rgb[20, 20]), base + strength * emission[0, 0], atol=1e-4)
 
 
-def test_viewer_light_shows_the_asset_frame() -> None:
+def test_equirectangular_map_is_in_the_asset_frame() -> None:
     turn = np.array([[0, 0, 1.0], [1, 0, 0], [0, 1, 0]])
     image = LitShader(linear_light(0.5, (0.3, 0, 0)), turn).equirectangular(32)
     # three.js: u = atan2(z, x) / 2π + ½, so the asset's +Z lies at three quarters of the width, −Z at one quarter.
@@ -133,13 +133,13 @@ def test_viewer_light_shows_the_asset_frame() -> None:
     np.testing.assert_allclose(image[15:17, 16].mean(0), 0.2, atol=0.02)
 
 
-def test_fine_textures_do_not_alias() -> None:
+def test_minified_textures_do_not_alias() -> None:
     checker = (np.indices((512, 512)).sum(0) % 2).astype(np.float32)[..., None].repeat(3, 2)
     picture = Renderer(quad(checker)).draw(front_camera(4, 40, 60), unlit, samples=1)
     np.testing.assert_allclose(decode(picture.rgb[6:34, 6:34]), 0.5, atol=0.01)
 
 
-def test_windows_at_the_border_and_inside() -> None:
+def test_screen_bounds_at_the_border_and_inside() -> None:
     renderer = Renderer(ball(1.0))
     whole = renderer.draw(front_camera(4, 64, 90), unlit)
     camera = front_camera(4, 64, 90)
@@ -148,7 +148,7 @@ def test_windows_at_the_border_and_inside() -> None:
     np.testing.assert_array_equal(part.alpha[:44, 20:], whole.alpha[20:, :44])
     away = Camera("a", 64, 64, 90, 90, 500, 32, camera.R, camera.t)
     assert renderer.draw(away, unlit).alpha.max() == 0
-    assert renderer.draw(front_camera(0, 16, 8), unlit).alpha.min() == 1  # from within, the ball is everywhere
+    assert renderer.draw(front_camera(0, 16, 8), unlit).alpha.min() == 1  # camera inside the ball
     behind = Camera("b", 64, 64, 90, 90, 32, 32, np.eye(3), np.array([0, 0, -4.0]))
     assert renderer.draw(behind, unlit).alpha.max() == 0
 
@@ -160,14 +160,14 @@ def test_over_grey() -> None:
     np.testing.assert_allclose(over[20, 20], 1, atol=1e-5)
 
 
-@pytest.mark.parametrize("name", sorted(PROCEDURAL))
-def test_procedural_lights_are_lights(name: str) -> None:
+@pytest.mark.parametrize("name", sorted(PROCEDURAL_LIGHTS))
+def test_procedural_environments_are_finite_and_well_exposed(name: str) -> None:
     directions = np.random.default_rng(0).normal(size=(20_000, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    radiance = PROCEDURAL[name](directions)
+    radiance = PROCEDURAL_LIGHTS[name](directions)
     assert radiance.shape == (20_000, 3) and radiance.min() >= 0 and np.isfinite(radiance).all()
-    # Irradiance / π on the front and the top: bright enough to see by, not so bright that white burns out everywhere.
+    # Irradiance / π of normals to the front and up: neither too dark nor overexposed.
     for n in ((0, 0, 1.0), (0, 1.0, 0)):
-        level = 4 * np.mean(radiance.mean(1) * np.clip(directions @ np.array(n), 0, None))
-        assert 0.25 < level < 1.5
+        irradiance = 4 * np.mean(radiance.mean(1) * np.clip(directions @ np.array(n), 0, None))
+        assert 0.25 < irradiance < 1.5
     assert procedural(name).light.size == 32

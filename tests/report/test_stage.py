@@ -1,4 +1,4 @@
-"""The report stage on a tiny finished run whose right answer is known."""
+"""Report stage on a small finished run with known figures."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from gsbake.report.asset import open_asset
 from gsbake.report.lights import LitShader
 from gsbake.report.quality import asset_cameras
 from gsbake.report.render import Renderer
-from gsbake.report.sheets import chart_of_faces, uv_sheet
+from gsbake.report.sheets import face_charts, uv_atlas_image
 from gsbake.shading.environment import EnvironmentLight
 from gsbake.stages.report import STAGE
 from tests.report.conftest import Finished
@@ -28,10 +28,10 @@ from tests.report.shapes import ball, quad
 MakeRun = Callable[..., Finished]
 
 
-def test_the_right_asset_scores_high(make_run: MakeRun) -> None:
+def test_correct_asset_has_high_psnr(make_run: MakeRun) -> None:
     done = make_run()
     found = done.report()
-    # The ball is polygonal and the photos are reduced from 64 to 48 pixels: only the rim differs.
+    # The ball is polygonal and the photos are reduced from 64 to 48 pixels: only the silhouette differs.
     assert found["psnr"] > 32 and found["ssim"] > 0.97
     assert found["held_out"] is True and found["compared"] == 2  # every fourth of eight, from the second on
     body = json.loads((done.out / "report.json").read_text())
@@ -41,25 +41,25 @@ def test_the_right_asset_scores_high(make_run: MakeRun) -> None:
     assert done.monitor.warnings == []
 
 
-def test_a_shifted_asset_scores_low(make_run: MakeRun) -> None:
+def test_shifted_asset_has_low_psnr(make_run: MakeRun) -> None:
     assert make_run(shift=1.2).report()["psnr"] < 20
 
 
-def test_page_tells_the_run(make_run: MakeRun) -> None:
+def test_page_shows_the_run(make_run: MakeRun) -> None:
     done = make_run(materials=True)
     found = done.report()
     html = (done.out / "report.html").read_text()
     triangles = f"{found['triangles']:,}".replace(",", " ")
     for words in ("grey_ball", "One photo is blurred &amp; dark.", "structure from motion", "8 of 9", "Learnt light", "Sunset", triangles):
         assert words in html
-    assert html.count("used in training") == 0
+    assert html.count("<span>training photo</span>") == 0
     assert 'id="light-3"' in html
     assert found["seconds"] == pytest.approx(1.5 * 28) and found["peak_bytes"] == 7e8
     assert found["page_bytes"] < 4e6
 
 
 def test_lit_ball_under_white_light(make_run: MakeRun) -> None:
-    # Radiance 1 from everywhere: sRGB 188 is linear .5, so diffuse light alone gives .5; the gloss adds a few percent of white.
+    # Uniform radiance 1: sRGB 188 is linear .5, the diffuse part; specular reflection adds a few percent.
     found = make_run(materials=True).report()
     assert 20 < found["psnr"] < 40
 
@@ -70,7 +70,7 @@ def test_without_masks_or_held_out_photos(make_run: MakeRun) -> None:
     assert found["held_out"] is False and found["compared"] == 8
     assert found["psnr"] > 28
     html = (done.out / "report.html").read_text()
-    assert "no masks" in html and html.count("used in training") == 2
+    assert "no masks" in html and html.count("<span>training photo</span>") == 2
 
 
 def test_cameras_of_another_run(make_run: MakeRun) -> None:
@@ -97,7 +97,7 @@ def test_light_turns_with_the_frames(make_run: MakeRun) -> None:
     np.testing.assert_allclose(to_light @ [up[0], up[2], -up[1]], [0.3, 0.5, -0.7], atol=1e-9)
 
 
-def test_open_asset_undoes_the_coding(make_run: MakeRun) -> None:
+def test_open_asset_decodes_the_textures(make_run: MakeRun) -> None:
     path = make_run().folders["export"] / "asset.glb"
     asset = open_asset(path, unlit=True)
     np.testing.assert_allclose(asset.base_color, 0.5029, atol=1e-3)  # sRGB 188
@@ -114,20 +114,20 @@ def test_open_asset_undoes_the_coding(make_run: MakeRun) -> None:
 def test_framed_camera_sees_all() -> None:
     shape = ball(2.0)
     for direction in ([0, 0, 1.0], [1, 0.4, -0.3], [0, 1.0, 0]):
-        camera = compose.framed(shape, np.array(direction), 100)
+        camera = compose.framing_camera(shape, np.array(direction), 100)
         np.testing.assert_allclose(camera.R @ camera.R.T, np.eye(3), atol=1e-12)
         assert np.linalg.det(camera.R) > 0
         pixels, depth = camera.project(shape.position)
         assert depth.min() > 0 and pixels.min() > -0.5 and pixels.max() < 100.5
         assert np.ptp(pixels[:, 0]) > 95
-    side = compose.framed(shape, np.array([0, 0, 1.0]), 100)
+    side = compose.framing_camera(shape, np.array([0, 0, 1.0]), 100)
     above = side.project(np.array([[0, 1.0, 0]]))[0][0]
     assert above[1] < 50 and above[0] == pytest.approx(50)
 
 
 def test_viewpoints_are_spread() -> None:
     shape = ball(1.0)
-    cameras = [compose.framed(shape, np.array([np.sin(a), 0.35, np.cos(a)]), 8) for a in np.linspace(0, 2 * np.pi, 12, False)]
+    cameras = [compose.framing_camera(shape, np.array([np.sin(a), 0.35, np.cos(a)]), 8) for a in np.linspace(0, 2 * np.pi, 12, False)]
     found = compose.viewpoints(shape, cameras, 2)
     assert len(found) == 2 and found[0] @ found[1] < -0.7
     assert len(compose.viewpoints(shape, cameras[:1], 3)) == 1
@@ -145,14 +145,14 @@ def test_relit_panels_differ_by_light() -> None:
 
 def test_charts_of_the_atlas() -> None:
     faces = np.array([[0, 1, 2], [2, 1, 3], [4, 5, 6]], np.int32)
-    found = chart_of_faces(faces, 7)
+    found = face_charts(faces, 7)
     assert found[0] == found[1] != found[2] and found.max() == 1
 
 
 def test_uv_sheet_covers_what_the_triangles_cover() -> None:
     shape = quad(np.ones((2, 2, 3)))
     uv = np.array([[0.25, 0.25], [0.75, 0.25], [0.75, 0.5], [0.25, 0.5]], np.float32)
-    sheet = uv_sheet(type(shape)(shape.position, shape.normal, shape.tangent, uv, shape.faces, shape.base_color), edge=64)
+    sheet = uv_atlas_image(type(shape)(shape.position, shape.normal, shape.tangent, uv, shape.faces, shape.base_color), edge=64)
     assert sheet[24, 24].max() > 0.4 and sheet[24, 40].max() > 0.4  # v = .375: row 24
     np.testing.assert_allclose(sheet[[8, 40, 24, 24], [24, 24, 8, 56]], 34 / 255, atol=0.01)
 
@@ -160,30 +160,30 @@ def test_uv_sheet_covers_what_the_triangles_cover() -> None:
 def test_manifests_may_lack_everything(tmp_path: Path) -> None:
     folder = tmp_path / "mesh"
     folder.mkdir()
-    said = manifests.load_manifests({"mesh": folder})
-    assert said == {"mesh": {}}
-    assert manifests.total_seconds(said) == 0 and manifests.peak(said) == (0.0, "")
-    assert "by hand" in manifests.time_chart(said) and manifests.stage_rows(said)[0].title == "mesh"
-    assert manifests.decisions(said) == () and manifests.warnings(said) == () and manifests.capture_name(said) == "Asset"
-    assert "0.0 s" in manifests.run_note(said)
+    found = manifests.load_manifests({"mesh": folder})
+    assert found == {"mesh": {}}
+    assert manifests.total_seconds(found) == 0 and manifests.peak(found) == (0.0, "")
+    assert "replaced" in manifests.time_chart(found) and manifests.stage_rows(found)[0].title == "mesh"
+    assert manifests.decisions(found) == () and manifests.warnings(found) == () and manifests.capture_name(found) == "Asset"
+    assert "0.0 s" in manifests.run_note(found)
 
 
-def test_every_rule_on_work_left_out_is_listed() -> None:
-    done = {"what": "skip.converged_steps", "choice": "stopped", "evidence": "stood still", "saved_s": 75.0}
-    said = {
+def test_every_skip_rule_is_listed() -> None:
+    done = {"what": "skip.converged_steps", "choice": "stopped", "evidence": "plateau", "saved_s": 75.0}
+    found = {
         "poses": {"decisions": [{"what": "skip.redundant_photos", "choice": "all used", "evidence": "0 of 9"},
                                 {"what": "matching", "choice": "x"}]},
         "train": {"decisions": [done]},
         "refine": {"decisions": [done | {"choice": "all steps", "saved_s": None}]},
     }
-    rows = manifests.left_out(said)
+    rows = manifests.skip_decisions(found)
     assert list(dict.fromkeys(row.rule for row in rows)) == [f"skip.{rule}" for rule in Skip.model_fields]
     by_stage = {(row.rule, row.stage): row for row in rows}
     assert by_stage["skip.converged_steps", "train"].saved == "about 1 min 15 s"
     assert by_stage["skip.converged_steps", "refine"].saved == "" and by_stage["skip.redundant_photos", "poses"].evidence == "0 of 9"
-    assert by_stage["skip.exposure_equalisation", ""].choice == "not asked"
-    assert [d.what for d in manifests.decisions(said)] == ["matching"]
-    assert manifests.left_out({"mesh": {}}) == ()
+    assert by_stage["skip.exposure_equalisation", ""].choice == "not applicable"
+    assert [d.what for d in manifests.decisions(found)] == ["matching"]
+    assert manifests.skip_decisions({"mesh": {}}) == ()
 
 
 @pytest.mark.parametrize(
@@ -193,7 +193,7 @@ def test_capture_name(path: str, name: str) -> None:
     assert manifests.capture_name({"ingest": {"inputs": {"photos": {"path": path}}}}) == name
 
 
-def test_logs_of_refine_go_on_after_those_of_train() -> None:
+def test_steps_of_refine_follow_those_of_train() -> None:
     train, refine = {"step": [0.0, 100.0], "psnr": [20.0, 25.0]}, {"step": [0.0, 50.0], "psnr": [25.0, 26.0]}
     (chart,) = manifests.training_charts({"train": train, "refine": refine})
     lines = {c: [float(p.split(",")[0]) for p in points.split()] for c, points in re.findall(r'class="(c\d)" points="([^"]+)"', chart)}
@@ -224,7 +224,10 @@ def test_audit_states(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("value", "text"),
-    [(True, "yes"), (3, "3"), (0.123456, "0.1235"), ([1, 2.5], "1, 2.5"), ({"a": 1}, "a: 1"), (None, "–"), ([], "–"), ([7] * 20, "(20)")],
-)
-def test_readable(value: object, text: str) -> None:
-    assert text in manifests.readable(value)
+    [
+        (True, "yes"), (3, "3"), (0.123456, "0.1235"), (15_000.0, "15 000"), (30_000, "30 000"), ([1, 2.5], "1, 2.5"), ({"a": 1}, "a: 1"),
+        (None, "–"), ([], "–"), ([7] * 20, "(20)"),
+    ],
+)  # fmt: skip
+def test_format_value(value: object, text: str) -> None:
+    assert text in manifests.format_value(value)

@@ -39,8 +39,8 @@ def test_white_furnace() -> None:
     tables = EnvironmentLight(8, 1.0).prefilter()
     normal, view, albedo, rough, _ = buffers(500, 1)
     zero, one = torch.zeros(500), torch.ones(500)
-    matte = shade(normal, view, albedo, one, zero, tables)
-    assert (matte >= albedo - 1e-4).all() and (matte <= albedo + 0.05 + 0.3 * (1 - (normal * view).sum(1, keepdim=True)).clamp_min(0)).all()
+    lit = shade(normal, view, albedo, one, zero, tables)
+    assert (lit >= albedo - 1e-4).all() and (lit <= albedo + 0.05 + 0.3 * (1 - (normal * view).sum(1, keepdim=True)).clamp_min(0)).all()
     mirror = shade(normal, view, torch.ones(500, 3), rough, one, tables)
     assert (mirror <= 1.0001).all()  # F0 = 1 returns A + B ≤ 1 …
     smooth = shade(normal, view, torch.ones(500, 3), torch.full((500,), 0.08), one, tables)

@@ -1,4 +1,4 @@
-"""Scenes no photo would give: any scale, sharpness, SDF value, opacity and field of view, drawn by hypothesis."""
+"""Extreme scenes for hypothesis: any scale, sharpness, SDF value, opacity and field of view."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ SPECIAL_SDF = (0.0, 1e-30, 1e-3, 1.0, 1e6, -1e6)
 
 @dataclass
 class Scene:
-    """Leaves by name, the pose, the view and the transfer."""
+    """Leaf tensors by name, the pose, the intrinsics and the transfer function."""
 
     leaves: dict[str, Tensor]
     rotation: Tensor
@@ -27,13 +27,13 @@ class Scene:
     transfer: Transfer
 
     def render(self) -> Rendered:
-        """Render with the opacity that SDF and sharpness give."""
+        """Render with the opacity from SDF samples and sharpness."""
         x = self.leaves
         opacity = self.transfer.opacity(x["sdf"], x["gamma"])
         return render(x["position"], x["quaternion"], x["log_scale"], opacity, x["features"], self.rotation, self.translation, self.view)
 
     def backward(self, out: Rendered, factor: float = 1.0) -> dict[str, Tensor]:
-        """Gradients of everything that is rendered, by name, the pose's included."""
+        """Gradients of all leaves and of the pose, by name."""
         loss = out.features.sum() + out.depth.sum() + out.distortion.sum() + out.alpha.sum() + out.expected_depth().sum()
         if loss.requires_grad:
             (factor * loss).backward()
@@ -52,7 +52,7 @@ def build(
     fov: float,
     size: tuple[int, int],
 ) -> Scene:
-    """A scene of n surfels: log10 of the scales between the two given, centres `spread` wide, `distance` before the camera."""
+    """A scene of n surfels: log10 of the scales in the range `scale`, centres with standard deviation `spread` at `distance`."""
     g = torch.Generator().manual_seed(seed)
     special = torch.tensor(SPECIAL_SDF)[torch.randint(len(SPECIAL_SDF), (n,), generator=g)]
     near_zero = torch.randn(n, generator=g) / gamma
@@ -75,7 +75,7 @@ def build(
 
 
 def scenes() -> st.SearchStrategy[Scene]:
-    """Everything `build` takes, over many orders of magnitude."""
+    """All parameters of `build`, over many orders of magnitude."""
     exponent = st.floats(-8, 4)
     return st.builds(
         build,

@@ -1,4 +1,4 @@
-"""The kernels' error against the float64 twin stays small over the corners of the grid of docs/numerics.md."""
+"""The error of the float32 kernels against the float64 reference is small over the grid of docs/lab/numerics.md."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from benchmarks.numerics import FIELDS, SCALES, errors
 
 @pytest.mark.parametrize("field", [FIELDS[0], FIELDS[2], FIELDS[-1]])
 @pytest.mark.parametrize("scale", [SCALES[0], SCALES[3], SCALES[-1]])
-def test_corners(scale: float, field: float) -> None:
+def test_corners_of_the_grid(scale: float, field: float) -> None:
     colour, off, other = errors(scale, field)
     assert 0 < colour < 1e-4 and off < 1e-3 and other < 2e-3
 

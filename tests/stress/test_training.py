@@ -1,4 +1,4 @@
-"""Training that has no answer: it ends all the same, finite and within its memory; the same seed gives the same bits."""
+"""Training on ill-posed photos: it stays finite and within its memory; the same seed gives bit-identical results."""
 
 from __future__ import annotations
 
@@ -16,9 +16,10 @@ from gsbake.surfels.initialisation import fibonacci_sphere, spacing
 from gsbake.surfels.model import create
 from gsbake.surfels.raster import threads
 from gsbake.surfels.raster.projection import Pinhole
-from gsbake.surfels.training.finite import broken
+from gsbake.surfels.training.finite import first_non_finite
 from gsbake.surfels.training.trainer import Plan, Trainer
 from gsbake.surfels.training.views import TrainView
+from tests.support.cameras import look_at_rotation
 
 SIZE = 24
 STEPS = int(os.environ.get("GSBAKE_SOAK_STEPS", "20000"))
@@ -35,15 +36,12 @@ def one_thread_after() -> Iterator[None]:
 
 
 def pose(eye: np.ndarray) -> tuple[torch.Tensor, torch.Tensor]:
-    z = -eye / np.linalg.norm(eye)
-    x = np.cross(z, [0.1, 0.2, 1.0])
-    x /= np.linalg.norm(x)
-    rotation = np.stack([x, np.cross(z, x), z])
+    rotation = look_at_rotation(eye, up=(0.1, 0.2, 1.0))
     return torch.tensor(rotation, dtype=torch.float32), torch.tensor(-rotation @ eye, dtype=torch.float32)
 
 
 def views(kind: str, size: int) -> list[TrainView]:
-    """Eight photos of nothing that a scene could explain."""
+    """Eight photos without a consistent scene."""
     g = torch.Generator().manual_seed(1)
     made = []
     eyes = fibonacci_sphere(8) * 2.5
@@ -54,7 +52,7 @@ def views(kind: str, size: int) -> list[TrainView]:
         value = {"all black": 0, "all white": 255}.get(kind)
         rgb = photo if value is None else torch.full_like(photo, value)
         mask = torch.full((size, size), 0 if kind == "empty masks" else 255, dtype=torch.uint8)
-        # contradictory: the same photo is said to be taken from everywhere, from inside the object too
+        # contradictory: the same photo from all directions, also from inside the object
         r, t = pose(eye * (0.2 if kind == "contradictory poses" and i % 2 else 1.0))
         f = 1.1 * size
         made.append(TrainView(f"{i}", rgb, mask, r, t, -r.T @ t, Pinhole(size, size, f, f, size / 2, size / 2)))
@@ -76,13 +74,13 @@ def trainer(kind: str, steps: int, shading: str = "colour", seed: int = 0) -> Tr
 
 
 def show(t: Trainer, kind: str) -> None:
-    """Put other photos before a trainer in the middle of its run."""
-    t.views, t.half, t.queue = views(kind, SIZE), views(kind, SIZE // 2), []
-    t.used = list(range(len(t.views)))
+    """Replace the photos of a running trainer."""
+    t.views, t.half_views, t.queue = views(kind, SIZE), views(kind, SIZE // 2), []
+    t.training_indices = list(range(len(t.views)))
 
 
 def soak(kinds: Sequence[str], shading: str, steps: int, turn: int) -> None:
-    """`steps` steps; after every `turn` of them the next kind of photos."""
+    """Train `steps` steps; switch to the next kind of photos every `turn` steps."""
     t = trainer(kinds[0], steps, shading)
     process, base = psutil.Process(), 0
     while t.done < t.end:
@@ -93,8 +91,8 @@ def soak(kinds: Sequence[str], shading: str, steps: int, turn: int) -> None:
         if t.done == steps // 10:
             base = process.memory_info().rss
     assert t.done == steps
-    assert broken(t.surfels.tensors()) is None
-    assert broken({"image": torch.tensor(t.evaluate())}) is None
+    assert first_non_finite(t.surfels.tensors()) is None
+    assert first_non_finite({"image": torch.tensor(t.evaluate())}) is None
     assert process.memory_info().rss - base < 200e6
 
 
@@ -116,7 +114,7 @@ def test_soak_of_one_kind(kind: str, shading: str) -> None:
 @pytest.mark.timeout(0)
 @pytest.mark.parametrize("shading", ["colour", "pbr"])
 def test_long_soak(shading: str) -> None:
-    """GSBAKE_SOAK_STEPS steps (20 000 when unset) of one run that is shown every kind of photos in turn, eight times over."""
+    """GSBAKE_SOAK_STEPS steps (20 000 when unset) of one run on all kinds of photos in turn, eight times each."""
     soak(KINDS, shading, STEPS, max(1, STEPS // (8 * len(KINDS))))
 
 
@@ -130,16 +128,16 @@ def final(count: int, shading: str, steps: int) -> dict[str, torch.Tensor]:
 
 @pytest.mark.usefixtures("one_thread_after")
 @pytest.mark.parametrize("shading", ["colour", "pbr"])
-def test_same_seed_same_bits(shading: str) -> None:
+def test_same_seed_is_bit_identical(shading: str) -> None:
     first, again, other = (final(n, shading, 120) for n in (2, 2, 1))
     assert all(torch.equal(v, again[k]) for k, v in first.items())
-    # one thread or two: agreement to rounding is what is promised
+    # results with one and two threads agree up to rounding
     assert all(torch.allclose(v, other[k], rtol=1e-4, atol=1e-5) for k, v in first.items())
 
 
 @pytest.mark.parametrize("bad", [float("nan"), float("inf")])
 @pytest.mark.parametrize("name", ["position", "quaternion", "log_scale", "sdf", "gamma", "attributes.sh"])
-def test_training_names_what_is_not_finite(name: str, bad: float) -> None:
+def test_error_names_the_tensor_that_is_not_finite(name: str, bad: float) -> None:
     t = trainer("random photos", 50)
     t.step()
     x = t.surfels.tensors()[name]
@@ -149,7 +147,7 @@ def test_training_names_what_is_not_finite(name: str, bad: float) -> None:
             t.step()
 
 
-def test_training_names_a_bad_light() -> None:
+def test_error_names_a_light_that_is_not_finite() -> None:
     t = trainer("random photos", 50, "pbr")
     t.step()
     with torch.no_grad():

@@ -1,6 +1,6 @@
 """A reference renderer: direct light of a distant environment on convex surfaces by Monte Carlo, in NumPy.
 
-It shares no code with `gsbake.light`: the BRDF of glTF 2.0 (appendix B: Lambert, GGX with the height-correlated Smith term, Schlick's
+It shares no code with `gsbake.shading`: the BRDF of glTF 2.0 (appendix B: Lambert, GGX with the height-correlated Smith term, Schlick's
 Fresnel) is sampled half by the cosine and half by GGX's half vectors, combined by the balance heuristic (Veach & Guibas, *Optimally
 combining sampling techniques*, SIGGRAPH 1995). Nothing is prefiltered, no sum is split.
 """
@@ -28,7 +28,7 @@ def render(
     samples: int = 256,
     seed: int = 0,
 ) -> Doubles:
-    """Linear radiance (n, 3) of n unoccluded points: unit `normal`, `view` towards the eye, linear `albedo` (n, 3), the rest (n,)."""
+    """Linear radiance (n, 3) of n unoccluded points: unit `normal`, `view` towards the camera, linear `albedo` (n, 3), the rest (n,)."""
     draw = np.random.default_rng(seed)
     n = len(normal)
     view, alpha = np.asarray(view, float), np.maximum(np.asarray(roughness, float), 0.05) ** 2
@@ -60,7 +60,7 @@ def render(
 
 
 def local(tangent: Doubles, across: Doubles, normal: Doubles, cosine: Doubles, turn: Doubles) -> Doubles:
-    """Unit directions (n, 3) at `cosine` (n,) from the normals, turned about them by `turn` (n,)."""
+    """Unit directions (n, 3) at `cosine` (n,) from the normals, at azimuth `turn` (n,)."""
     sine = np.sqrt(np.maximum(1 - cosine**2, 0))
     return np.asarray((sine * np.cos(turn))[:, None] * tangent + (sine * np.sin(turn))[:, None] * across + cosine[:, None] * normal)
 

@@ -26,7 +26,7 @@ validator.validateBytes(new Uint8Array(fs.readFileSync(process.argv[2])), {maxIs
 
 
 def run_node(script: str, package: str, *arguments: object) -> Any:
-    """What the script prints, as JSON; its arguments are the folder of npm packages and `arguments`."""
+    """JSON output of the script; its arguments are the folder of npm packages and `arguments`."""
     node = shutil.which("node", path=str(Path(sys.executable).parent)) or shutil.which("node")
     if node is None or not (MODULES / package).is_dir():
         pytest.fail(f"the npm package {package} is not in {MODULES}; run `make node`")
@@ -35,6 +35,6 @@ def run_node(script: str, package: str, *arguments: object) -> Any:
 
 
 def gltf_issues(path: Path) -> list[dict[str, Any]]:
-    """Errors, warnings, infos and hints that Khronos' validator has about a GLB."""
+    """Errors, warnings, infos and hints of Khronos' validator for a GLB."""
     messages: list[dict[str, Any]] = run_node(VALIDATE, "gltf-validator", path)["messages"]
     return messages

@@ -1,4 +1,4 @@
-"""A monitor that keeps what a step reports, and can ask it to stop."""
+"""A monitor that records the reports of a step and can request a stop."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from gsbake.errors import InterruptedRun
 
 
 class Recorder:
-    """`decisions` maps what was decided to (choice, evidence); `stop_at` (text, done) interrupts at that progress."""
+    """`decisions` maps the subject of a decision to (choice, evidence); `stop_at` (text, done) interrupts at that progress."""
 
     def __init__(self, stop_at: tuple[str, int] | None = None) -> None:
         self.decisions: dict[str, tuple[str, str]] = {}

@@ -1,4 +1,4 @@
-"""The tests' own reference renderer against closed forms."""
+"""The Monte Carlo reference renderer against closed forms."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ WHITE, BLACK = np.ones((1, 3)), np.zeros((1, 3))
 
 
 def test_lambert_under_a_linear_sky() -> None:
-    """E / π of a + b z is a + 2/3 b n_z; the dielectric's specular part is taken off by a black surface."""
+    """E / π of a + b z is a + 2/3 b n_z; the specular part of the dielectric is subtracted by a black surface."""
 
     def sky(directions: np.ndarray) -> np.ndarray:
         return np.asarray((0.5 + 0.3 * directions[:, 2])[:, None] * np.ones(3))

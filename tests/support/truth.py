@@ -1,8 +1,8 @@
-"""A baked asset measured against the analytic object of the built-in capture: shape, materials, and how it looks in another light.
+"""Errors of a baked asset against the analytic object of the built-in capture: shape, materials, and relighting.
 
-Nothing of what is measured takes part in the measuring: the truth is the analytic field with its materials, and the other light falls on
-the asset through the analytic scene's own shader (`gsbake.synth.shade`), which shares no code with the split sum that materials are fitted
-with. Shadows are those of the true object; normals, materials and the outline are the asset's.
+The measurement is independent of the bake: ground truth is the analytic field with its materials, and relighting uses the analytic scene's
+reference renderer (`gsbake.synth.shade`), which shares no code with the split sum of the material fit. Shadows are those of the true
+object; normals, materials and the silhouette are the asset's.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ from gsbake.report.asset import open_asset
 from gsbake.report.render import Asset, Renderer, Samples
 from gsbake.synth import scene
 from gsbake.synth.capture import cameras
-from gsbake.synth.shade import SUBSETS, Rig, make_rig, outgoing, render
+from gsbake.synth.shade import SAMPLE_SUBSETS, LightRig, make_light_rig, outgoing_radiance, render
 
 #: glTF (+Y up) to the capture's Z-up world.
 TO_WORLD = np.array([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])
-#: Points that materials are compared at.
+#: Points at which materials are compared.
 POINTS = 20_000
-#: Photos in the other light, and their size.
+#: Number and size in pixels of the relit images.
 VIEWS, SIZE = 4, 96
 
 
@@ -93,18 +93,18 @@ def _materials(asset: Asset) -> tuple[np.ndarray, np.ndarray]:
     return np.column_stack([base, packed[:, 1:]]), scene.materials(place)
 
 
-def other_light() -> Rig:
-    """A light that lit no photo: the key from behind as a strong sun, a dimmer and warmer sky."""
-    return make_rig(sun=(2.4, 2.2, 1.8), ambient=(0.35, 0.30, 0.26), gradient=(-0.10, 0.05, 0.20), sun_direction=(-0.9, -0.6, 0.7))
+def other_light() -> LightRig:
+    """Lighting of no photo: a strong sun from behind as key, a dimmer and warmer sky."""
+    return make_light_rig(sun=(2.4, 2.2, 1.8), ambient=(0.35, 0.30, 0.26), gradient=(-0.10, 0.05, 0.20), sun_direction=(-0.9, -0.6, 0.7))
 
 
 def relit_psnr(asset: Asset) -> float:
-    """PSNR (dB, sRGB values, one gain per channel and picture) of the asset in the world frame against the truth in `other_light`."""
+    """PSNR (dB, sRGB values, one gain per channel and image) of the asset in the world frame against the truth in `other_light`."""
     rig = other_light()
     renderer = Renderer(asset)
     scores = []
     for camera in cameras(VIEWS, SIZE, seed=7):
-        truth, cover = true_picture(camera, rig)
+        truth, cover = true_image(camera, rig)
         picture = renderer.draw(camera, lambda samples: under_rig(samples, rig))
         shown = np.asarray(picture.linear, np.float64)
         where = (cover > 0.5) | (picture.alpha > 0.5)
@@ -115,7 +115,7 @@ def relit_psnr(asset: Asset) -> float:
     return float(np.mean(scores))
 
 
-def true_picture(camera: Camera, rig: Rig) -> tuple[np.ndarray, np.ndarray]:
+def true_image(camera: Camera, rig: LightRig) -> tuple[np.ndarray, np.ndarray]:
     """Linear radiance (h, w, 3) of the true object over black, and its coverage (h, w)."""
     picture, _ = render(
         camera.R, camera.centre, camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height, rig, False
@@ -123,12 +123,12 @@ def true_picture(camera: Camera, rig: Rig) -> tuple[np.ndarray, np.ndarray]:
     return picture[..., :3], picture[..., 3]
 
 
-def under_rig(samples: Samples, rig: Rig) -> np.ndarray:
-    """Radiance (n, 3) of the asset's samples in the light of a rig, with the true object's shadows."""
+def under_rig(samples: Samples, rig: LightRig) -> np.ndarray:
+    """Radiance (n, 3) of the asset's samples under a light rig, with the shadows of the true object."""
     place = onto_surface(np.asarray(samples.position, np.float64))
     out = np.zeros((len(place), 3), np.float32)
     for k in range(len(place)):
         normal, view = tuple(map(float, samples.normal[k])), tuple(map(float, samples.view[k]))
         surface = (*map(float, samples.base_color[k]), max(0.05, float(samples.roughness[k])), float(samples.metallic[k]))
-        out[k] = outgoing(tuple(map(float, place[k])), normal, view, surface, rig, k % SUBSETS)
+        out[k] = outgoing_radiance(tuple(map(float, place[k])), normal, view, surface, rig, k % SAMPLE_SUBSETS)
     return out

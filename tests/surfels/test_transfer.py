@@ -13,7 +13,7 @@ import pytest
 import torch
 
 from gsbake.errors import BadInputError
-from gsbake.surfels.densification.clone_split import OPACITY_FLOOR, prune
+from gsbake.surfels.densification.clone_split import MIN_RELATIVE_OPACITY, prune
 from gsbake.surfels.losses.terms import median_sharpness
 from gsbake.surfels.model import Surfels, create
 from gsbake.surfels.training.adam import Adam
@@ -183,7 +183,7 @@ def test_files_without_a_name_are_sech2_and_unknown_names_are_refused(tmp_path: 
 @each
 def test_pruning_is_relative_to_the_peak(transfer: Transfer) -> None:
     surfels = ball(transfer.name)
-    limit = float(transfer.distance(torch.tensor(OPACITY_FLOOR * transfer.peak), torch.tensor(2.0)))
+    limit = float(transfer.distance(torch.tensor(MIN_RELATIVE_OPACITY * transfer.peak), torch.tensor(2.0)))
     surfels.sdf[3], surfels.sdf[7] = 1.01 * limit, -1.01 * limit
     surfels.sdf[5] = 0.99 * limit
     _, kept, counts = prune(surfels, Adam(), None, math.inf)

@@ -1,4 +1,4 @@
-"""The written capture: poses, the camera convention, truth that agrees with the photos, repeatability."""
+"""The built-in capture: poses, camera convention, ground truth that agrees with the photos, determinism."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def test_poses_place_a_known_point(folder: Path) -> None:
     assert (top["w"], top["h"]) == (SIZE, SIZE) and len(top["frames"]) == VIEWS
     truth = CameraSet.load(folder / "truth" / "cameras.json").cameras
     point = np.array([scene.ORIGIN[0] + 0.62, scene.ORIGIN[1], 0.52])
-    seen = []
+    metallic = []
     for frame, camera in zip(top["frames"], truth, strict=True):
         pixel = nerf_project(frame, top, point)
         np.testing.assert_allclose(camera.project(point[None])[0][0], pixel, atol=1e-9)
@@ -67,8 +67,8 @@ def test_poses_place_a_known_point(folder: Path) -> None:
         x, y = pixel.astype(int)
         assert picture[y, x, 3] > 0  # the handle (or the jar before it) covers its own projection
         maps = rgba(folder / "truth" / "orm" / Path(frame["file_path"]).name)
-        seen.append(maps[y, x, 2] > 200)
-    assert any(seen)  # and where it is not hidden, it is metal
+        metallic.append(maps[y, x, 2] > 200)
+    assert any(metallic)  # metallic where it is not occluded
 
 
 def test_silhouette_agrees_with_the_mesh(folder: Path) -> None:
@@ -149,7 +149,7 @@ def test_same_arguments_same_bytes_and_the_seed_counts(folder: Path, tmp_path: P
     assert np.linalg.norm(first.centre - cameras(3, 16, 1)[0].centre) > 0.1
 
 
-def test_background_fills_the_picture(tmp_path: Path) -> None:
+def test_background_fills_the_image(tmp_path: Path) -> None:
     write_capture(tmp_path, views=3, size=32, background=True)
     picture = cv2.imread(str(tmp_path / "images" / "000.png"), cv2.IMREAD_UNCHANGED)
     mask = cv2.imread(str(tmp_path / "truth" / "masks" / "000.png"), cv2.IMREAD_GRAYSCALE)

@@ -15,7 +15,7 @@ def around(count: int, seed: int = 0) -> np.ndarray:
 
 
 def test_distances_on_the_axes() -> None:
-    # Worked by hand from the shape: jar radius .40, z .12–.92; bowl: ball of radius .36 about z = 1.10; foot radius .30, z 0–.16;
+    # Computed by hand from the shape: jar radius .40, z .12–.92; bowl: ball of radius .36 about z = 1.10; foot radius .30, z 0–.16;
     # handle: ring of radius .22 about (.40, ·, .52), .04 thick.
     points = np.array(
         [
@@ -51,7 +51,7 @@ def test_gradient_has_unit_length_outside() -> None:
     np.testing.assert_allclose(np.median(np.sum(np.stack(steps, 1) * scene.normals(points), 1)), 1, atol=1e-6)
 
 
-def test_the_ball_holds_the_object() -> None:
+def test_the_bounding_sphere_contains_the_object() -> None:
     directions = default_rng(2).normal(size=(4000, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     shell = np.array(scene.CENTRE) + scene.RADIUS * directions
@@ -63,7 +63,7 @@ def test_trace_hits_where_the_closed_form_says() -> None:
     assert abs(hit - 2.6) < 1e-5
     # Through the handle's hole, parallel to y: the ray must pass.
     assert scene.trace(OX + 0.50, OY - 3, 0.52, 0.0, 1.0, 0.0, 0.0, 1e-6) == -1
-    # Down the axis: into the bowl, not onto its rim.
+    # Down the axis: into the bowl, not onto its edge.
     assert abs(scene.trace(OX, OY, 3.0, 0.0, 0.0, -1.0, 0.0, 1e-6) - (3.0 - 0.74)) < 1e-5
 
 
@@ -74,22 +74,22 @@ def test_materials_are_four_and_physical() -> None:
     assert np.all(metal[:, 4] == 1)
     assert set(np.unique(surface[:, 4])) == {0.0, 1.0}
     assert surface[:, :3].min() > 0.01 and surface[:, :3].max() < 0.95
-    glaze, lamp = scene.materials(np.array([[OX, OY - 0.40, 0.25], [OX - 0.40, OY + 0.05, 0.66]]))
+    glaze, emitter = scene.materials(np.array([[OX, OY - 0.40, 0.25], [OX - 0.40, OY + 0.05, 0.66]]))
     np.testing.assert_allclose(glaze, [*scene.GLAZE_ALBEDO, scene.GLAZE_ROUGHNESS, 0])
-    assert lamp[:3].max() < 0.05 and lamp[4] == 0
+    assert emitter[:3].max() < 0.05 and emitter[4] == 0
     diffuse = surface[surface[:, 3] == 0.75]
     assert np.all(diffuse[:, 4] == 0)
     assert diffuse[:, :3].std(axis=0).min() > 0.08  # textured enough to find features on
 
 
-def test_the_lamp_is_a_patch_of_its_radius_that_no_other_point_sees() -> None:
+def test_the_emissive_patch_has_its_radius_and_lights_no_other_point() -> None:
     angle, height = np.meshgrid(np.linspace(-np.pi, np.pi, 721), np.linspace(0.40, 0.90, 251))
     side = np.column_stack([OX + 0.4 * np.cos(angle.ravel()), OY + 0.4 * np.sin(angle.ravel()), height.ravel()])
     lit = scene.emissions(side).max(1) > 0
     area = lit.mean() * 2 * np.pi * 0.4 * 0.5
-    np.testing.assert_allclose(area, np.pi * scene.LAMP_RADIUS**2, rtol=0.03)  # the side turns away from the disc a little
+    np.testing.assert_allclose(area, np.pi * scene.EMITTER_RADIUS**2, rtol=0.03)  # the side turns away from the disc a little
     assert scene.emissions(np.array([[OX + 0.40, OY, 0.66]])).max() == 0
-    # All of the object lies behind the tangent planes at the lamp's points.
+    # All of the object lies behind the tangent planes at the emissive points.
     for point in side[lit][::40]:
         outward = np.array([point[0] - OX, point[1] - OY, 0]) / 0.4
         surface = around(4000)

@@ -1,4 +1,4 @@
-"""The scene's own shader: BRDF against a plain NumPy transcription of the formulas, energy, shadows, light quantities."""
+"""The reference renderer: BRDF against a NumPy transcription of the formulas, energy, shadows, radiometric quantities."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import pytest
 from numpy.random import default_rng
 
 from gsbake.synth import scene
-from gsbake.synth.shade import SUBSETS, make_rig, outgoing, reflect
+from gsbake.synth.shade import SAMPLE_SUBSETS, brdf_cosine, make_light_rig, outgoing_radiance
 
 OX, OY, _ = scene.ORIGIN
 SIDE = (OX - 0.40, OY, 0.60)  # on the jar, opposite the handle: its whole hemisphere is free
@@ -32,65 +32,68 @@ def textbook(light: np.ndarray, n: np.ndarray, v: np.ndarray, albedo: np.ndarray
     return nl * (d * g * f / (4 * nl * nv) + (1 - metallic) * albedo / np.pi)
 
 
-def test_reflect_is_the_textbook_brdf() -> None:
+def test_brdf_matches_the_textbook() -> None:
     draw = default_rng(0)
     for _ in range(50):
         n, light, v = (unit(draw.normal(size=3)) for _ in range(3))
         light, v = light * np.sign(n @ light), v * np.sign(n @ v)
         albedo, roughness, metallic = draw.random(3), draw.uniform(0.2, 1), draw.random()
-        got = reflect(tuple(light), tuple(n), tuple(v), (*albedo, roughness, metallic))
+        got = brdf_cosine(tuple(light), tuple(n), tuple(v), (*albedo, roughness, metallic))
         np.testing.assert_allclose(got, textbook(light, n, v, albedo, roughness, metallic), rtol=1e-9)
 
 
-def full(point: tuple[float, ...], n: tuple[float, ...], v: tuple[float, ...], surface: tuple[float, ...], rig: object) -> np.ndarray:
-    return np.mean([outgoing(point, n, v, surface, rig, k) for k in range(SUBSETS)], axis=0)
+def mean_radiance(
+    point: tuple[float, ...], n: tuple[float, ...], v: tuple[float, ...], surface: tuple[float, ...], rig: object
+) -> np.ndarray:
+    """Full quadrature: the mean over all sample subsets."""
+    return np.mean([outgoing_radiance(point, n, v, surface, rig, k) for k in range(SAMPLE_SUBSETS)], axis=0)
 
 
 def test_white_furnace() -> None:
-    rig = make_rig(ambient=(1, 1, 1))
+    rig = make_light_rig(ambient=(1, 1, 1))
     v = tuple(unit(np.array([-1.0, 0.3, 0.4])))
-    mirror = full(SIDE, OUT, v, (1.0, 1.0, 1.0, 0.3, 1.0), rig)
-    rough = full(SIDE, OUT, v, (1.0, 1.0, 1.0, 0.9, 1.0), rig)
+    mirror = mean_radiance(SIDE, OUT, v, (1.0, 1.0, 1.0, 0.3, 1.0), rig)
+    rough = mean_radiance(SIDE, OUT, v, (1.0, 1.0, 1.0, 0.9, 1.0), rig)
     assert np.all(mirror <= 1 + 1e-6) and mirror.min() > 0.95  # nearly nothing is lost at low roughness
-    np.testing.assert_allclose(rough, 0.436, rtol=0.03)  # what one bounce keeps, by 100 000 uniform directions
+    np.testing.assert_allclose(rough, 0.436, rtol=0.03)  # reflectance of single scattering, by 100 000 uniform directions
     # A black dielectric reflects only its Fresnel part: at least F0 times what white metal keeps, far from 1.
-    black = full(SIDE, OUT, v, (0.0, 0.0, 0.0, 0.3, 0.0), rig)
+    black = mean_radiance(SIDE, OUT, v, (0.0, 0.0, 0.0, 0.3, 0.0), rig)
     assert 0.035 < black.min() < 0.08
 
 
 def test_environment_specular_matches_monte_carlo() -> None:
-    rig = make_rig(ambient=(0.5, 0.5, 0.5), gradient=(0.4, 0.0, -0.3))
+    rig = make_light_rig(ambient=(0.5, 0.5, 0.5), gradient=(0.4, 0.0, -0.3))
     v = unit(np.array([-1.0, -0.2, 0.8]))
     surface = (0.8, 0.6, 0.3, 0.45, 1.0)
     draw = default_rng(1)
     lights = unit(draw.normal(size=(40_000, 3)))
     lights *= np.sign(-lights[:, :1])  # the hemisphere about (-1, 0, 0)
     light_in = np.array([0.5, 0.5, 0.5]) + lights[:, 2:] * np.array([0.4, 0.0, -0.3])
-    values = np.array([reflect(tuple(d), OUT, tuple(v), surface) for d in lights])
+    values = np.array([brdf_cosine(tuple(d), OUT, tuple(v), surface) for d in lights])
     expected = 2 * np.pi * np.mean(values * light_in, axis=0)
-    np.testing.assert_allclose(full(SIDE, OUT, tuple(v), surface, rig), expected, rtol=0.03)
+    np.testing.assert_allclose(mean_radiance(SIDE, OUT, tuple(v), surface, rig), expected, rtol=0.03)
 
 
 def test_lambert_values() -> None:
     v = (-1.0, 0.0, 0.0)
     direction = unit(np.array([-0.6, 0.0, 0.8]))
-    sun = make_rig(sun=(np.pi, np.pi, np.pi), sun_direction=tuple(direction))
-    matte, black = (0.5, 0.5, 0.5, 1.0, 0.0), (0.0, 0.0, 0.0, 1.0, 0.0)
-    diffuse = full(SIDE, OUT, v, matte, sun) - full(SIDE, OUT, v, black, sun)
+    sun = make_light_rig(sun=(np.pi, np.pi, np.pi), sun_direction=tuple(direction))
+    rough, black = (0.5, 0.5, 0.5, 1.0, 0.0), (0.0, 0.0, 0.0, 1.0, 0.0)
+    diffuse = mean_radiance(SIDE, OUT, v, rough, sun) - mean_radiance(SIDE, OUT, v, black, sun)
     np.testing.assert_allclose(diffuse, 0.5 * 0.6, rtol=1e-9)  # albedo cos(theta) E / pi
-    sky = make_rig(ambient=(1, 1, 1), gradient=(0.3, 0.3, 0.3))
+    sky = make_light_rig(ambient=(1, 1, 1), gradient=(0.3, 0.3, 0.3))
     top_rim = (OX + 0.36, OY, 0.92)
     n = (0.0, 0.0, 1.0)
-    diffuse = full(top_rim, n, n, matte, sky) - full(top_rim, n, n, black, sky)
+    diffuse = mean_radiance(top_rim, n, n, rough, sky) - mean_radiance(top_rim, n, n, black, sky)
     np.testing.assert_allclose(diffuse, 0.5 * (1 + 2 / 3 * 0.3), rtol=1e-9)  # albedo (a + 2/3 b n_z)
 
 
 def test_area_light_has_its_form_factor() -> None:
     # Irradiance of a whole polygon by Lambert's contour formula: E = L/2 sum_i theta_i (gamma_i . n).
-    rig = make_rig(area=(1, 1, 1))
-    centre = rig.points.mean(axis=0)
-    u = unit(np.cross(rig.facing, [0, 0, 1.0]))
-    v = np.cross(rig.facing, u)
+    rig = make_light_rig(area=(1, 1, 1))
+    centre = rig.area_points.mean(axis=0)
+    u = unit(np.cross(rig.area_normal, [0, 0, 1.0]))
+    v = np.cross(rig.area_normal, u)
     point = np.array([OX, OY - 0.40, 0.60])
     n = np.array([0.0, -1.0, 0.0])
     corners = unit(np.array([centre + a * u + b * v for a, b in ((-1, -1), (1, -1), (1, 1), (-1, 1))]) - point)
@@ -98,23 +101,24 @@ def test_area_light_has_its_form_factor() -> None:
     for p, q in zip(corners, np.roll(corners, -1, axis=0), strict=True):
         total += np.arccos(p @ q) * (unit(np.cross(p, q)) @ n)
     out = tuple(n)
-    diffuse = full(tuple(point), out, out, (0.8, 0.8, 0.8, 1.0, 0.0), rig) - full(tuple(point), out, out, (0.0, 0.0, 0.0, 1.0, 0.0), rig)
+    bright, black = (mean_radiance(tuple(point), out, out, (a, a, a, 1.0, 0.0), rig) for a in (0.8, 0.0))
+    diffuse = bright - black
     np.testing.assert_allclose(diffuse, 0.8 / np.pi * abs(total) / 2, rtol=0.01)
 
 
 @pytest.mark.parametrize(("sun", "lit"), [((0.0, 0.0, 1.0), True), ((1.0, 0.0, 0.05), False)])
 def test_shadow_in_the_bowl(sun: tuple[float, float, float], lit: bool) -> None:
-    rig = make_rig(sun=(1, 1, 1), sun_direction=sun)
+    rig = make_light_rig(sun=(1, 1, 1), sun_direction=sun)
     bottom, up = (OX, OY, 0.74), (0.0, 0.0, 1.0)
-    got = full(bottom, up, up, (0.5, 0.5, 0.5, 0.75, 0.0), rig)
+    got = mean_radiance(bottom, up, up, (0.5, 0.5, 0.5, 0.75, 0.0), rig)
     assert bool(got[0] > 0.1) == lit
 
 
 def test_bowl_is_partly_occluded() -> None:
     # From its deepest point the bowl's wall hides a share of the sky; the outer wall sees all of it.
-    rig = make_rig(ambient=(1, 1, 1))
+    rig = make_light_rig(ambient=(1, 1, 1))
     surface = (0.6, 0.6, 0.6, 0.8, 0.0)
     up = (0.0, 0.0, 1.0)
-    inside = full((OX, OY, 0.74), up, up, surface, rig)[0]
-    free = full(SIDE, OUT, OUT, surface, rig)[0]
+    inside = mean_radiance((OX, OY, 0.74), up, up, surface, rig)[0]
+    free = mean_radiance(SIDE, OUT, OUT, surface, rig)[0]
     assert 0.6 * free < inside < 0.95 * free

@@ -1,4 +1,4 @@
-"""Occlusion against closed forms."""
+"""Ambient occlusion against closed forms."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ import pytest
 import trimesh
 
 from gsbake.geometry.raycast import RayCaster
-from gsbake.texturing.ambient_occlusion import occlusion, smoothed
+from gsbake.texturing.ambient_occlusion import occlusion, smooth_over_surface
 from gsbake.texturing.texels import rasterise
 
 
 @pytest.mark.parametrize("depth", [0.5, 1.0, 2.0])
 def test_bottom_of_a_well(depth: float) -> None:
-    """At the bottom of a cylinder of radius r and depth h the open, cosine-weighted share of the sky is r² / (r² + h²)."""
+    """At the bottom of a cylinder of radius r and depth h ambient occlusion is r² / (r² + h²)."""
     wall = trimesh.creation.cylinder(radius=1, height=2 * depth, sections=256, cap=False)
     keep = np.abs(wall.face_normals[:, 2]) < 0.5
     caster = RayCaster(wall.vertices, wall.faces[keep])
@@ -23,19 +23,19 @@ def test_bottom_of_a_well(depth: float) -> None:
     assert value.std() < 0.05  # stratified: random directions would give 0.06 at depth 1
 
 
-def test_open_surface_is_white_whatever_its_normal() -> None:
+def test_convex_surface_is_unoccluded() -> None:
     ball = trimesh.creation.icosphere(subdivisions=3)
     value = occlusion(ball.vertices, ball.vertices, RayCaster(ball.vertices, ball.faces), 16, 0.02)
     assert value.min() == 1
 
 
-def test_filter_stays_on_its_own_side() -> None:
+def test_filter_does_not_cross_depth_edges() -> None:
     uv = np.array([[0.1, 0.1], [0.9, 0.1], [0.9, 0.9], [0.1, 0.9]])
     texels = rasterise(uv, np.array([[0, 2, 1], [0, 3, 2]]), 32)
     column = texels.index % 32
     position = np.stack([column, texels.index // 32, np.where(column < 16, 0, 100)], 1).astype(float)
     rng = np.random.default_rng(0)
     value = (np.where(column < 16, 0.2, 0.8) + rng.normal(0, 0.05, len(texels))).astype(np.float32)
-    out = smoothed(texels, value, position, np.tile([0, 0, 1.0], (len(texels), 1)), reach=3.0)
+    out = smooth_over_surface(texels, value, position, np.tile([0, 0, 1.0], (len(texels), 1)), radius=3.0)
     assert abs(out[column == 15].mean() - 0.2) < 0.02 and abs(out[column == 16].mean() - 0.8) < 0.02
     assert out[column < 16].std() < 0.03

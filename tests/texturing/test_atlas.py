@@ -1,4 +1,4 @@
-"""The atlas: exact square, no overlap, no mirroring, padding kept, even texel density."""
+"""The atlas: exact square, no overlap, no mirroring, padding, uniform texel density."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def test_texel_density_is_even(bumpy: tuple[np.ndarray, np.ndarray], atlas: Atla
     assert by_chart.max() / by_chart.min() < 1.01
 
 
-def test_charts_keep_their_distance(atlas: Atlas) -> None:
+def test_charts_are_padded(atlas: Atlas) -> None:
     texels = rasterise(atlas.uv, atlas.faces, 1024)  # four texels of this image are one of the atlas
     chart = texels.image(np.where(texels.inside, atlas.chart[texels.face], -1), -1)[..., 0]
     for c in range(atlas.charts):
@@ -59,7 +59,7 @@ def test_charts_keep_their_distance(atlas: Atlas) -> None:
             assert distance_transform_edt(~others)[chart == c].min() >= 4 * 2 - 2
 
 
-def test_the_same_mesh_gives_the_same_atlas(bumpy: tuple[np.ndarray, np.ndarray], atlas: Atlas) -> None:
+def test_atlas_is_deterministic(bumpy: tuple[np.ndarray, np.ndarray], atlas: Atlas) -> None:
     again = make_atlas(*bumpy, SIZE)
     assert np.array_equal(again.uv, atlas.uv) and np.array_equal(again.faces, atlas.faces)
 
@@ -81,13 +81,13 @@ def test_packing_keeps_shape_and_handedness() -> None:
     assert overlapping(packed.uv / 256, faces, 1024) == 0
 
 
-def test_an_empty_mesh_has_no_atlas() -> None:
+def test_empty_mesh_is_refused() -> None:
     with pytest.raises(ValueError, match="without faces"):
         make_atlas(np.zeros((3, 3)), np.zeros((0, 3), int), SIZE)
 
 
-def test_folded_charts_are_taken_apart() -> None:
-    """A strip that winds more than once around a flat ring folds over itself in one chart; the detached faces overlap no more."""
+def test_folded_charts_are_split() -> None:
+    """A strip that winds more than once around a flat ring folds over itself in one chart; the detached faces do not overlap."""
     turns = np.linspace(0, 3 * np.pi, 60)
     inner = np.stack([np.cos(turns), np.sin(turns)], 1)
     uv = np.concatenate([0.5 + 0.2 * inner, 0.5 + 0.4 * inner])

@@ -1,4 +1,4 @@
-"""Projection and fusion against a sphere painted by a formula."""
+"""Projection and fusion against a sphere with an analytic texture."""
 
 from __future__ import annotations
 
@@ -9,31 +9,28 @@ import trimesh
 from gsbake.geometry.cameras import Camera
 from gsbake.geometry.raycast import RayCaster
 from gsbake.texturing.projection import ProjectionBlender, edge_weights, mask_weights
+from tests.support.cameras import look_at
 
 SIZE = 160
 
 
-def paint(p: np.ndarray) -> np.ndarray:
+def texture(p: np.ndarray) -> np.ndarray:
     return 0.35 + 0.15 * np.sin(np.stack([5 * p[:, 0], 4 * p[:, 1] + 1, 6 * p[:, 2]], 1))
 
 
 def camera(direction: np.ndarray, name: str = "view") -> Camera:
     """A camera three units from the origin, looking at it."""
-    z = -direction / np.linalg.norm(direction)
-    x = np.cross(z, [0.1, 0.2, 1.0])
-    x /= np.linalg.norm(x)
-    rotation = np.stack([x, np.cross(z, x), z])
-    return Camera(name, SIZE, SIZE, 200, 200, SIZE / 2, SIZE / 2, rotation, -rotation @ (-3 * z))
+    return look_at(3 * direction / np.linalg.norm(direction), size=SIZE, focal=200, name=name, up=(0.1, 0.2, 1.0))
 
 
 def photo(view: Camera, highlight: float = 0.0, gain: float = 1.0) -> np.ndarray:
-    """The unit sphere as seen: paint, a highlight where it mirrors the camera, times an exposure; blue surround."""
+    """A photo of the unit sphere: texture, a highlight that depends on the view, times an exposure gain; blue background."""
     ray = view.rays().reshape(-1, 3)
     ray /= np.linalg.norm(ray, axis=1, keepdims=True)
     b = ray @ view.centre
     root = b * b - (view.centre @ view.centre - 1)
     p = view.centre + (-b - np.sqrt(np.maximum(root, 0)))[:, None] * ray
-    colour = paint(p)
+    colour = texture(p)
     half = view.centre / np.linalg.norm(view.centre) + [0.3, 0, 0.2]
     colour = colour + highlight * (p @ (half / np.linalg.norm(half)) > 0.985)[:, None]
     colour = np.where(root[:, None] > 0, gain * colour, [0.0, 0.0, 1.0])
@@ -56,7 +53,7 @@ def points(n: int = 3000) -> np.ndarray:
     return directions(n)
 
 
-def test_highlights_and_exposures_fall_away(sphere: RayCaster) -> None:
+def test_highlights_and_exposure_gains_are_removed(sphere: RayCaster) -> None:
     p = points()
     blender = ProjectionBlender(p, p, sphere, 3, 0.02)
     gains = np.exp(np.random.default_rng(0).normal(0, 0.1, 30))
@@ -64,16 +61,16 @@ def test_highlights_and_exposures_fall_away(sphere: RayCaster) -> None:
     for d, gain in zip(directions(30), gains, strict=True):
         blender.add(camera(d), photo(camera(d), highlight=0.5, gain=gain))
     solved = blender.result(solve_exposure=True)
-    assert solved.seen.all()
+    assert solved.observed.all()
     assert solved.explained > 0.5
     assert np.abs(np.log(solved.gains[:, 0] / gains)).max() < 0.02
-    error = np.abs(solved.values - paint(p)).max(1)
+    error = np.abs(solved.values - texture(p)).max(1)
     assert np.median(error) < 0.004 and np.quantile(error, 0.98) < 0.015
     plain = blender.result(solve_exposure=False)
-    assert np.median(np.abs(plain.values - paint(p)).max(1)) > 0.01
+    assert np.median(np.abs(plain.values - texture(p)).max(1)) > 0.01
 
 
-def test_reflections_are_no_exposures(sphere: RayCaster) -> None:
+def test_reflections_are_not_exposure_gains(sphere: RayCaster) -> None:
     """Four times brighter at one place from each side: gains of up to a tenth are found, but they explain little."""
     p = points()
     blender = ProjectionBlender(p, p, sphere, 3, 0.02)
@@ -85,8 +82,8 @@ def test_reflections_are_no_exposures(sphere: RayCaster) -> None:
     assert blender.result(solve_exposure=True).explained < 0.1
 
 
-def test_surround_never_reaches_the_surface(sphere: RayCaster) -> None:
-    """Even with poses a little wrong, so that some rim pixels show the surround."""
+def test_background_never_reaches_the_surface(sphere: RayCaster) -> None:
+    """Even with pose errors, so that some boundary pixels show the background."""
     p = points()
     blender = ProjectionBlender(p, p, sphere, 3, 0.02)
     rng = np.random.default_rng(1)
@@ -95,17 +92,17 @@ def test_surround_never_reaches_the_surface(sphere: RayCaster) -> None:
     assert np.quantile(blender.result().values[:, 2], 0.999) < 0.6
 
 
-def test_only_what_a_view_sees_is_seen(sphere: RayCaster) -> None:
+def test_only_visible_texels_are_observed(sphere: RayCaster) -> None:
     p = points()
     blender = ProjectionBlender(p, p, sphere, 3, 0.02)
     d = np.array([0.0, 1.0, 0.0])
     blender.add(camera(d), photo(camera(d)))
-    seen = blender.result().seen
-    assert seen[p[:, 1] > 0.6].all()
-    assert not seen[p[:, 1] < 1 / 3 - 0.02].any()  # the horizon of a camera at three radii
+    observed = blender.result().observed
+    assert observed[p[:, 1] > 0.6].all()
+    assert not observed[p[:, 1] < 1 / 3 - 0.02].any()  # the horizon of a camera at three radii
 
 
-def test_what_stands_in_front_hides(sphere: RayCaster) -> None:
+def test_occluded_texels_are_not_observed(sphere: RayCaster) -> None:
     ball = trimesh.creation.icosphere(subdivisions=3, radius=0.3)
     ball.apply_translation([0, 1.5, 0])
     both = trimesh.util.concatenate([trimesh.Trimesh(sphere.vertices, sphere.faces), ball])
@@ -113,12 +110,12 @@ def test_what_stands_in_front_hides(sphere: RayCaster) -> None:
     blender = ProjectionBlender(p, p, RayCaster(both.vertices, both.faces), 3, 0.02)
     d = np.array([0.0, 1.0, 0.0])
     blender.add(camera(d), photo(camera(d)))
-    seen = blender.result().seen
+    observed = blender.result().observed
     # The ball of radius 0.3 at distance 1.5 shades a cone of tan = 0.3 / sqrt(1.5² - 0.3²).
     off = np.hypot(p[:, 0], p[:, 2]) / (3 - p[:, 1])
     slope = 0.3 / np.sqrt(1.5**2 - 0.3**2)
     front = p[:, 1] > 0.6
-    assert not seen[front & (off < slope - 0.02)].any() and seen[front & (off > slope + 0.03)].all()
+    assert not observed[front & (off < slope - 0.02)].any() and observed[front & (off > slope + 0.03)].all()
 
 
 def test_masked_pixels_are_never_used(sphere: RayCaster) -> None:
@@ -129,12 +126,12 @@ def test_masked_pixels_are_never_used(sphere: RayCaster) -> None:
     mask[:, : SIZE // 2] = 0
     blender.add(camera(d), photo(camera(d)), mask_weights(mask, 2))
     pixels, _ = camera(d).project(p)
-    seen = blender.result().seen
-    assert not seen[pixels[:, 0] < SIZE / 2 - 1].any()
-    assert seen[(pixels[:, 0] > SIZE / 2 + 1) & (p[:, 1] > 0.6)].all()
+    observed = blender.result().observed
+    assert not observed[pixels[:, 0] < SIZE / 2 - 1].any()
+    assert observed[(pixels[:, 0] > SIZE / 2 + 1) & (p[:, 1] > 0.6)].all()
 
 
-def test_fine_photos_are_filtered_to_the_texture(sphere: RayCaster) -> None:
+def test_fine_photos_are_antialiased(sphere: RayCaster) -> None:
     """A photo of single-pixel checks must come out grey on a coarse texture, not as moiré."""
     p = points(500)
     blender = ProjectionBlender(p, p, sphere, 1, 0.2)
@@ -142,10 +139,10 @@ def test_fine_photos_are_filtered_to_the_texture(sphere: RayCaster) -> None:
     d = np.array([0.0, 1.0, 0.0])
     blender.add(camera(d), checks[..., None].astype(np.float32))
     blended = blender.result()
-    assert np.abs(blended.values[blended.seen] - 0.5).max() < 0.1
+    assert np.abs(blended.values[blended.observed] - 0.5).max() < 0.1
 
 
-def test_depth_edges_weigh_little_but_not_nothing() -> None:
+def test_depth_edges_have_small_positive_weight() -> None:
     depth = np.zeros((20, 40), np.float32)
     depth[5:15, 5:35] = 2
     weight = edge_weights(depth, 0.1, 4)

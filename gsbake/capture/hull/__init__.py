@@ -1,1 +1,1 @@
-"""The visual hull of the masks."""
+"""Visual hull of the masks, and parts too thin for its grid."""

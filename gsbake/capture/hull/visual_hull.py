@@ -1,9 +1,9 @@
-"""The visual hull of a masked object, as a signed distance on a grid.
+"""Visual hull of a masked object, as a signed distance on a grid.
 
-Laurentini, *The visual hull concept* (PAMI 1994): what no silhouette excludes. Instead of a yes or no per voxel each view gives a
-signed distance (pixels from the silhouette's edge, times depth over focal length), and the hull's value is the largest of them:
-surfaces come out at a fraction of a cell with smooth normals. Two allowances for real captures: a point outside a photo's frame is
-*unknown* to that photo, not empty (an object cut off at the edge stays whole), and a few views may disagree, since masks have holes.
+Laurentini, *The visual hull concept* (PAMI 1994): the largest shape that no silhouette excludes. Instead of a binary occupancy each view
+gives a signed distance (pixels from the silhouette's edge, times depth over focal length), and the hull's value is the maximum:
+the surface has subcell precision and smooth normals. Two tolerances for real captures: a point outside a photo's frame is
+*unknown* to that photo, not empty (an object cut off by the frame stays whole), and a few views may disagree, since masks have holes.
 """
 
 from __future__ import annotations
@@ -26,46 +26,46 @@ if TYPE_CHECKING:
 
 Floats = NDArray[np.float32]
 
-#: Views that may call a point empty although it belongs to the object: this share of those that see it, rounded.
-WRONG_VIEWS = 0.03
-#: A point that fewer views than this share (and fewer than 2) see is not taken for object: nothing is known of it.
-SEEN_SHARE = 0.25
-#: At most this many votes are kept per point, which bounds how many views may be wrong.
-_KEEP = 8
-#: Cells from the surface beyond which the distance outside need only be a lower bound.
-_BAND = 6.0
+#: Share of the views of a point, rounded, that may exclude it although it belongs to the object.
+MAX_INCONSISTENT_SHARE = 0.03
+#: A point inside the frames of fewer than this share of the views (or of fewer than 2) is outside the hull.
+MIN_VISIBLE_SHARE = 0.25
+#: Number of largest distances kept per point; bounds how many views may be inconsistent.
+_MAX_RANKED = 8
+#: Cells from the surface beyond which the distance outside is only a lower bound.
+_EXACT_BAND = 6.0
 
 
 @nb.njit(parallel=True, error_model="numpy", cache=True)
 def _carve(
-    distance: Floats, starts: NDArray[np.int64], sizes: NDArray[np.int64], lens: Array, poses: Array, lower: Array, cell: float, n: int,
-    wrong_share: float, least_seen: int,
+    distance: Floats, starts: NDArray[np.int64], sizes: NDArray[np.int64], intrinsics: Array, poses: Array, lower: Array, cell: float,
+    n: int, max_inconsistent_share: float, min_visible: int,
 ) -> Floats:  # fmt: skip
     """Signed distance (n, n, n) at cell centres; negative inside.
 
     distance: concatenated signed pixel distances (positive outside) of all views; starts (v,), sizes (v, 2) as h, w;
-    lens (v, 4) fx, fy, cx, cy; poses (v, 3, 4) world→camera.
+    intrinsics (v, 4) fx, fy, cx, cy; poses (v, 3, 4) world→camera.
     """
     views = starts.shape[0]
-    most_wrong = min(int(wrong_share * views + 0.5), _KEEP - 1)
-    far = _BAND * cell
+    max_inconsistent = min(int(max_inconsistent_share * views + 0.5), _MAX_RANKED - 1)
+    far = _EXACT_BAND * cell
     out = np.empty((n, n, n), np.float32)
     for i in nb.prange(n):
-        worst = np.empty(_KEEP, np.float64)
+        largest = np.empty(_MAX_RANKED, np.float64)
         x = lower[0] + (i + 0.5) * cell
         for j in range(n):
             y = lower[1] + (j + 0.5) * cell
             for k in range(n):
                 z = lower[2] + (k + 0.5) * cell
-                seen = 0
-                worst[:] = -1e30
+                visible = 0
+                largest[:] = -1e30
                 for v in range(views):
                     p = poses[v]
                     depth = p[2, 0] * x + p[2, 1] * y + p[2, 2] * z + p[2, 3]
                     if depth <= 1e-9:
                         continue
-                    u = lens[v, 0] * (p[0, 0] * x + p[0, 1] * y + p[0, 2] * z + p[0, 3]) / depth + lens[v, 2] - 0.5
-                    w = lens[v, 1] * (p[1, 0] * x + p[1, 1] * y + p[1, 2] * z + p[1, 3]) / depth + lens[v, 3] - 0.5
+                    u = intrinsics[v, 0] * (p[0, 0] * x + p[0, 1] * y + p[0, 2] * z + p[0, 3]) / depth + intrinsics[v, 2] - 0.5
+                    w = intrinsics[v, 1] * (p[1, 0] * x + p[1, 1] * y + p[1, 2] * z + p[1, 3]) / depth + intrinsics[v, 3] - 0.5
                     height, width = sizes[v, 0], sizes[v, 1]
                     if not (u >= 0 and w >= 0 and u < width - 1 and w < height - 1):
                         continue
@@ -74,64 +74,64 @@ def _carve(
                     base = starts[v] + iw * width + iu
                     top = distance[base] * (1 - fu) + distance[base + 1] * fu
                     bottom = distance[base + width] * (1 - fu) + distance[base + width + 1] * fu
-                    value = (top * (1 - fw) + bottom * fw) * depth / (0.5 * (lens[v, 0] + lens[v, 1]))
-                    seen += 1
-                    if value > worst[_KEEP - 1]:
-                        slot = _KEEP - 1
-                        while slot > 0 and worst[slot - 1] < value:
-                            worst[slot] = worst[slot - 1]
+                    value = (top * (1 - fw) + bottom * fw) * depth / (0.5 * (intrinsics[v, 0] + intrinsics[v, 1]))
+                    visible += 1
+                    if value > largest[_MAX_RANKED - 1]:
+                        slot = _MAX_RANKED - 1
+                        while slot > 0 and largest[slot - 1] < value:
+                            largest[slot] = largest[slot - 1]
                             slot -= 1
-                        worst[slot] = value
-                        if worst[most_wrong] > far:  # no later view can bring it back
+                        largest[slot] = value
+                        if largest[max_inconsistent] > far:  # no later view can change the result
                             break
-                if worst[most_wrong] > far:
-                    out[i, j, k] = worst[most_wrong]
-                elif seen < least_seen:
+                if largest[max_inconsistent] > far:
+                    out[i, j, k] = largest[max_inconsistent]
+                elif visible < min_visible:
                     out[i, j, k] = cell
                 else:
-                    allowed = min(int(wrong_share * seen + 0.5), _KEEP - 1, seen - 1)
-                    out[i, j, k] = worst[allowed]
+                    allowed = min(int(max_inconsistent_share * visible + 0.5), _MAX_RANKED - 1, visible - 1)
+                    out[i, j, k] = largest[allowed]
     return out
 
 
 def silhouette_distance(mask: Bytes) -> Floats:
     """Signed distance in pixels from the edge of a mask (h, w), positive outside; the frame's edge is no silhouette.
 
-    A mask without an edge is ± its diagonal everywhere.
+    Without an edge the distance is ± the image diagonal everywhere.
     """
     inside = (mask > 127).astype(np.uint8)
     if inside.all() or not inside.any():
         far = float(np.hypot(*mask.shape))
         return np.full(mask.shape, -far if inside.all() else far, np.float32)
     outer, inner = distance_to_zero(1 - inside), distance_to_zero(inside)
-    # Distances run between pixel centres, the edge lies half a pixel before them.
+    # Distances are between pixel centres; the edge lies half a pixel before them.
     return np.where(inside > 0, 0.5 - inner, outer - 0.5).astype(np.float32)
 
 
-def carve(
-    cameras: Sequence[Camera], masks: Sequence[Bytes], centre: Array, radius: float, resolution: int, wrong_views: float = WRONG_VIEWS
-) -> Floats:
+def carve(cameras: Sequence[Camera], masks: Sequence[Bytes], centre: Array, radius: float, resolution: int) -> Floats:
     """Signed distance (n, n, n) of the hull on the cube of half edge `radius` around `centre` (3,), negative inside; axes x, y, z.
 
-    `cameras` are pinholes of the masks' sizes; n = `resolution`. Where too few views look, the value is one cell (outside).
+    `cameras` are pinholes of the masks' sizes; n = `resolution`. Where too few views see a cell, the value is one cell (outside).
     The occupancy is `carve(...) < 0`.
     """
     fields = [silhouette_distance(m) for m in masks]
     sizes = np.array([f.shape for f in fields], np.int64).reshape(-1, 2)
     starts = np.concatenate([[0], np.cumsum(sizes.prod(1))[:-1]]).astype(np.int64)
-    lens = np.array([(c.fx, c.fy, c.cx, c.cy) for c in cameras], float).reshape(-1, 4)
+    intrinsics = np.array([(c.fx, c.fy, c.cx, c.cy) for c in cameras], float).reshape(-1, 4)
     poses = np.array([np.concatenate([c.R, c.t[:, None]], 1) for c in cameras], float).reshape(-1, 3, 4)
-    # Views in an order that jumps around the object: what is empty is found so after a few.
+    # A low-discrepancy order of the views: empty cells are excluded after a few.
     order = np.argsort(np.arange(len(fields)) * 0.6180339887498949 % 1.0)
     cell = 2.0 * radius / resolution
-    least = max(2, int(np.ceil(SEEN_SHARE * len(fields))))
+    min_visible = max(2, int(np.ceil(MIN_VISIBLE_SHARE * len(fields))))
     flat = np.concatenate([f.ravel() for f in fields])
-    return _carve(flat, starts[order], sizes[order], lens[order], poses[order], np.asarray(centre, float) - radius, cell, resolution,
-    wrong_views, least)
+    return _carve(
+        flat, starts[order], sizes[order], intrinsics[order], poses[order], np.asarray(centre, float) - radius, cell, resolution,
+        MAX_INCONSISTENT_SHARE, min_visible,
+    )  # fmt: skip
 
 
-def _largest_parts(inside: NDArray[np.bool_], share: float = 0.05) -> NDArray[np.bool_]:
-    """Drop loose pieces smaller than `share` of the largest (left where silhouettes cross in empty space)."""
+def _large_components(inside: NDArray[np.bool_], share: float = 0.05) -> NDArray[np.bool_]:
+    """Remove connected components smaller than `share` of the largest (where silhouettes intersect in empty space)."""
     from scipy import ndimage
 
     labels, count = ndimage.label(inside, structure=np.ones((3, 3, 3)))
@@ -144,7 +144,7 @@ def _largest_parts(inside: NDArray[np.bool_], share: float = 0.05) -> NDArray[np
 
 @dataclass(frozen=True)
 class Hull:
-    """A visual hull: `occupancy` (n, n, n) with axes x, y, z; cell (i, j, k) has its centre at `lower` + (i+.5, j+.5, k+.5)·`cell`.
+    """Visual hull: `occupancy` (n, n, n) with axes x, y, z; cell (i, j, k) has its centre at `lower` + (i+.5, j+.5, k+.5)·`cell`.
 
     `field` (n, n, n) is the signed distance at the cell centres, negative inside.
     """
@@ -155,14 +155,12 @@ class Hull:
     field: Floats
 
     @staticmethod
-    def of(
-        cameras: Sequence[Camera], masks: Sequence[Bytes], centre: Array, radius: float, resolution: int, wrong_views: float = WRONG_VIEWS
-    ) -> Hull:
-        """Carve the cube of half edge `radius` around `centre`."""
-        field = carve(cameras, masks, centre, radius, resolution, wrong_views)
+    def from_masks(cameras: Sequence[Camera], masks: Sequence[Bytes], centre: Array, radius: float, resolution: int) -> Hull:
+        """Carve the cube of half edge `radius` around `centre`; small components are removed."""
+        field = carve(cameras, masks, centre, radius, resolution)
         cell = 2.0 * radius / resolution
         inside = field < 0
-        kept = _largest_parts(inside)
+        kept = _large_components(inside)
         field[inside & ~kept] = cell
         return Hull(kept, np.asarray(centre, float) - radius, cell, field)
 
@@ -221,7 +219,7 @@ class Hull:
         cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         area = np.linalg.norm(cross, axis=1)
         rng = np.random.default_rng(seed)
-        # Stratified along the cumulated area: evener than independent draws.
+        # Stratified sampling along the cumulative area: more even than independent samples.
         total = np.cumsum(area)
         face = np.searchsorted(total, (np.arange(count) + rng.random(count)) / count * total[-1]).clip(0, len(area) - 1)
         a, b = np.sqrt(rng.random(count)), rng.random(count)
@@ -231,7 +229,7 @@ class Hull:
 
 
 def visual_hull(posed: PosedPhotos, resolution: int = 128, max_size: int = 512) -> Hull:
-    """The hull of a masked capture in the unit frame, on the cube [-1, 1]³. Masks are read at `max_size`.
+    """Visual hull of a masked capture in the unit frame, on the cube [-1, 1]³. Masks are read at `max_size`.
 
     Raises ValueError when a photo has no mask.
     """
@@ -242,4 +240,4 @@ def visual_hull(posed: PosedPhotos, resolution: int = 128, max_size: int = 512) 
             raise ValueError(f"photo {camera.name} has no mask")
         cameras.append(camera)
         masks.append(mask)
-    return Hull.of(cameras, masks, np.zeros(3), 1.0, resolution)
+    return Hull.from_masks(cameras, masks, np.zeros(3), 1.0, resolution)

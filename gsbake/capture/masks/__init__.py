@@ -1,1 +1,1 @@
-"""Masks of the object: which belongs to which photo, and completing them."""
+"""Masks of the object: matching to photos, completion."""

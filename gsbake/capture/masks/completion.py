@@ -1,8 +1,8 @@
-"""Masks that leave out a part of the object, found out by the points of the other photos.
+"""Completion of masks that miss a part of the object, detected by the tie points of the other photos.
 
-One mask that misses the dark mouth of a mug declares everything behind it empty, and a visual hull lets only few views be wrong. But a
-point of the object lies inside every mask, hidden or not; so points that nearly all masks hold and one leaves out, many at one
-place, are its mistake. That place is taken from the hull of the photos without mistakes: what all of them hold to be the object.
+One mask that misses the dark mouth of a mug marks everything behind it as empty, and a visual hull tolerates only few wrong views. A point
+of the object projects into every mask, occluded or not. So points that nearly all masks include and one mask excludes, many of them in
+one region, are errors of that mask. The missing region is taken from the visual hull of the correct masks.
 """
 
 from __future__ import annotations
@@ -18,86 +18,86 @@ from gsbake.capture.hull.visual_hull import Hull, silhouette_distance
 from gsbake.capture.photos.decode import Bytes
 from gsbake.geometry.cameras import Array, Camera
 
-#: A point is left out when it lies this share of the longer side outside.
-OUTSIDE = 0.01
-#: A point is the object's when so many photos show its place, and at most this share of them (but one in any case) leave it out.
-LEAST_PHOTOS, LEFT_OUT = 5, 0.03
-#: A mask is wrong where at least so many points are left out at one place, and this share of all.
-LEAST_POINTS, LEAST_SHARE = 10, 0.01
-#: With more wrong masks than this share it is not clear which are right.
-MOST_WRONG = 0.2
-#: Points looked at: more say no more.
-MOST_POINTS = 50_000
-#: Cells along the cube of half edge 1 in the hull of the right masks.
-CELLS = 96
+#: Distance outside the mask, as a share of the longer side, from which a point is excluded.
+OUTSIDE_MARGIN = 0.01
+#: A point belongs to the object when at least this many photos show it and at most this share of them (but one in any case) exclude it.
+MIN_VIEWS, MAX_EXCLUDED_SHARE = 5, 0.03
+#: A mask is wrong where it excludes at least this many points in one region, and this share of all points.
+MIN_EXCLUDED_POINTS, MIN_EXCLUDED_SHARE = 10, 0.01
+#: With a larger share of wrong masks it is ambiguous which masks are correct.
+MAX_WRONG_SHARE = 0.2
+#: Points tested; more do not change the result.
+MAX_POINTS = 50_000
+#: Cells along the cube of half edge 1 in the hull of the correct masks.
+HULL_CELLS = 96
 
 
 @dataclass(frozen=True)
-class Mended:
-    """One wrong mask: the photo's index, how many points of the object it left out, and the part (h, w) that it lacks."""
+class MaskCompletion:
+    """A wrong mask: the photo's `index`, the number of object `points` it excludes, and the `missing` region (h, w)."""
 
     index: int
     points: int
     missing: NDArray[np.bool_]
 
 
-def left_out(cameras: Sequence[Camera], masks: Sequence[Bytes], points: Array) -> list[Array]:
-    """For each photo the pixels (k, 2) at which points of the object lie outside its mask. `points` (n, 3) may hold others too."""
-    seen, out = np.zeros(len(points), np.int64), np.zeros((len(cameras), len(points)), bool)
+def excluded_points(cameras: Sequence[Camera], masks: Sequence[Bytes], points: Array) -> list[Array]:
+    """For each photo the pixels (k, 2) at which points of the object lie outside its mask; `points` (n, 3) may include background."""
+    views, excluded = np.zeros(len(points), np.int64), np.zeros((len(cameras), len(points)), bool)
     pixels = []
     for index, (camera, mask) in enumerate(zip(cameras, masks, strict=True)):
         pixel, z = camera.project(points)
-        shown = camera.shows(pixel, z)
-        column, row = np.floor(pixel[shown]).astype(np.int64).T
-        out[index, shown] = silhouette_distance(mask)[row, column] > OUTSIDE * max(mask.shape)
-        seen += shown
+        visible = camera.in_view(pixel, z)
+        column, row = np.floor(pixel[visible]).astype(np.int64).T
+        excluded[index, visible] = silhouette_distance(mask)[row, column] > OUTSIDE_MARGIN * max(mask.shape)
+        views += visible
         pixels.append(pixel)
-    object_ = (seen >= LEAST_PHOTOS) & (out.sum(0) <= np.maximum(LEFT_OUT * seen, 1))
-    least = max(LEAST_POINTS, LEAST_SHARE * object_.sum())
-    found = [pixel[missed & object_] for pixel, missed in zip(pixels, out, strict=True)]
-    return [f if len(f) >= least else f[:0] for f in found]
+    on_object = (views >= MIN_VIEWS) & (excluded.sum(0) <= np.maximum(MAX_EXCLUDED_SHARE * views, 1))
+    min_count = max(MIN_EXCLUDED_POINTS, MIN_EXCLUDED_SHARE * on_object.sum())
+    found = [pixel[outside & on_object] for pixel, outside in zip(pixels, excluded, strict=True)]
+    return [f if len(f) >= min_count else f[:0] for f in found]
 
 
-def silhouette(hull: Hull, camera: Camera) -> NDArray[np.bool_]:
-    """Pixels (h, w) of the camera that show the hull, to about a cell."""
+def render_silhouette(hull: Hull, camera: Camera) -> NDArray[np.bool_]:
+    """Pixels (h, w) of the camera that the hull covers, accurate to about a cell."""
     centres = hull.lower + (np.argwhere(hull.occupancy) + 0.5) * hull.cell
     pixel, z = camera.project(centres)
-    shown = camera.shows(pixel, z)
+    visible = camera.in_view(pixel, z)
     image = np.zeros((camera.height, camera.width), np.uint8)
-    column, row = np.floor(pixel[shown]).astype(np.int64).T
+    column, row = np.floor(pixel[visible]).astype(np.int64).T
     image[row, column] = 1
-    reach = max(1, round(0.6 * hull.cell * camera.fx / float(np.median(z[shown])))) if shown.any() else 1
-    return np.asarray(cv2.morphologyEx(image, cv2.MORPH_CLOSE, _disc(reach)) > 0)
+    radius = max(1, round(0.6 * hull.cell * camera.fx / float(np.median(z[visible])))) if visible.any() else 1
+    return np.asarray(cv2.morphologyEx(image, cv2.MORPH_CLOSE, _disc(radius)) > 0)
 
 
-def mend(cameras: Sequence[Camera], masks: Sequence[Bytes], points: Array) -> list[Mended]:
-    """Which masks (h, w) leave out a part of the object, and which part; `cameras` are pinholes of their sizes in the unit frame.
+def complete_masks(cameras: Sequence[Camera], masks: Sequence[Bytes], points: Array) -> list[MaskCompletion]:
+    """Masks (h, w) that miss a part of the object, with the missing region; `cameras` are pinholes of their sizes in the unit frame.
 
-    `points` (n, 3) are tie points, of the object and of what is around it. Empty where no mask is wrong, or too many are.
+    `points` (n, 3) are tie points of the object and of the background. Empty when no mask is wrong, or too many are.
     """
-    pixels = left_out(cameras, masks, points[:: -(-len(points) // MOST_POINTS) or 1])
+    pixels = excluded_points(cameras, masks, points[:: -(-len(points) // MAX_POINTS) or 1])
     wrong = [i for i, p in enumerate(pixels) if len(p)]
-    right = [i for i, p in enumerate(pixels) if not len(p)]
-    if not wrong or len(wrong) > MOST_WRONG * len(cameras):
+    correct = [i for i, p in enumerate(pixels) if not len(p)]
+    if not wrong or len(wrong) > MAX_WRONG_SHARE * len(cameras):
         return []
-    hull = Hull.of([cameras[i] for i in right], [masks[i] for i in right], np.zeros(3), 1.0, CELLS)
+    hull = Hull.from_masks([cameras[i] for i in correct], [masks[i] for i in correct], np.zeros(3), 1.0, HULL_CELLS)
     if hull.empty:
         return []
-    mended = []
+    completions = []
     for index in wrong:
         mask = masks[index]
-        missing = silhouette(hull, cameras[index]) & (mask <= 127)
-        # The hull is a little wider than the object all around: that rim is no mistake.
-        rim = _disc(max(1, round(OUTSIDE * max(mask.shape))))
-        core = cv2.morphologyEx(missing.astype(np.uint8), cv2.MORPH_OPEN, rim)
-        _, label = cv2.connectedComponents(core)
+        missing = render_silhouette(hull, cameras[index]) & (mask <= 127)
+        # The hull is slightly larger than the object all around: opening removes this boundary.
+        boundary = _disc(max(1, round(OUTSIDE_MARGIN * max(mask.shape))))
+        regions = cv2.morphologyEx(missing.astype(np.uint8), cv2.MORPH_OPEN, boundary)
+        _, label = cv2.connectedComponents(regions)
         column, row = np.floor(pixels[index]).astype(np.int64).T
-        at = np.bincount(label[row, column], minlength=int(label.max()) + 1)
-        at[0] = 0
-        hit = at >= LEAST_POINTS
-        if hit.any():
-            mended.append(Mended(index, int(at[hit].sum()), hit[label]))
-    return mended
+        count = np.bincount(label[row, column], minlength=int(label.max()) + 1)
+        count[0] = 0
+        confirmed = count >= MIN_EXCLUDED_POINTS
+        if confirmed.any():
+            completions.append(MaskCompletion(index, int(count[confirmed].sum()), confirmed[label]))
+    return completions
 
 
 def _disc(radius: int) -> Bytes:

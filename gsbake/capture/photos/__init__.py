@@ -1,1 +1,1 @@
-"""Single photos: decoding, EXIF, quality, redundancy, exposure, lens distortion."""
+"""Single photos: decoding, EXIF, quality, redundancy, exposure, undistortion."""

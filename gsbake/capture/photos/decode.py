@@ -1,13 +1,15 @@
-"""Decoding one photo, of whatever format, to upright 8-bit sRGB of the working size.
+"""Decoding of a photo in any supported format to upright 8-bit sRGB at the working size.
 
-OpenImageIO reads JPEG, PNG, TIFF, EXR and WebP in 8 bit, 16 bit and float. Integer files are taken as sRGB-coded, or converted from the ICC
-profile they carry; float files (EXR, float TIFF) as linear light. Reduction is an area filter in linear light (IEC 61966-2-1 curve),
-weighted with alpha, since the mean of coded values is not the light a larger sensor cell would have caught.
+OpenImageIO reads JPEG, PNG, TIFF, EXR and WebP in 8 bit, 16 bit and float. Integer files are sRGB-coded, or converted from their embedded
+ICC profile; float files (EXR, float TIFF) are linear. Downsampling is an area filter on linear values (IEC 61966-2-1 curve), weighted
+with alpha, because the mean of coded values is not the radiance that a larger sensor cell measures.
 """
 
 from __future__ import annotations
 
 import io
+import os
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,14 +24,18 @@ from gsbake.imaging.srgb import decode_bytes, encode_bytes
 Bytes = NDArray[np.uint8]
 Floats = NDArray[np.float32]
 
-#: Alpha below this (of 255) is background whose colour means nothing.
-_CLEAR = 1
-#: Colours of the object are spread this many pixels into the background, so that no filter mixes in what lay under alpha = 0.
-_SPREAD = 8
+#: Default of `ingest.max_megapixels`.
+MAX_MEGAPIXELS = 250.0
+#: Largest edge in pixels and most channels of an image that is decoded at all.
+_MAX_EDGE, _MAX_CHANNELS = 100_000, 16
+#: Alpha (of 255) below which the colour of a pixel is undefined.
+_MIN_ALPHA = 1
+#: Radius in pixels of the dilation of object colours into the background, so that no filter reads undefined colours.
+_DILATION_RADIUS = 8
 
 
 class UnreadablePhotoError(Exception):
-    """The file cannot be decoded, or ends too early; the message says why."""
+    """The file cannot be decoded or is truncated; the message states the reason."""
 
 
 @dataclass(frozen=True)
@@ -52,8 +58,8 @@ class RawPhoto:
         return int(self.pixels.shape[0])
 
 
-def orient(image: NDArray[Any], orientation: int) -> NDArray[Any]:
-    """Turn or mirror an image (h, w[, c]) by its EXIF orientation (1..8) so that its top is up."""
+def apply_orientation(image: NDArray[Any], orientation: int) -> NDArray[Any]:
+    """The upright image of a stored image (h, w[, c]) with this EXIF orientation (1..8)."""
     if orientation in (5, 6, 7, 8):
         image = np.swapaxes(image, 0, 1)
     if orientation in (2, 3, 6, 7):
@@ -63,24 +69,73 @@ def orient(image: NDArray[Any], orientation: int) -> NDArray[Any]:
     return np.ascontiguousarray(image)
 
 
-def _decode(path: Path) -> tuple[NDArray[Any], oiio.ImageSpec]:
+@dataclass(frozen=True)
+class ImageHeader:
+    """Size of a stored image from its header: width, height, channels, and bytes per channel after decoding (1 or 4)."""
+
+    width: int
+    height: int
+    channels: int
+    sample_bytes: int
+
+    @property
+    def megapixels(self) -> float:
+        """Pixels in millions."""
+        return self.width * self.height / 1e6
+
+    @property
+    def decoded_bytes(self) -> int:
+        """Bytes of the decoded pixels."""
+        return self.width * self.height * self.channels * self.sample_bytes
+
+
+def read_header(path: Path) -> ImageHeader:
+    """The header of an image file; no pixel is decoded. Raises UnreadablePhotoError."""
+    handle = _open(path)
+    try:
+        return _header(handle.spec())
+    finally:
+        handle.close()
+
+
+def _header(spec: oiio.ImageSpec) -> ImageHeader:
+    if not (0 < spec.width <= _MAX_EDGE and 0 < spec.height <= _MAX_EDGE and 0 < spec.nchannels <= _MAX_CHANNELS and spec.depth <= 1):
+        raise UnreadablePhotoError(f"it has {spec.width}x{spec.height} pixels of {spec.nchannels} channels")
+    return ImageHeader(spec.width, spec.height, spec.nchannels, 1 if spec.format == oiio.UINT8 else 4)
+
+
+def _open(path: Path) -> Any:
+    try:
+        name = os.fsencode(path).decode("utf-8")
+    except UnicodeDecodeError:
+        raise UnreadablePhotoError("its name is not valid UTF-8; rename it") from None
     config = oiio.ImageSpec()
     config.attribute("oiio:UnassociatedAlpha", 1)
-    handle = oiio.ImageInput.open(str(path), config)
+    handle = oiio.ImageInput.open(name, config)
     if handle is None:
-        raise UnreadablePhotoError(oiio.geterror().strip() or "unknown format")
+        raise UnreadablePhotoError(" ".join(oiio.geterror().split()) or "unknown format")
+    return handle
+
+
+def _decode(path: Path, max_megapixels: float) -> tuple[NDArray[Any], oiio.ImageSpec]:
+    handle = _open(path)
     try:
         spec = handle.spec()
+        header = _header(spec)
+        if header.megapixels > max_megapixels:
+            raise UnreadablePhotoError(
+                f"it has {header.megapixels:.0f} megapixels, more than ingest.max_megapixels = {max_megapixels:g}; raise that setting"
+            )
         pixels = handle.read_image(oiio.UINT8 if spec.format == oiio.UINT8 else oiio.FLOAT)
         if pixels is None or handle.has_error:  # a truncated JPEG is decoded as far as it goes, with an error set
-            raise UnreadablePhotoError(handle.geterror().strip().splitlines()[0] or "no pixels")
+            raise UnreadablePhotoError(" ".join(handle.geterror().split())[:200] or "no pixels")
         return pixels, spec
     finally:
         handle.close()
 
 
-def _from_profile(rgb: Bytes, tags: dict[str, Any]) -> Bytes:
-    """Convert from the RGB profile a file carries (Display P3 of phones, Adobe RGB of cameras) to sRGB."""
+def _convert_icc_profile(rgb: Bytes, tags: dict[str, Any]) -> Bytes:
+    """Convert from the embedded RGB profile of a file (Display P3 of phones, Adobe RGB of cameras) to sRGB."""
     profile = tags.get("ICCProfile")
     if profile is None or "srgb" in str(tags.get("ICCProfile:profile_description", "")).lower():
         return rgb
@@ -91,21 +146,53 @@ def _from_profile(rgb: Bytes, tags: dict[str, Any]) -> Bytes:
     try:
         source = ImageCms.ImageCmsProfile(io.BytesIO(np.asarray(profile).astype(np.uint8).tobytes()))
         out = ImageCms.profileToProfile(Image.fromarray(rgb), source, ImageCms.createProfile("sRGB"), outputMode="RGB")
-    except ImageCms.PyCMSError:
-        return rgb  # a broken profile is no reason to lose the photo
+    except (ImageCms.PyCMSError, OSError, ValueError, TypeError, OverflowError):
+        return rgb  # a broken profile does not make the photo unusable
     return rgb if out is None else np.asarray(out, np.uint8)
 
 
-def read_photo(path: Path) -> RawPhoto:
-    """Decode a photo: grey becomes RGB, CMYK is converted, alpha is split off and the EXIF orientation applied.
+def read_photo(path: Path, max_megapixels: float = MAX_MEGAPIXELS) -> RawPhoto:
+    """Decode a photo: grey and CMYK are converted to RGB, alpha is separated and the EXIF orientation applied.
 
-    Raises UnreadablePhotoError when the file is broken, truncated or holds values that are no numbers.
+    Raises UnreadablePhotoError when the file is broken, truncated, larger than `max_megapixels`, or holds NaN or infinite values.
     """
-    pixels, spec = _decode(path)
-    tags: dict[str, Any] = {a.name: a.value for a in spec.extra_attribs}
+    try:
+        return _read_photo(path, max_megapixels)
+    except UnreadablePhotoError:
+        raise
+    except MemoryError:
+        raise UnreadablePhotoError("decoding it needs more memory than there is") from None
+    except Exception as error:  # decoders report damaged metadata in exceptions of many types
+        raise UnreadablePhotoError(f"{type(error).__name__}: {' '.join(str(error).split())[:200]}") from error
+
+
+def _tags(spec: oiio.ImageSpec) -> dict[str, Any]:
+    """The metadata of a file by name, without entries that cannot be decoded."""
+    tags: dict[str, Any] = {}
+    for k in range(len(spec.extra_attribs)):
+        with suppress(Exception):
+            entry = spec.extra_attribs[k]
+            tags[entry.name] = entry.value
+    return tags
+
+
+def _orientation(value: object) -> int:
+    """EXIF orientation 1..8; 1 for anything else."""
+    try:
+        number = int(value)  # type: ignore[call-overload]
+    except (TypeError, ValueError, OverflowError):
+        return 1
+    return number if 1 <= number <= 8 else 1
+
+
+def _read_photo(path: Path, max_megapixels: float) -> RawPhoto:
+    pixels, spec = _decode(path, max_megapixels)
+    tags = _tags(spec)
     names = [str(n).upper() for n in spec.channelnames]
     alpha_at = spec.alpha_channel if spec.alpha_channel >= 0 else (names.index("A") if "A" in names else -1)
     colour_at = [i for i in range(pixels.shape[2]) if i != alpha_at]
+    if not colour_at:
+        raise UnreadablePhotoError("it has no colour channels")
     if all(n in names for n in "RGB"):
         colour_at = [names.index(n) for n in "RGB"]
     colour = pixels[..., colour_at[:3] if len(colour_at) >= 3 else [colour_at[0]] * 3]
@@ -121,26 +208,29 @@ def read_photo(path: Path) -> RawPhoto:
         if alpha is not None:
             alpha = np.rint(np.clip(alpha, 0, 1) * 255).astype(np.uint8)
     if colour.dtype == np.uint8:
-        colour = _from_profile(np.ascontiguousarray(colour), tags)
-    orientation = int(tags.get("Orientation", 1) or 1)
+        colour = _convert_icc_profile(np.ascontiguousarray(colour), tags)
+    orientation = _orientation(tags.get("Orientation", 1))
     if alpha is not None:
-        alpha = None if alpha.min() == 255 else orient(alpha, orientation)  # an opaque alpha channel is no mask
-    return RawPhoto(orient(colour, orientation), alpha, orientation, tags)
+        alpha = None if alpha.min() == 255 else apply_orientation(alpha, orientation)  # an opaque alpha channel is no mask
+    return RawPhoto(apply_orientation(colour, orientation), alpha, orientation, tags)
 
 
-def read_mask(path: Path) -> tuple[Bytes, int]:
+def read_mask(path: Path, max_megapixels: float = MAX_MEGAPIXELS) -> tuple[Bytes, int]:
     """A mask file as (h, w) 8-bit, 255 = white, and its EXIF orientation, which is already applied.
 
-    Of RGBA files the alpha channel is the mask if it is not opaque. Raises UnreadablePhotoError.
+    The mask of an RGBA file is its alpha channel unless that is opaque. Raises UnreadablePhotoError.
     """
-    pixels, spec = _decode(path)
-    orientation = spec.get_int_attribute("Orientation", 1) or 1
+    try:
+        pixels, spec = _decode(path, max_megapixels)
+    except (MemoryError, RuntimeError, ValueError, OSError) as error:
+        raise UnreadablePhotoError(f"{type(error).__name__}: {' '.join(str(error).split())[:200]}") from error
+    orientation = _orientation(spec.get_int_attribute("Orientation", 1))
     plane = pixels[..., 0]
     if spec.alpha_channel >= 0 and float(pixels[..., spec.alpha_channel].min()) < (255 if pixels.dtype == np.uint8 else 1.0):
         plane = pixels[..., spec.alpha_channel]
     if plane.dtype != np.uint8:
         plane = np.rint(np.clip(plane, 0, 1) * 255).astype(np.uint8)
-    return orient(plane, orientation), orientation
+    return apply_orientation(plane, orientation), orientation
 
 
 def working_size(width: int, height: int, max_size: int) -> tuple[int, int]:
@@ -151,10 +241,10 @@ def working_size(width: int, height: int, max_size: int) -> tuple[int, int]:
     return max(1, round(width * max_size / longer)), max(1, round(height * max_size / longer))
 
 
-def to_working(photo: RawPhoto, mask: Bytes | None, max_size: int) -> tuple[Bytes, Bytes | None]:
-    """8-bit sRGB (h, w, 3) of the working size, and the mask at that size.
+def to_working_size(photo: RawPhoto, mask: Bytes | None, max_size: int) -> tuple[Bytes, Bytes | None]:
+    """The photo as 8-bit sRGB (h, w, 3) at the working size, and the mask at that size.
 
-    Where the photo has alpha, its colour counts by alpha in the filter, and what lies under alpha = 0 is replaced, see `fill_clear`.
+    Colours are weighted with alpha in the filter, and replaced where alpha = 0, see `fill_transparent`.
     """
     size = working_size(photo.width, photo.height, max_size)
     reduced = size != (photo.width, photo.height)
@@ -163,36 +253,36 @@ def to_working(photo: RawPhoto, mask: Bytes | None, max_size: int) -> tuple[Byte
     if reduced:
         linear: Any = decode_bytes(np.asarray(pixels, np.uint8)) if pixels.dtype == np.uint8 else pixels
         if weight is not None:
-            share = weight.astype(np.float32)[..., None] / 255
-            total = cv2.resize(share, size, interpolation=cv2.INTER_AREA)[..., None]
-            linear = cv2.resize(linear * share, size, interpolation=cv2.INTER_AREA) / np.maximum(total, 1e-4)
-            weight = np.rint(total[..., 0] * 255).astype(np.uint8)
+            alpha = weight.astype(np.float32)[..., None] / 255
+            reduced_alpha = cv2.resize(alpha, size, interpolation=cv2.INTER_AREA)[..., None]
+            linear = cv2.resize(linear * alpha, size, interpolation=cv2.INTER_AREA) / np.maximum(reduced_alpha, 1e-4)
+            weight = np.rint(reduced_alpha[..., 0] * 255).astype(np.uint8)
         else:
             linear = cv2.resize(linear, size, interpolation=cv2.INTER_AREA)
         rgb = encode_bytes(linear)
     else:
         rgb = np.asarray(pixels) if pixels.dtype == np.uint8 else encode_bytes(pixels)
     if weight is not None:
-        rgb = fill_clear(rgb, weight)
+        rgb = fill_transparent(rgb, weight)
     if mask is not None and reduced:
         mask = np.asarray(cv2.resize(mask, size, interpolation=cv2.INTER_AREA), np.uint8)
     return np.ascontiguousarray(rgb, np.uint8), None if mask is None else np.ascontiguousarray(mask, np.uint8)
 
 
-def fill_clear(rgb: Bytes, alpha: Bytes) -> Bytes:
-    """Give pixels with alpha = 0 a harmless colour: the nearest object colour close by, black farther away.
+def fill_transparent(rgb: Bytes, alpha: Bytes) -> Bytes:
+    """Replace the colour of pixels with alpha = 0: dilated object colours within _DILATION_RADIUS, black beyond.
 
-    Whatever stood there (often white, or left-overs of an editor) would otherwise bleed into the object in every later filter.
+    The stored colours there (often white, or remains of an editor) would bleed into the object in every later filter.
     """
-    clear = alpha < _CLEAR
-    if not clear.any() or clear.all():
+    transparent = alpha < _MIN_ALPHA
+    if not transparent.any() or transparent.all():
         return rgb
     distance, labels = cv2.distanceTransformWithLabels(
-        clear.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
+        transparent.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
     )
     nearest = np.zeros(int(labels.max()) + 1, np.int64)
-    solid = np.flatnonzero(~clear)
-    nearest[labels.ravel()[solid]] = solid
+    opaque = np.flatnonzero(~transparent)
+    nearest[labels.ravel()[opaque]] = opaque
     out = rgb.reshape(-1, 3)[nearest[labels.ravel()]].reshape(rgb.shape)
-    out[distance > _SPREAD] = 0
+    out[distance > _DILATION_RADIUS] = 0
     return out

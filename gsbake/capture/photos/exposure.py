@@ -1,8 +1,8 @@
-"""Exposure of the photos against each other, told by the tie points of structure from motion.
+"""Exposure differences between photos, measured at the tie points of structure from motion.
 
-A tie point was matched because it looks the same in its photos, and most lie on the matt, textured things around an object. So their
-brightness changes with the exposure alone, where a shining object's own surface also changes with the side it is seen from: on polished
-metal the photos differ by half without any change of exposure.
+Tie points match because they look the same in their photos, and most lie on the diffuse, textured surroundings of the object. Their
+brightness therefore changes with the exposure alone. The surface of a specular object also changes with the viewing direction: on smooth
+metal photos of equal exposure differ by half.
 """
 
 from __future__ import annotations
@@ -13,54 +13,54 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsbake.capture.poses.colmap_model import read_tracks
-from gsbake.capture.view_dependence import exposures, luminance_at
+from gsbake.capture.view_dependence import exposure_offsets, sample_luminance
 from gsbake.geometry.cameras import Camera, Similarity
 
-#: Blur (pixels) before photos are compared: keypoints sit on corners.
-BLUR = 2.0
+#: Standard deviation of the Gaussian blur before comparison, in pixels: keypoints lie on corners.
+BLUR_SIGMA = 2.0
 #: Linear values outside this range are noise or clipped.
-RANGE = (0.01, 0.9)
-#: A point counts when this many photos show it, a photo when it shows this many points; fewer points in all say nothing.
-LEAST_PHOTOS, LEAST_POINTS, LEAST_IN_ALL = 3, 30, 200
-#: Share of the photos that the answer holds for: one that shares few points with the others may be off.
-MOST = 0.9
+VALUE_RANGE = (0.01, 0.9)
+#: Photos that must show a point, points that a photo must show, and points in all that a result needs.
+MIN_VIEWS, MIN_POINTS_PER_PHOTO, MIN_POINTS = 3, 30, 200
+#: Quantile of the photos' exposure offsets that is returned: a photo that shares few points with the others may be an outlier.
+SPREAD_QUANTILE = 0.9
 
 
-class TiePoints:
-    """What photos show at tie points; add the photos one by one."""
+class TiePointExposure:
+    """Log brightness of tie points in photos that are added one by one."""
 
-    def __init__(self, points: NDArray[np.float64], seen: dict[str, NDArray[np.int64]]) -> None:
-        """`points` (k, 3) in the frame of the cameras; `seen` holds the points' indices by the name of the photo."""
-        self._points, self._seen = points, seen
+    def __init__(self, points: NDArray[np.float64], visible: dict[str, NDArray[np.int64]]) -> None:
+        """`points` (k, 3) in the frame of the cameras; `visible` maps a photo's name to the indices of the points it shows."""
+        self._points, self._visible = points, visible
         self._rows: list[NDArray[np.float64]] = []
 
     @classmethod
-    def of(cls, folder: Path, to_frame: Similarity) -> TiePoints | None:
-        """Those of the COLMAP model in `folder`, mapped by the similarity `to_frame`; None when there is no model."""
+    def from_model(cls, folder: Path, to_frame: Similarity) -> TiePointExposure | None:
+        """The tie points of the COLMAP model in `folder`, mapped by the similarity `to_frame`; None when there is no model."""
         if not (folder / "points3D.bin").exists():
             return None
-        points, seen = read_tracks(folder)
-        return cls(to_frame.apply(points), seen)
+        points, visible = read_tracks(folder)
+        return cls(to_frame.apply(points), visible)
 
     def add(self, camera: Camera, linear: NDArray[np.float32]) -> None:
-        """One undistorted photo (h, w, 3), linear, of `camera`."""
+        """Add one undistorted linear photo (h, w, 3) of `camera`."""
         row = np.full(len(self._points), np.nan)
-        index = self._seen.get(camera.name, np.zeros(0, np.int64))
+        index = self._visible.get(camera.name, np.zeros(0, np.int64))
         if len(index):
             pixel, depth = camera.project(self._points[index])
             inside = (depth > 0) & (pixel > 2).all(1) & (pixel[:, 0] < camera.width - 2) & (pixel[:, 1] < camera.height - 2)
             index, pixel = index[inside], pixel[inside]
         if len(index):
-            value = luminance_at(linear, pixel, BLUR)
-            good = (value > RANGE[0]) & (value < RANGE[1])
-            row[index[good]] = np.log(value[good])
+            value = sample_luminance(linear, pixel, BLUR_SIGMA)
+            valid = (value > VALUE_RANGE[0]) & (value < VALUE_RANGE[1])
+            row[index[valid]] = np.log(value[valid])
         self._rows.append(row)
 
     def spread(self) -> float | None:
-        """Factor within which `MOST` of the photos' exposures lie; None when there are too few points to say."""
+        """Factor within which the exposures of SPREAD_QUANTILE of the photos lie; None when there are too few points."""
         table = np.stack(self._rows) if self._rows else np.zeros((0, len(self._points)))
-        table = table[:, np.isfinite(table).sum(0) >= LEAST_PHOTOS]
-        table = table[np.isfinite(table).sum(1) >= LEAST_POINTS]
-        if table.shape[1] < LEAST_IN_ALL or len(table) < LEAST_PHOTOS:
+        table = table[:, np.isfinite(table).sum(0) >= MIN_VIEWS]
+        table = table[np.isfinite(table).sum(1) >= MIN_POINTS_PER_PHOTO]
+        if table.shape[1] < MIN_POINTS or len(table) < MIN_VIEWS:
             return None
-        return float(np.exp(np.quantile(np.abs(exposures(table)), MOST)))
+        return float(np.exp(np.quantile(np.abs(exposure_offsets(table)), SPREAD_QUANTILE)))

@@ -1,8 +1,8 @@
-"""Photos that add nothing: the same photo saved twice, and one of many whose every place others show from the same side.
+"""Redundant photos: duplicates, and photos of dense sequences whose surface points other photos cover.
 
-Frames of a video lie a degree apart; stereo, the field and the textures look at each of them, but depth comes from views some ten degrees
-apart and a texel keeps its ten best views. Coverage as in Furukawa, Curless, Seitz, Szeliski, *Towards internet-scale multi-view stereo*
-(CVPR 2010): a photo can go when what it sees stays seen well enough without it.
+Frames of a video lie about a degree apart. Every later stage reads each of them, but depth comes from views some ten degrees apart and a
+texel keeps its ten best views. Coverage as in Furukawa, Curless, Seitz, Szeliski, *Towards internet-scale multi-view stereo* (CVPR 2010):
+a photo is redundant when the surface that it shows stays covered without it.
 """
 
 from __future__ import annotations
@@ -15,121 +15,122 @@ from numpy.typing import NDArray
 
 from gsbake.geometry.cameras import Array, Camera
 
-#: Views of one place count as of the same side up to this angle (degrees), when they resolve it at least this finely in comparison.
-SAME_SIDE, AS_FINE = 10.0, 0.8
-#: A place is covered when this many other photos show it from the same side; a photo goes when this share of its places is.
-ENOUGH, COVERED = 6, 0.98
-#: Sets of fewer photos than this are not thinned: a person who took that few took each for a reason.
-LEAST_PHOTOS = 80
-#: A photo saved twice has the pose of the other within this share of the distance to the object and this angle (degrees).
-SAME_PLACE, SAME_TURN = 0.01, 0.5
-#: Never fewer photos than these are kept.
-FEWEST = 3
-#: A place is seen by photos that look at it within about 75 degrees of its normal.
-FACING = 0.25
+#: A view covers another at a point within this angle (degrees) between them, at this ratio of pixel sizes or better.
+MAX_ANGLE, MIN_RESOLUTION_RATIO = 10.0, 0.8
+#: Other views that must cover a point, and the share of a photo's points that must be covered for it to be redundant.
+MIN_COVERING_VIEWS, MIN_COVERED_SHARE = 6, 0.98
+#: Smaller sets are not thinned: in a hand-picked set each photo has a purpose.
+MIN_SET_SIZE = 80
+#: Duplicates agree in position within this share of the distance to the object, and in orientation within this angle (degrees).
+DUPLICATE_DISTANCE, DUPLICATE_ANGLE = 0.01, 0.5
+#: Photos that are kept in any case.
+MIN_KEPT = 3
+#: Cosine between normal and viewing direction above which a point is visible: about 75 degrees.
+MIN_FACING_COSINE = 0.25
 
 
 @dataclass(frozen=True)
 class Coverage:
-    """Of n photos and k places of the surface: which photo sees which (n, k), unit rays towards the photos (n, k, 3) float32, and the
-    size of a pixel there (n, k)."""
+    """Visibility of k surface points in n photos: `visible` (n, k), unit `directions` towards the cameras (n, k, 3) float32, and
+    `pixel_size` (n, k), the size of a pixel at the point."""
 
-    sees: NDArray[np.bool_]
-    rays: NDArray[np.float32]
-    pixel: NDArray[np.float32]
+    visible: NDArray[np.bool_]
+    directions: NDArray[np.float32]
+    pixel_size: NDArray[np.float32]
 
     @staticmethod
-    def of(cameras: Sequence[Camera], points: Array, normals: Array | None) -> Coverage:
-        """Coverage of `points` (k, 3); with outward `normals` (k, 3) only places that face a camera are seen by it."""
-        sees = np.zeros((len(cameras), len(points)), np.bool_)
-        rays = np.zeros((len(cameras), len(points), 3), np.float32)
-        pixel = np.ones((len(cameras), len(points)), np.float32)
+    def from_cameras(cameras: Sequence[Camera], points: Array, normals: Array | None) -> Coverage:
+        """Coverage of `points` (k, 3); with outward `normals` (k, 3) only points that face a camera are visible."""
+        visible = np.zeros((len(cameras), len(points)), np.bool_)
+        directions = np.zeros((len(cameras), len(points), 3), np.float32)
+        pixel_size = np.ones((len(cameras), len(points)), np.float32)
         for i, camera in enumerate(cameras):
-            place, z = camera.project(points)
-            sees[i] = camera.shows(place, z)
-            ray = camera.centre - points
-            length = np.maximum(np.linalg.norm(ray, axis=1), 1e-12)
-            rays[i], pixel[i] = ray / length[:, None], length / camera.fx
+            pixel, z = camera.project(points)
+            visible[i] = camera.in_view(pixel, z)
+            offset = camera.centre - points
+            length = np.maximum(np.linalg.norm(offset, axis=1), 1e-12)
+            directions[i], pixel_size[i] = offset / length[:, None], length / camera.fx
             if normals is not None:
-                sees[i] &= (rays[i] * normals).sum(1) > FACING
-        return Coverage(sees, rays, pixel)
+                visible[i] &= (directions[i] * normals).sum(1) > MIN_FACING_COSINE
+        return Coverage(visible, directions, pixel_size)
 
-    def counts(self, index: int) -> NDArray[np.int64]:
-        """How many other photos show each place from the same side as photo `index` and as finely (k,); 0 where that sees nothing."""
-        return np.asarray((self._same_side(index) & (self.pixel * AS_FINE <= self.pixel[index])).sum(0))
+    def covering_views(self, index: int) -> NDArray[np.int64]:
+        """Number of other photos that cover photo `index` at each point (k,); 0 where the point is not visible in it."""
+        return np.asarray((self._similar_direction(index) & (self.pixel_size * MIN_RESOLUTION_RATIO <= self.pixel_size[index])).sum(0))
 
-    def counts_for(self, index: int) -> NDArray[np.bool_]:
-        """For which photos, and where, photo `index` is one of those that `counts` counts (n, k)."""
-        return self._same_side(index) & (self.pixel[index] * AS_FINE <= self.pixel)
+    def covered_views(self, index: int) -> NDArray[np.bool_]:
+        """Photos and points (n, k) at which photo `index` is one of the `covering_views`."""
+        return self._similar_direction(index) & (self.pixel_size[index] * MIN_RESOLUTION_RATIO <= self.pixel_size)
 
-    def _same_side(self, index: int) -> NDArray[np.bool_]:
-        near = np.einsum("nkc,kc->nk", self.rays, self.rays[index]) > np.cos(np.radians(SAME_SIDE))
-        near &= self.sees & self.sees[index]
-        near[index] = False
-        return np.asarray(near)
+    def _similar_direction(self, index: int) -> NDArray[np.bool_]:
+        similar = np.einsum("nkc,kc->nk", self.directions, self.directions[index]) > np.cos(np.radians(MAX_ANGLE))
+        similar &= self.visible & self.visible[index]
+        similar[index] = False
+        return np.asarray(similar)
 
 
-def saved_twice(cameras: Sequence[Camera], alike: Mapping[str, str]) -> list[int]:
-    """Indices of photos whose pose, too, is that of the photo they look like.
+def find_duplicate_poses(cameras: Sequence[Camera], duplicates: Mapping[str, str]) -> list[int]:
+    """Indices of photos whose image and pose both equal those of another photo.
 
-    `alike` maps the name of a photo to that of an earlier one with the same picture (`quality.near_duplicates`): from a
-    turning, symmetric object two different poses show the same picture, and both say something.
+    `duplicates` maps the name of a photo to that of an earlier one with the same image (`quality.find_near_duplicates`). The pose is
+    compared too, because a symmetric object on a turntable gives equal images at different poses, and these are not redundant.
     """
     index = {camera.name: i for i, camera in enumerate(cameras)}
     out = []
     for i, camera in enumerate(cameras):
-        j = index.get(alike.get(camera.name, ""))
+        j = index.get(duplicates.get(camera.name, ""))
         if j is None:
             continue
         other = cameras[j]
-        apart = np.linalg.norm(camera.centre - other.centre) / max(float(np.linalg.norm(camera.centre)), 1e-9)
-        turn = np.degrees(np.arccos(np.clip((np.trace(camera.R @ other.R.T) - 1) / 2, -1, 1)))
-        if apart < SAME_PLACE and turn < SAME_TURN:
+        distance = np.linalg.norm(camera.centre - other.centre) / max(float(np.linalg.norm(camera.centre)), 1e-9)
+        angle = np.degrees(np.arccos(np.clip((np.trace(camera.R @ other.R.T) - 1) / 2, -1, 1)))
+        if distance < DUPLICATE_DISTANCE and angle < DUPLICATE_ANGLE:
             out.append(i)
     return out
 
 
-def covered_by_others(seen: Coverage, kept: Sequence[int]) -> list[int]:
-    """Of the photos `kept`, those that can go one after the other, each covered by the ones that stay at that moment."""
-    alive = np.zeros(len(seen.sees), np.bool_)
-    alive[list(kept)] = True
-    sees = seen.sees & alive[:, None]
-    seen = Coverage(sees, seen.rays, seen.pixel)
-    others = np.stack([seen.counts(i) for i in range(len(sees))])
-    places = np.maximum(sees.sum(1), 1)
-    share = ((others >= ENOUGH) & sees).sum(1) / places
-    gone: list[int] = []
-    # The most crowded first: they leave no gap.
-    for i in np.argsort(-others.sum(1) / places, kind="stable"):
-        if not alive[i] or share[i] < COVERED or alive.sum() <= FEWEST:
+def find_covered_photos(coverage: Coverage, kept: Sequence[int]) -> list[int]:
+    """Indices of those of the photos `kept` that can be removed one after the other, each covered by the photos that remain."""
+    remaining = np.zeros(len(coverage.visible), np.bool_)
+    remaining[list(kept)] = True
+    visible = coverage.visible & remaining[:, None]
+    coverage = Coverage(visible, coverage.directions, coverage.pixel_size)
+    covering = np.stack([coverage.covering_views(i) for i in range(len(visible))])
+    points = np.maximum(visible.sum(1), 1)
+    share = ((covering >= MIN_COVERING_VIEWS) & visible).sum(1) / points
+    removed: list[int] = []
+    # Greedy, densest neighbourhoods first: their removal leaves no gap.
+    for i in np.argsort(-covering.sum(1) / points, kind="stable"):
+        if not remaining[i] or share[i] < MIN_COVERED_SHARE or remaining.sum() <= MIN_KEPT:
             continue
-        alive[i] = False
-        gone.append(int(i))
-        others -= seen.counts_for(int(i))
-        share = ((others >= ENOUGH) & sees).sum(1) / places
-    return sorted(gone)
+        remaining[i] = False
+        removed.append(int(i))
+        covering -= coverage.covered_views(int(i))
+        share = ((covering >= MIN_COVERING_VIEWS) & visible).sum(1) / points
+    return sorted(removed)
 
 
-def spare_photos(
-    cameras: Sequence[Camera], alike: Mapping[str, str], surface: Callable[[], tuple[Array, Array | None]], whatever_count: bool
+def find_redundant_photos(
+    cameras: Sequence[Camera], duplicates: Mapping[str, str], surface: Callable[[], tuple[Array, Array | None]], any_set_size: bool
 ) -> tuple[list[int], str]:
-    """Indices of the photos that add nothing, and the evidence.
+    """Indices of redundant photos, and the evidence.
 
-    `cameras` live in the unit frame, `alike` is that of `saved_twice`, `surface()` gives places of the object (k, 3) and their normals
-    (k, 3) or None; it is asked only where the set is large enough to be thinned, or with `whatever_count`.
+    `cameras` are in the unit frame, `duplicates` is as in `find_duplicate_poses`. `surface()` returns points of the object (k, 3) and
+    their normals (k, 3) or None; it is called only for sets of at least MIN_SET_SIZE photos, or with `any_set_size`.
     """
-    twice = saved_twice(cameras, alike)
-    evidence = f"{len(twice)} of {len(cameras)} photos are saved twice"
-    kept = [i for i in range(len(cameras)) if i not in set(twice)]
-    if len(kept) < FEWEST:
-        return [], f"{evidence}, but too few would be left"
-    if len(kept) < LEAST_PHOTOS and not whatever_count:
-        return twice, f"{evidence}; sets of less than {LEAST_PHOTOS} are not thinned"
+    duplicate = find_duplicate_poses(cameras, duplicates)
+    evidence = f"{len(duplicate)} of {len(cameras)} photos are duplicates"
+    kept = [i for i in range(len(cameras)) if i not in set(duplicate)]
+    if len(kept) < MIN_KEPT:
+        return [], f"{evidence}, but fewer than {MIN_KEPT} photos would remain"
+    if len(kept) < MIN_SET_SIZE and not any_set_size:
+        return duplicate, f"{evidence}; sets of fewer than {MIN_SET_SIZE} are not thinned"
     points, normals = surface()
     if len(points) == 0:
-        return twice, f"{evidence}; nothing is known of the surface that the others see"
-    covered = covered_by_others(Coverage.of(cameras, points, normals), kept)
+        return duplicate, f"{evidence}; no surface points are known to measure coverage"
+    covered = find_covered_photos(Coverage.from_cameras(cameras, points, normals), kept)
     evidence += (
-        f"; {len(covered)} more show little that {ENOUGH} others do not ({100 * COVERED:.0f} % of it from within {SAME_SIDE:g} degrees)"
+        f"; at {100 * MIN_COVERED_SHARE:.0f} % of their surface points {len(covered)} more are covered by {MIN_COVERING_VIEWS} others "
+        f"within {MAX_ANGLE:g} degrees"
     )
-    return sorted(twice + covered), evidence
+    return sorted(duplicate + covered), evidence

@@ -1,8 +1,8 @@
-"""From lens distortion to a pinhole camera.
+"""Undistortion of photos to a pinhole camera.
 
 Distortion is OpenCV's rational model: radial k1, k2, k3 over k4, k5, k6 and tangential p1, p2
-(https://docs.opencv.org/4.x/d9/d0c/group__calib3d.html). The pinhole image is the largest upright rectangle that holds no blank pixel,
-at the focal length of the source, so that pixels keep their size and neither detail is lost nor blur added.
+(https://docs.opencv.org/4.x/d9/d0c/group__calib3d.html). The pinhole image is the largest upright rectangle without blank pixels, at the
+focal length of the source, so that the resolution is preserved.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from gsbake.geometry.cameras import Array, Camera
 
 
 def distort(points: Array, coefficients: tuple[float, ...]) -> Array:
-    """Undistorted image plane coordinates (..., 2) at z = 1 to distorted ones. `coefficients` are k1, k2, p1, p2[, k3[, k4, k5, k6]]."""
+    """Distorted image plane coordinates of undistorted ones (..., 2) at z = 1; `coefficients` are k1, k2, p1, p2[, k3[, k4, k5, k6]]."""
     k1, k2, p1, p2, k3, k4, k5, k6 = (*coefficients, *([0.0] * (8 - len(coefficients))))
     x, y = points[..., 0], points[..., 1]
     r2 = x * x + y * y
@@ -29,7 +29,7 @@ def distort(points: Array, coefficients: tuple[float, ...]) -> Array:
     )
 
 
-def undistorted(points: Array, coefficients: tuple[float, ...], steps: int = 50) -> Array:
+def undistort_points(points: Array, coefficients: tuple[float, ...], steps: int = 50) -> Array:
     """Inverse of `distort` for points (n, 2), by Newton's method with a numeric Jacobian; points that do not converge become NaN."""
     guess = np.array(points, float)
     h = 1e-6
@@ -48,47 +48,47 @@ def undistorted(points: Array, coefficients: tuple[float, ...], steps: int = 50)
     return np.where((off < 1e-6)[:, None], guess, np.nan)
 
 
-def pinhole_of(camera: Camera) -> Camera:
-    """The pinhole camera whose every pixel the distorted photo covers; same pose and focal lengths.
+def pinhole_camera(camera: Camera) -> Camera:
+    """The pinhole camera of the same pose and focal lengths whose pixels the distorted photo all covers.
 
-    Raises BadInputError when the distortion folds over inside the photo, so that no pinhole image exists.
+    Raises BadInputError when the distortion is not invertible inside the photo.
     """
     if not any(camera.distortion):
         return replace(camera, distortion=())
     w, h, n = camera.width, camera.height, 64
-    along = np.linspace(0, 1, n)
+    t = np.linspace(0, 1, n)
     sides = {
-        "left": np.stack([np.zeros(n), along * h], 1),
-        "right": np.stack([np.full(n, w), along * h], 1),
-        "top": np.stack([along * w, np.zeros(n)], 1),
-        "bottom": np.stack([along * w, np.full(n, h)], 1),
+        "left": np.stack([np.zeros(n), t * h], 1),
+        "right": np.stack([np.full(n, w), t * h], 1),
+        "top": np.stack([t * w, np.zeros(n)], 1),
+        "bottom": np.stack([t * w, np.full(n, h)], 1),
     }
-    flat = {k: undistorted((v - (camera.cx, camera.cy)) / (camera.fx, camera.fy), camera.distortion) for k, v in sides.items()}
-    x0, x1 = flat["left"][:, 0].max(), flat["right"][:, 0].min()
-    y0, y1 = flat["top"][:, 1].max(), flat["bottom"][:, 1].min()
+    plane = {k: undistort_points((v - (camera.cx, camera.cy)) / (camera.fx, camera.fy), camera.distortion) for k, v in sides.items()}
+    x0, x1 = plane["left"][:, 0].max(), plane["right"][:, 0].min()
+    y0, y1 = plane["top"][:, 1].max(), plane["bottom"][:, 1].min()
     bounds = np.array([x0 * camera.fx, x1 * camera.fx, y0 * camera.fy, y1 * camera.fy])
     width, height = np.floor(bounds[1] - bounds[0] + 1e-6), np.floor(bounds[3] - bounds[2] + 1e-6)
     if not np.isfinite(bounds).all() or not (0.25 * w < width < 4 * w and 0.25 * h < height < 4 * h):
-        raise BadInputError(f"The lens distortion {camera.distortion} of photo {camera.name} cannot be undone; check the calibration.")
+        raise BadInputError(f"The lens distortion {camera.distortion} of photo {camera.name} cannot be inverted; check the calibration.")
     return replace(
         camera, width=int(width), height=int(height), cx=float(-bounds[0]), cy=float(-bounds[2]), distortion=()
     )
 
 
 def remap_tables(source: Camera, target: Camera) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """For each pixel of the pinhole `target` where to read in the photo of `source`, in OpenCV's pixels (centres at integers)."""
+    """Positions (h, w) x and y in the photo of `source` of each pixel of the pinhole `target`, in OpenCV's pixels (centres at integers)."""
     x = (np.arange(target.width) + 0.5 - target.cx) / target.fx
     y = (np.arange(target.height) + 0.5 - target.cy) / target.fy
-    bent = distort(np.stack(np.meshgrid(x, y), -1), source.distortion or (0.0,))
-    return (bent[..., 0] * source.fx + source.cx - 0.5).astype(np.float32), (bent[..., 1] * source.fy + source.cy - 0.5).astype(np.float32)
+    xy = distort(np.stack(np.meshgrid(x, y), -1), source.distortion or (0.0,))
+    return (xy[..., 0] * source.fx + source.cx - 0.5).astype(np.float32), (xy[..., 1] * source.fy + source.cy - 0.5).astype(np.float32)
 
 
 def resample(image: Bytes, tables: tuple[NDArray[np.float32], NDArray[np.float32]], mask: bool = False) -> Bytes:
-    """The photo (h, w, 3) read through `remap_tables` with a cubic kernel; masks (h, w) linearly, so that they do not ring."""
+    """The photo (h, w, 3) resampled through `remap_tables` with a cubic kernel; masks (h, w) linearly, to avoid ringing."""
     kernel = cv2.INTER_LINEAR if mask else cv2.INTER_CUBIC
     return np.asarray(cv2.remap(image, tables[0], tables[1], kernel, borderMode=cv2.BORDER_REPLICATE), np.uint8)
 
 
-def lens_key(camera: Camera) -> tuple[float, ...]:
-    """Cameras with the same key share one set of tables."""
+def intrinsics_key(camera: Camera) -> tuple[float, ...]:
+    """Intrinsics as a key: cameras with equal keys share one set of `remap_tables`."""
     return (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy, *camera.distortion)

@@ -1,1 +1,1 @@
-"""Known poses in all formats that are read, and the frame that all later steps work in."""
+"""Known poses in all supported formats, and normalisation to the unit frame."""

@@ -5,6 +5,7 @@ COLMAP's cameras are world→camera with OpenCV axes and pixel centres at +.5, a
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -12,11 +13,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gsbake.capture.poses.frames import Given, PhotoSize, collect, rigid
+from gsbake.capture.poses.frames import MAX_TRANSLATION, GivenPoses, PhotoSize, checked_rigid, match_cameras
 from gsbake.errors import BadInputError
 from gsbake.geometry.cameras import Camera
+from gsbake.limited_process import Limits, ParserFailedError, run_limited
 
-#: Camera model → places of its parameters among fx, fy, cx, cy, k1, k2, p1, p2, k3, k4, k5, k6.
+#: Camera model → index of each of fx, fy, cx, cy, k1, k2, p1, p2, k3, k4, k5, k6 in COLMAP's parameters, as far as the model has them.
 _LAYOUT = {
     "SIMPLE_PINHOLE": (0, 0, 1, 2),
     "PINHOLE": (0, 1, 2, 3),
@@ -27,8 +29,12 @@ _LAYOUT = {
 }
 
 
+#: Address space of the process that reads a model: at least, and per byte of the model. Seconds it may take.
+MIN_READER_MEMORY, READER_MEMORY_FACTOR, READER_SECONDS = 2 << 30, 40, 600.0
+
+
 def intrinsics(model: str, params: Any, where: str) -> dict[str, Any]:
-    """fx, fy, cx, cy and OpenCV distortion of a COLMAP camera; BadInputError for models that are not perspective."""
+    """fx, fy, cx, cy and OpenCV distortion of a COLMAP camera; raises BadInputError for models that are not perspective."""
     if model not in _LAYOUT:
         raise BadInputError(f"The camera model {model} in {where} is not supported; undistort the photos first (colmap image_undistorter).")
     values = [float(params[i]) for i in _LAYOUT[model]]
@@ -38,38 +44,53 @@ def intrinsics(model: str, params: Any, where: str) -> dict[str, Any]:
 
 
 def camera_of(image: Any, name: str, where: str) -> Camera:
-    """Our camera for an image of a pycolmap reconstruction that has a pose."""
+    """The `Camera` of a registered image of a pycolmap reconstruction."""
     pose = image.cam_from_world()
-    rot, t = rigid(np.asarray(pose.rotation.matrix(), float), np.asarray(pose.translation, float), name, where)
+    rot, t = checked_rigid(np.asarray(pose.rotation.matrix(), float), np.asarray(pose.translation, float), name, where)
     lens = image.camera
     return Camera(name=name, width=lens.width, height=lens.height, R=rot, t=t, **intrinsics(lens.model_name, lens.params, where))
 
 
-def read_model(folder: Path, sizes: Mapping[str, PhotoSize]) -> Given:
-    """Poses and points of a COLMAP model folder.
+def read_model(folder: Path, sizes: Mapping[str, PhotoSize]) -> GivenPoses:
+    """Poses and points of a stranger's COLMAP model folder, read in a child process with limited memory and time.
 
-    Raises BadInputError for files that are broken or hold NaN, and for camera models that are not perspective.
+    Raises BadInputError for damaged files, values that are not finite or out of bounds, and camera models that are not perspective.
     """
-    model = _open(folder)
-    frames = [(im.name, camera_of(im, im.name, str(folder))) for im in model.images.values() if im.has_pose]
+    total = sum(path.stat().st_size for path in folder.iterdir() if path.is_file())
+    limits = Limits(memory=MIN_READER_MEMORY + READER_MEMORY_FACTOR * total, seconds=READER_SECONDS)
+    with tempfile.TemporaryDirectory(prefix="gsbake-colmap-") as scratch:
+        target = Path(scratch) / "model.npz"
+        try:
+            listed = run_limited("gsbake.capture.poses.colmap_reader", [str(folder), str(target)], limits)
+        except ParserFailedError as error:
+            raise BadInputError(f"The COLMAP model {folder} cannot be read ({error}).") from error
+        with np.load(target, allow_pickle=False) as body:
+            arrays = {name: body[name] for name in body.files}
+    frames = []
+    for k, (name, model) in enumerate(zip(listed["names"], listed["models"], strict=True)):
+        rot, t = checked_rigid(arrays["rotations"][k], arrays["translations"][k], name, str(folder))
+        width, height = (int(x) for x in arrays["sizes"][k])
+        inner = intrinsics(model, arrays["params"][k], str(folder))
+        frames.append((name, Camera(name=name, width=width, height=height, R=rot, t=t, **inner)))
     if not frames:
         raise BadInputError(f"The COLMAP model {folder} holds no image with a pose.")
-    cameras, missing = collect(frames, sizes, str(folder))
-    points, colours = cloud(model)
-    return Given(cameras, missing, points if len(points) else None, colours if len(points) else None)
+    cameras, missing = match_cameras(frames, sizes, str(folder))
+    finite = np.isfinite(arrays["points"]).all(1) & (np.abs(arrays["points"]) < MAX_TRANSLATION).all(1)
+    points, colours = arrays["points"][finite], arrays["colours"][finite]
+    return GivenPoses(cameras, missing, points if len(points) else None, colours if len(points) else None)
 
 
 def read_tracks(folder: Path) -> tuple[Any, dict[str, NDArray[np.int64]]]:
-    """Points (n, 3) of a COLMAP model folder in its own frame, and the indices of those that each photo shows, by the photo's name
-    without suffix. Raises BadInputError for files that are broken."""
+    """Points (n, 3) of a COLMAP model folder in its own frame, and the indices of the points that each photo shows, by the photo's name
+    without suffix. Raises BadInputError for damaged files."""
     model = _open(folder)
     index = {name: k for k, name in enumerate(model.points3D)}
     points = np.array([p.xyz for p in model.points3D.values()], float).reshape(-1, 3)
-    seen = {
+    visible = {
         Path(image.name).stem: np.array([index[p.point3D_id] for p in image.points2D if p.has_point3D()], np.int64)
         for image in model.images.values()
     }
-    return points, seen
+    return points, visible
 
 
 def _open(folder: Path) -> Any:
@@ -83,9 +104,9 @@ def _open(folder: Path) -> Any:
 
 
 def cloud(model: Any) -> tuple[Any, Any]:
-    """Points (n, 3) of a reconstruction and their colours (n, 3) 8-bit; those that are not finite are left out."""
+    """Points (n, 3) of a reconstruction and their colours (n, 3) 8-bit, without points that are not finite."""
     entries = list(model.points3D.values())
     points = np.array([p.xyz for p in entries], float).reshape(-1, 3)
     colours = np.array([p.color for p in entries], np.uint8).reshape(-1, 3)
-    good = np.isfinite(points).all(1)
-    return points[good], colours[good]
+    finite = np.isfinite(points).all(1)
+    return points[finite], colours[finite]

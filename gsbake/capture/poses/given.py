@@ -1,20 +1,20 @@
-"""Poses that came with the photos, in any of the formats gsbake reads."""
+"""Reader of known poses in any supported format."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from gsbake.capture.poses.frames import Given, PhotoSize
+from gsbake.capture.poses.frames import GivenPoses, PhotoSize
 from gsbake.capture.poses.llff import read_llff
 from gsbake.capture.poses.transforms_json import read_transforms
 
 
-def read_poses(path: Path, listing: Sequence[str], sizes: Mapping[str, PhotoSize]) -> Given:
+def read_poses(path: Path, listing: Sequence[str], sizes: Mapping[str, PhotoSize]) -> GivenPoses:
     """Cameras for the photos, in the frame of the file.
 
-    `path` is a transforms.json, a poses_bounds.npy or a COLMAP model folder; `listing` names all photo files in order (LLFF poses go
-    by order), `sizes` holds the readable ones. Raises BadInputError when the file is broken, a pose is unusable or no frame fits a photo.
+    `path` is a transforms.json, a poses_bounds.npy or a COLMAP model folder; `listing` names all photo files in order (LLFF poses refer to
+    photos by order), `sizes` holds the readable ones. Raises BadInputError when the file or a pose is invalid or no frame matches a photo.
     """
     if path.is_dir():
         from gsbake.capture.poses.colmap_model import read_model

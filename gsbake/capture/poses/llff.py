@@ -10,35 +10,47 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
-from gsbake.capture.poses.frames import Given, PhotoSize, checked_intrinsics, fit_to_photo, rigid
+from gsbake.capture.poses.frames import GivenPoses, PhotoSize, checked_rigid, fit_to_photo
+from gsbake.capture.poses.validation import check_file_size
 from gsbake.errors import BadInputError
 from gsbake.geometry.cameras import Camera
 
 
-def read_llff(path: Path, listing: Sequence[str], sizes: Mapping[str, PhotoSize]) -> Given:
-    """Poses of a poses_bounds.npy; `listing` names all photo files in order, `sizes` has the readable ones.
+def read_llff(path: Path, listing: Sequence[str], sizes: Mapping[str, PhotoSize]) -> GivenPoses:
+    """Poses of a poses_bounds.npy; `listing` names all photo files in order, `sizes` holds the readable ones.
 
-    Raises BadInputError when the rows are not one per photo, for NaN and for a matrix that is no rigid motion.
+    Raises BadInputError when there is not one row per photo, for NaN, and for a matrix that is no rigid motion.
     """
-    try:
-        rows = np.load(path, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
-        raise BadInputError(f"{path} cannot be read as a NumPy array ({error}).") from error
-    if rows.ndim != 2 or rows.shape[1] != 17:
-        raise BadInputError(f"{path} holds an array of shape {rows.shape}; LLFF poses have 17 numbers a photo.")
-    if len(rows) != len(listing):
-        raise BadInputError(f"{path} has {len(rows)} poses but there are {len(listing)} photos; use the photos the poses were made with.")
+    rows = _load(path, len(listing))
     cameras = {}
-    for row, photo in zip(np.asarray(rows, float), listing, strict=True):
+    for row, photo in zip(rows, listing, strict=True):
         matrix = row[:15].reshape(3, 5)
         down, right, back, centre = matrix[:, 0], matrix[:, 1], matrix[:, 2], matrix[:, 3]
-        rot, centre = rigid(np.stack([right, down, -back], 1), centre, photo, str(path))
-        height, width, focal = matrix[:, 4]
+        rot, centre = checked_rigid(np.stack([right, down, -back], 1), centre, photo, str(path))
+        height, width, focal = (float(x) for x in matrix[:, 4])
         if not np.isfinite(matrix[:, 4]).all() or min(height, width) < 1:
-            raise BadInputError(f"The intrinsics of frame {photo} in {path} are unusable.")
+            raise BadInputError(f"The intrinsics of frame {photo} in {path} are invalid.")
         if photo not in sizes:
             continue
         camera = Camera(photo, round(width), round(height), focal, focal, width / 2, height / 2, rot.T, -rot.T @ centre)
-        cameras[photo] = checked_intrinsics(fit_to_photo(camera, sizes[photo], str(path)), str(path))
-    return Given(cameras)
+        cameras[photo] = fit_to_photo(camera, sizes[photo], str(path))
+    return GivenPoses(cameras)
+
+
+def _load(path: Path, count: int) -> NDArray[np.float64]:
+    """The array (count, 17) of the file, whose header is checked before the data are read."""
+    check_file_size(path)
+    try:
+        with path.open("rb") as file:
+            version = np.lib.format.read_magic(file)
+            read_header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+            shape, _, dtype = read_header(file)
+            if len(shape) != 2 or shape[1] != 17 or dtype.kind not in "fiu":
+                raise BadInputError(f"{path} holds an array of shape {shape} of {dtype}; LLFF poses have 17 numbers per photo.")
+            if shape[0] != count:
+                raise BadInputError(f"{path} has {shape[0]} poses but there are {count} photos; use the photos the poses were made with.")
+        return np.asarray(np.load(path, allow_pickle=False), np.float64)
+    except (OSError, ValueError, EOFError, SyntaxError, TypeError, OverflowError, RecursionError, MemoryError) as error:
+        raise BadInputError(f"{path} cannot be read as a NumPy array ({' '.join(str(error).split())[:200]}).") from error

@@ -1,7 +1,7 @@
-"""The similarity between the world and the unit frame, in which the object fills most of the unit sphere.
+"""Normalisation to the unit frame: the similarity that maps the object into the unit sphere.
 
-With masks the visual hull says where the object is; without, what the cameras look at does: the point closest to all optical axes,
-and around it the points that most photos show.
+The object is located by the visual hull of the masks. Without masks it is located by the point nearest to all optical axes and the tie
+points around it that most photos show.
 """
 
 from __future__ import annotations
@@ -15,29 +15,30 @@ from gsbake.capture.hull.visual_hull import Hull
 from gsbake.capture.photos.decode import Bytes
 from gsbake.geometry.cameras import Array, Camera, Similarity
 
-#: Radius of the object in the unit frame: a margin of 10 % stays to the unit sphere.
+#: Radius of the object in the unit frame: leaves a margin of 10 % to the unit sphere.
 UNIT_RADIUS = 0.9
-_COARSE, _FINE = 48, 96
-_PASSES = 4
+#: Cells along the edge of the hull in the first and in later passes, and the most passes.
+_COARSE_CELLS, _FINE_CELLS = 48, 96
+_MAX_PASSES = 4
 
 
 @dataclass(frozen=True)
-class Extent:
-    """A ball around the object: `centre` (3,) and `radius` in world units, and how it was found, in words."""
+class BoundingSphere:
+    """Bounding sphere of the object: `centre` (3,) and `radius` in world units, and the evidence it is based on."""
 
     centre: Array
     radius: float
     evidence: str
 
     def similarity(self) -> Similarity:
-        """unit → world."""
+        """The map from the unit frame to the world."""
         return Similarity(self.radius / UNIT_RADIUS, np.eye(3), np.asarray(self.centre, float))
 
 
-def looked_at(cameras: Sequence[Camera]) -> Array:
-    """The point (3,) closest to the optical axes of all cameras, by least squares with outlying cameras weighted down.
+def nearest_point_to_axes(cameras: Sequence[Camera]) -> Array:
+    """The point (3,) nearest to the optical axes of all cameras, by iteratively reweighted least squares (Cauchy weights).
 
-    Of parallel axes the point is the one nearest to the cameras' mean position.
+    For parallel axes, the solution nearest to the cameras' mean position.
     """
     directions = np.stack([c.view_direction for c in cameras])
     centres = np.stack([c.centre for c in cameras])
@@ -55,21 +56,21 @@ def looked_at(cameras: Sequence[Camera]) -> Array:
 
 
 def _frame_radius(camera: Camera, point: Array) -> float:
-    """Radius of the ball around `point` that just fits the camera's shorter side; inf when the point is behind the camera."""
+    """Radius of the sphere around `point` that fits the camera's shorter side; inf when the point is behind the camera."""
     depth = float((camera.R @ point + camera.t)[2])
     return depth * 0.5 * min(camera.width / camera.fx, camera.height / camera.fy) if depth > 0 else np.inf
 
 
-def extent_from_view(cameras: Sequence[Camera], points: Array | None) -> Extent:
-    """The ball that the cameras look at, from their axes and the SfM points (n, 3) most of them show."""
-    point = looked_at(cameras)
+def bounding_sphere_from_views(cameras: Sequence[Camera], points: Array | None) -> BoundingSphere:
+    """Bounding sphere from the optical axes and the tie points (n, 3) that most cameras show."""
+    point = nearest_point_to_axes(cameras)
     distances = np.array([np.linalg.norm(c.centre - point) for c in cameras])
     fits = np.array([_frame_radius(c, point) for c in cameras])
     fits = fits[np.isfinite(fits)]
-    if not fits.size:  # cameras that look apart: take in what lies in front of them
+    if not fits.size:  # the axes diverge: fall back to the camera positions
         centres = np.stack([c.centre for c in cameras])
         spread = float(np.linalg.norm(centres - centres.mean(0), axis=1).max())
-        return Extent(centres.mean(0), max(spread, 1e-6), "camera positions")
+        return BoundingSphere(centres.mean(0), max(spread, 1e-6), "camera positions")
     frame = float(np.median(fits))
     limit = 0.9 * max(float(np.quantile(distances, 0.1)), 1e-6)
     if points is not None and len(points) >= 50:
@@ -78,41 +79,41 @@ def extent_from_view(cameras: Sequence[Camera], points: Array | None) -> Extent:
             pixel, depth = camera.project(points)
             inner = np.abs(pixel - (camera.width / 2, camera.height / 2)) < (0.45 * camera.width, 0.45 * camera.height)
             shown += (depth > 0) & inner.all(1)
-        # Objects are framed by both sides of a photo: an upright one reaches farther than the shorter side of a portrait tells.
+        # Both sides of a photo frame the object: a tall object exceeds the sphere that fits the shorter side of a portrait photo.
         reach = 1.2 * frame * float(np.median([(c.width * c.height) ** 0.5 / min(c.width, c.height) for c in cameras]))
         near = np.linalg.norm(points - point, axis=1) < reach
         common = points[near & (shown >= 0.6 * len(cameras))]
         if len(common) >= 50:
             low, high = np.quantile(common, [0.02, 0.98], axis=0)
             centre = 0.5 * (low + high)
-            # Points are found on texture; the object reaches beyond them (a fox's ears, say).
+            # Tie points lie on texture only; the object extends beyond them.
             radius = 1.2 * float(np.quantile(np.linalg.norm(common - centre, axis=1), 0.98))
-            return Extent(centre, min(max(radius, 0.2 * frame), limit, reach), f"{len(common)} points that most photos show")
-    return Extent(point, min(0.85 * frame, limit), "where the cameras look")
+            return BoundingSphere(centre, min(max(radius, 0.2 * frame), limit, reach), f"{len(common)} points that most photos show")
+    return BoundingSphere(point, min(0.85 * frame, limit), "optical axes of the cameras")
 
 
-def extent_from_masks(cameras: Sequence[Camera], masks: Sequence[Bytes]) -> Extent | None:
-    """The ball around the visual hull, or None when the masks leave nothing (wrong masks or wrong poses).
+def bounding_sphere_from_masks(cameras: Sequence[Camera], masks: Sequence[Bytes]) -> BoundingSphere | None:
+    """Bounding sphere of the visual hull, or None when the hull is empty (wrong masks or wrong poses).
 
-    `masks` (h, w) have their cameras' sizes. The hull is carved coarsely in all that the cameras see and again in the ball found, until
-    that stands still.
+    `masks` (h, w) have their cameras' sizes. The hull is carved coarsely in the common field of view, then repeatedly in its own bounding
+    sphere until that converges.
     """
-    centre = looked_at(cameras)
+    centre = nearest_point_to_axes(cameras)
     fits = [_frame_radius(c, centre) for c in cameras]
     finite = [f for f in fits if np.isfinite(f)]
     if not finite:
         return None
     radius = 2.0 * float(np.median(finite))
-    for step in range(_PASSES):
-        hull = Hull.of(cameras, masks, centre, radius, _FINE if step else _COARSE)
+    for step in range(_MAX_PASSES):
+        hull = Hull.from_masks(cameras, masks, centre, radius, _FINE_CELLS if step else _COARSE_CELLS)
         if hull.empty:
             return None
-        where = hull.lower + (np.argwhere(hull.occupancy) + 0.5) * hull.cell
-        low, high = where.min(0), where.max(0)
+        occupied = hull.lower + (np.argwhere(hull.occupancy) + 0.5) * hull.cell
+        low, high = occupied.min(0), occupied.max(0)
         centre = 0.5 * (low + high)
-        tight = float(np.linalg.norm(where - centre, axis=1).max()) + 0.5 * hull.cell
-        done = step > 0 and tight > 0.75 * radius
+        tight = float(np.linalg.norm(occupied - centre, axis=1).max()) + 0.5 * hull.cell
+        converged = step > 0 and tight > 0.75 * radius
         radius = 1.1 * tight
-        if done:
+        if converged:
             break
-    return Extent(centre, radius / 1.1, f"visual hull of {len(masks)} masks")
+    return BoundingSphere(centre, radius / 1.1, f"visual hull of {len(masks)} masks")

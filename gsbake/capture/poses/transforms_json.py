@@ -1,43 +1,84 @@
 """`transforms.json` of NeRF, instant-ngp and nerfstudio: camera-to-world matrices with OpenGL axes.
 
-Intrinsics stand at the top or in a frame (which wins): `fl_x, fl_y, cx, cy, w, h, k1..k3, p1, p2`, or only `camera_angle_x`.
-The world is kept as it came. See https://docs.nerf.studio/quickstart/data_conventions.html.
+Intrinsics are global or per frame (which takes precedence): `fl_x, fl_y, cx, cy, w, h, k1..k3, p1, p2`, or only `camera_angle_x`.
+The world frame is unchanged. See https://docs.nerf.studio/quickstart/data_conventions.html.
 """
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from pydantic import Field, ValidationError
 
-from gsbake.capture.poses.frames import Given, PhotoSize, collect, match_frame, rigid
+from gsbake.capture.poses.frames import GivenPoses, PhotoIndex, PhotoSize, checked_rigid, match_cameras
+from gsbake.capture.poses.validation import (
+    MAX_FRAMES,
+    Angle,
+    Coefficient,
+    Coordinate,
+    Focal,
+    Principal,
+    Size,
+    Strict,
+    check_file_size,
+    first_error,
+)
 from gsbake.errors import BadInputError
 from gsbake.geometry.cameras import Camera
 
 _MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE")
 
 
-def _intrinsics(frame: Mapping[str, Any], shared: Mapping[str, Any], name: str, size: PhotoSize | None, source: str) -> dict[str, Any]:
-    def value(*keys: str) -> float | None:
-        for holder in (frame, shared):
-            for key in keys:
-                if holder.get(key) is not None:
-                    return float(holder[key])
-        return None
+class _Intrinsics(Strict):
+    """Intrinsics as they may stand at a frame or at the top of the file."""
 
-    model = str(frame.get("camera_model", shared.get("camera_model", "OPENCV"))).upper()
-    if model not in _MODELS or shared.get("is_fisheye"):
-        raise BadInputError(f"The camera model {model} of frame {name} in {source} is not a perspective one; undistort the photos first.")
+    camera_model: str | None = Field(None, max_length=100)
+    fl_x: Focal | None = None
+    fl_y: Focal | None = None
+    cx: Principal | None = None
+    cy: Principal | None = None
+    w: Size | None = None
+    h: Size | None = None
+    camera_angle_x: Angle | None = None
+    camera_angle_y: Angle | None = None
+    k1: Coefficient | None = None
+    k2: Coefficient | None = None
+    k3: Coefficient | None = None
+    k4: Coefficient | None = None
+    p1: Coefficient | None = None
+    p2: Coefficient | None = None
+
+
+class _Frame(_Intrinsics):
+    file_path: str = Field(min_length=1, max_length=4096)
+    transform_matrix: list[list[Coordinate]] = Field(max_length=4)
+
+
+class _Transforms(_Intrinsics):
+    is_fisheye: bool = False
+    frames: list[_Frame] = Field(max_length=MAX_FRAMES)
+
+
+def _intrinsics(frame: _Frame, shared: _Transforms, size: PhotoSize | None, source: str) -> dict[str, Any]:
+    """Width, height, focal lengths, principal point and distortion of a frame."""
+
+    def value(key: str) -> float | None:
+        own: float | None = getattr(frame, key)
+        common: float | None = getattr(shared, key)
+        return common if own is None else own
+
+    name, model = frame.file_path, (frame.camera_model or shared.camera_model or "OPENCV").upper()
+    if model not in _MODELS or shared.is_fisheye:
+        raise BadInputError(f"The camera model {model} of frame {name} in {source} is not a perspective model; undistort the photos first.")
     if value("k4"):
         raise BadInputError(f"Frame {name} in {source} has a distortion k4, which is not supported; undistort the photos first.")
     width, height = value("w"), value("h")
     if width is None or height is None:
-        if size is None:  # the frame has no photo, so that its size does not matter
-            size = PhotoSize(1, 1)
+        size = size or PhotoSize(1, 1)  # the frame has no photo, so its size is not used
         width, height = float(size.width), float(size.height)
     fx, fy = value("fl_x"), value("fl_y")
     angle_x, angle_y = value("camera_angle_x"), value("camera_angle_y")
@@ -64,31 +105,37 @@ def _intrinsics(frame: Mapping[str, Any], shared: Mapping[str, Any], name: str, 
     }
 
 
-def read_transforms(path: Path, sizes: Mapping[str, PhotoSize]) -> Given:
-    """Poses of a transforms.json for the photos whose `sizes` are given.
+def _frame_name(error: ValidationError) -> str:
+    """The number of the frame that an error is about (from 1), for the start of a message; empty when it is about none."""
+    location = error.errors(include_url=False, include_context=False, include_input=False)[0]["loc"]
+    return f"Frame {location[1] + 1}: " if len(location) > 1 and isinstance(location[1], int) else ""
 
-    Raises BadInputError for what is no such file, for NaN, for a matrix that is no rigid motion, and for a fisheye camera.
+
+def read_transforms(path: Path, sizes: Mapping[str, PhotoSize]) -> GivenPoses:
+    """Poses of a transforms.json for the photos in `sizes`.
+
+    Raises BadInputError for an invalid file, a value that is not finite or out of bounds, a matrix that is no rigid motion, and a fisheye
+    camera.
     """
+    check_file_size(path)
     try:
-        body = json.loads(path.read_text(encoding="utf-8"))
-        listed = body["frames"]
-        pairs = [(str(f["file_path"]), f) for f in listed]
-    except (ValueError, KeyError, TypeError, UnicodeDecodeError) as error:
-        raise BadInputError(f"{path} is no transforms.json with frames that name their file_path ({error}).") from error
-    frames = []
-    for file, frame in pairs:
-        try:
-            matrix = np.asarray(frame["transform_matrix"], float)
-        except (KeyError, TypeError, ValueError) as error:
-            raise BadInputError(f"Frame {file} in {path} has no numeric transform_matrix.") from error
-        if matrix.shape not in ((4, 4), (3, 4)):
-            raise BadInputError(f"The transform_matrix of frame {file} in {path} is {matrix.shape}, not 4x4.")
-        if matrix.shape == (4, 4) and not np.allclose(matrix[3], (0, 0, 0, 1), atol=1e-6):
+        body = _Transforms.model_validate_json(path.read_bytes())
+    except ValidationError as error:
+        raise BadInputError(f"{_frame_name(error)}{path} is not a valid transforms.json ({first_error(error)}).") from error
+    except OSError as error:
+        raise BadInputError(f"{path} cannot be read ({error.strerror}).") from error
+    frames, index = [], PhotoIndex(sizes)
+    for frame in body.frames:
+        file, rows = frame.file_path, frame.transform_matrix
+        if len(rows) not in (3, 4) or any(len(row) != 4 for row in rows):
+            raise BadInputError(f"The transform_matrix of frame {file} in {path} is not 4x4.")
+        matrix = np.asarray(rows, float)
+        if len(rows) == 4 and not np.allclose(matrix[3], (0, 0, 0, 1), atol=1e-6):
             raise BadInputError(f"The pose of frame {file} in {path} is no rigid motion: its last row is {matrix[3].tolist()}.")
-        rot, centre = rigid(matrix[:3, :3], matrix[:3, 3], file, str(path))
+        rot, centre = checked_rigid(matrix[:3, :3], matrix[:3, 3], file, str(path))
         R, t = Camera.pose_from_opengl(np.concatenate([rot, centre[:, None]], 1))
-        photo = match_frame(file, sizes)
-        inner = _intrinsics(frame, body, file, None if photo is None else sizes[photo], str(path))
+        photo = index.match(file)
+        inner = _intrinsics(frame, body, None if photo is None else sizes[photo], str(path))
         frames.append((file, Camera(name=file, R=R, t=t, **inner)))
-    cameras, missing = collect(frames, sizes, str(path))
-    return Given(cameras, missing)
+    cameras, missing = match_cameras(frames, sizes, str(path))
+    return GivenPoses(cameras, missing)

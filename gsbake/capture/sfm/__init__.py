@@ -1,1 +1,1 @@
-"""Structure from motion with COLMAP, in a process of its own."""
+"""Structure from motion with COLMAP, in a separate process."""

@@ -1,8 +1,7 @@
-"""The one door to pycolmap.
+"""The only import of pycolmap in gsbake.
 
-pycolmap 4.1.0–4.2.1 corrupts zlib when it is loaded first: the next PNG written in the process aborts. Importing zlib before it cures
-that, so nothing else in gsbake imports pycolmap. Heavy work (features, matching, mapping) runs in a process of its own all the same, see
-`gsbake.capture.sfm.process`.
+pycolmap 4.1.0–4.2.1 corrupts zlib when it is loaded first: the next PNG written in the process aborts. Importing zlib before it avoids
+this, so no other module imports pycolmap. Features, matching and mapping run in a separate process, see `gsbake.capture.sfm.process`.
 """
 
 from __future__ import annotations

@@ -1,10 +1,9 @@
-"""Which photos to match with which, before the costly matching of all their features.
+"""Selection of the photo pairs whose features are matched.
 
-Small captures are matched exhaustively. Larger ones first match only the largest-scale features of each photo ("preemptive matching":
-Wu, *Towards linear-time incremental structure from motion*, 3DV 2013), which costs a hundredth, and keep each photo's best partners.
-Very large ones rank partners by VLAD descriptors (Jégou et al., CVPR 2010) over a vocabulary learnt from the capture itself: no
-vocabulary file has to be downloaded, and none that was trained on other pictures can mislead. Photos that follow each other by name
-are always matched.
+Small captures are matched exhaustively. Larger ones rank pairs by matches among the largest-scale features of each photo ("preemptive
+matching": Wu, *Towards linear-time incremental structure from motion*, 3DV 2013), at a hundredth of the cost. Very large ones rank pairs
+by VLAD descriptors (Jégou et al., CVPR 2010) over a vocabulary trained on the capture itself, so that no vocabulary file is needed. Photos
+that are adjacent by name are always matched.
 """
 
 from __future__ import annotations
@@ -18,19 +17,20 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float32]
 Pair = tuple[int, int]
 
-#: Exhaustive matching up to this many photos, preemptive ranking up to the second figure, VLAD beyond.
-EXHAUSTIVE_UP_TO = 40
-RANKED_UP_TO = 500
-#: Partners kept per photo, and neighbours by name that are matched in any case.
+#: Exhaustive matching up to this many photos, preemptive ranking up to the second number, VLAD beyond.
+MAX_EXHAUSTIVE_PHOTOS = 40
+MAX_RANKED_PHOTOS = 500
+#: Best-ranked partners per photo, and neighbours by name on either side that are always matched.
 PARTNERS = 16
-NEIGHBOURS = 3
-#: Neighbours by name of video frames in sequential matching (then 2, 4, 8… photos away up to this power).
-SEQUENCE = 10
-_RATIO = 0.85
+NAME_NEIGHBOURS = 3
+#: Neighbours by name of video frames in sequential matching, which adds those 2, 4, 8… photos away up to this power.
+SEQUENTIAL_OVERLAP = 10
+#: Largest ratio of the distances to the best and the second-best match (Lowe, IJCV 2004).
+_MAX_RATIO = 0.85
 
 
 def is_sequence(names: Sequence[str]) -> bool:
-    """Whether names end in numbers that mostly count up by one constant step, as video frames and camera series do."""
+    """Whether names end in numbers that mostly increase by a constant step, as video frames and camera series do."""
     numbers = [int(m.group(1)) for name in names if (m := re.search(r"(\d+)\D*$", name))]
     if len(numbers) < max(3, 0.9 * len(names)):
         return False
@@ -43,8 +43,8 @@ def exhaustive(count: int) -> list[Pair]:
     return [(i, j) for i in range(count) for j in range(i + 1, count)]
 
 
-def sequential(count: int, overlap: int = SEQUENCE) -> list[Pair]:
-    """Pairs up to `overlap` apart, and those 2^k apart up to 2^overlap, of photos in order."""
+def sequential(count: int, overlap: int = SEQUENTIAL_OVERLAP) -> list[Pair]:
+    """Pairs of photos up to `overlap` apart in order, and 2^k apart up to 2^overlap."""
     gaps = sorted({*range(1, overlap + 1), *(2**k for k in range(overlap + 1))})
     return [(i, i + gap) for gap in gaps for i in range(max(count - gap, 0))]
 
@@ -54,17 +54,17 @@ def _unit(descriptors: NDArray[np.uint8]) -> Floats:
     return flat / np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-6)
 
 
-def strongest(descriptors: NDArray[np.uint8], scales: Floats, count: int) -> Floats:
+def largest_features(descriptors: NDArray[np.uint8], scales: Floats, count: int) -> Floats:
     """Unit descriptors (≤ count, 128) of the largest features."""
     keep = np.argsort(-scales, kind="stable")[:count]
     return _unit(descriptors[keep])
 
 
 def preemptive_scores(features: Sequence[Floats], tick: Callable[[int, int], None] | None = None) -> NDArray[np.float64]:
-    """Symmetric (n, n) numbers of mutual nearest neighbours among few features per photo that pass the ratio test."""
+    """Symmetric (n, n) counts of mutual nearest neighbours between the features of two photos that pass the ratio test."""
     n = len(features)
     scores = np.zeros((n, n))
-    limit = np.float32(_RATIO**2)
+    limit = np.float32(_MAX_RATIO**2)
     for i in range(n):
         for j in range(i + 1, n):
             if min(len(features[i]), len(features[j])) < 2:
@@ -84,7 +84,7 @@ def preemptive_scores(features: Sequence[Floats], tick: Callable[[int, int], Non
 
 
 def vlad_scores(features: Sequence[Floats], seed: int, words: int = 64) -> NDArray[np.float64]:
-    """Symmetric (n, n) cosines of VLAD vectors over a vocabulary of `words` learnt from the same features."""
+    """Symmetric (n, n) cosines of VLAD vectors over a vocabulary of `words` trained on the same features."""
     from scipy.cluster.vq import kmeans2
 
     rng = np.random.default_rng(seed)
@@ -93,10 +93,10 @@ def vlad_scores(features: Sequence[Floats], seed: int, words: int = 64) -> NDArr
     words = min(words, len(sample))
     centres, _ = kmeans2(sample, words, iter=10, minit="points", rng=rng)
     vectors = np.zeros((len(features), words, full.shape[1]), np.float32)
-    for vector, own in zip(vectors, features, strict=True):
-        if len(own):
-            word = (own @ centres.T - 0.5 * (centres**2).sum(1)).argmax(1)
-            np.add.at(vector, word, own - centres[word])
+    for vector, descriptors in zip(vectors, features, strict=True):
+        if len(descriptors):
+            word = (descriptors @ centres.T - 0.5 * (centres**2).sum(1)).argmax(1)
+            np.add.at(vector, word, descriptors - centres[word])
     vectors /= np.maximum(np.linalg.norm(vectors, axis=2, keepdims=True), 1e-6)  # intra-normalised: no word dominates
     flat = vectors.reshape(len(features), -1)
     flat /= np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-6)
@@ -104,7 +104,8 @@ def vlad_scores(features: Sequence[Floats], seed: int, words: int = 64) -> NDArr
 
 
 def best_pairs(scores: NDArray[np.float64], partners: int, neighbours: int) -> list[Pair]:
-    """Each photo's best `partners` by score, its `neighbours` by order on either side, and a spanning tree so that no group is cut off."""
+    """Each photo's best `partners` by score, its `neighbours` in order on either side, and a maximum spanning tree, so that the graph is
+    connected."""
     from scipy.sparse.csgraph import minimum_spanning_tree
 
     n = len(scores)
@@ -120,29 +121,31 @@ def best_pairs(scores: NDArray[np.float64], partners: int, neighbours: int) -> l
     return sorted(pairs)
 
 
-def choose_matching(wanted: str, names: Sequence[str]) -> tuple[str, str]:
-    """The kind of matching ("exhaustive", "ranked", "sequential" or "vocabulary") and why, in words."""
+def choose_matching(setting: str, names: Sequence[str]) -> tuple[str, str]:
+    """The kind of matching ("exhaustive", "ranked", "sequential" or "vocabulary") and the evidence."""
     count = len(names)
-    if wanted != "auto":
-        return wanted, "as set"
-    if count <= EXHAUSTIVE_UP_TO:
-        return "exhaustive", f"{count} photos are few enough for all pairs"
-    if count <= RANKED_UP_TO:
-        return "ranked", f"{count} photos: best {PARTNERS} partners of each by their largest features"
+    if setting != "auto":
+        return setting, "set by the profile"
+    if count <= MAX_EXHAUSTIVE_PHOTOS:
+        return "exhaustive", f"{count} photos, at most {MAX_EXHAUSTIVE_PHOTOS}: all pairs"
+    if count <= MAX_RANKED_PHOTOS:
+        return "ranked", f"{count} photos: best {PARTNERS} partners of each by matches of the largest features"
     if is_sequence(names):
-        return "sequential", f"{count} photos named like video frames, with loops found by a vocabulary"
-    return "vocabulary", f"{count} photos: partners by a vocabulary learnt from them"
+        return "sequential", f"{count} photos with consecutive names, loops by VLAD"
+    return "vocabulary", f"{count} photos: best partners of each by VLAD"
 
 
-def near_views(centres: NDArray[np.float64], directions: NDArray[np.float64], partners: int = PARTNERS, widest: float = 75.0) -> list[Pair]:
-    """Pairs of cameras with known poses that look alike: the `partners` nearest by angle and place, at most `widest` degrees apart.
+def neighbouring_views(
+    centres: NDArray[np.float64], directions: NDArray[np.float64], partners: int = PARTNERS, max_angle: float = 75.0
+) -> list[Pair]:
+    """Pairs of cameras with known poses: each one's `partners` nearest by angle and position, at most `max_angle` degrees apart.
 
     centres (n, 3), directions (n, 3) unit view directions.
     """
     cosine = directions @ directions.T
-    gap = np.linalg.norm(centres[:, None] - centres[None], axis=2)
-    cost = (1 - cosine) + gap / max(float(gap.max()), 1e-12)
-    cost[cosine < np.cos(np.radians(widest))] = np.inf
+    distance = np.linalg.norm(centres[:, None] - centres[None], axis=2)
+    cost = (1 - cosine) + distance / max(float(distance.max()), 1e-12)
+    cost[cosine < np.cos(np.radians(max_angle))] = np.inf
     np.fill_diagonal(cost, np.inf)
     pairs: set[Pair] = set()
     for i, row in enumerate(cost):

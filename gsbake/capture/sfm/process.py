@@ -1,4 +1,4 @@
-"""Starting and watching the COLMAP process (`solve_worker`) from the poses stage."""
+"""Control of the COLMAP process (`sfm.worker`): start, progress, stop requests and time limit."""
 
 from __future__ import annotations
 
@@ -15,19 +15,20 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from gsbake.errors import GsbakeError
+from gsbake.errors import GsbakeError, InterruptedRun
 from gsbake.python_process import python_command, python_environment
 
-_POLL = 0.2  # seconds between looks at stop requests
+#: Seconds between checks for stop requests.
+_POLL_SECONDS = 0.2
 
 
 class SolveFailedError(GsbakeError):
-    """The COLMAP process ended without a result; the message ends with the last line it logged."""
+    """The COLMAP process ended without a result; the message ends with the last line of its log."""
 
 
 @dataclass(frozen=True)
-class Watch:
-    """What to do while COLMAP runs: take progress (part, done, total), and tell whether to stop."""
+class JobCallbacks:
+    """Callbacks while COLMAP runs: `progress` receives (part, done, total), `stop` returns whether to stop."""
 
     progress: Callable[[str, int, int], None]
     stop: Callable[[], bool]
@@ -39,9 +40,9 @@ def _kill(child: subprocess.Popen[bytes]) -> None:
     child.wait()
 
 
-class _Log:
-    """Progress from COLMAP's log, since its long calls take no callback. (Its database must not be read meanwhile: a second SQLite in
-    the same process breaks the first one's locks.)"""
+class _LogProgress:
+    """Progress read from COLMAP's log, since its long calls take no callback. (Reading its database instead is invalid: a second SQLite
+    in the same process breaks the locks of the first.)"""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -49,12 +50,12 @@ class _Log:
         self._part, self._total, self._files = "", 0, 0
 
     def begin(self, part: str, total: int) -> None:
-        """A part began; what the log counts from now on belongs to it."""
+        """Attribute the counts of the log from now on to this part."""
         if part != self._part:
             self._part, self._total, self._files = part, total, 0
 
     def poll(self) -> tuple[str, int, int] | None:
-        """What has been done of the current part, when the log says so."""
+        """Progress (part, done, total) of the current part, or None when the log has no new count."""
         with self._path.open("rb") as file:
             file.seek(self._offset)
             text = file.read()
@@ -72,18 +73,19 @@ def _last_line(log: Path) -> str:
     return lines[-1] if lines else "no message"
 
 
-def run_job(job: Mapping[str, Any], out: Path, watch: Watch, limit: float | None = None) -> dict[str, Any] | None:
-    """Run a job of `solve_worker`, its result in the folder `out`; None when it was stopped or took longer than `limit` seconds.
+def run_job(job: Mapping[str, Any], out: Path, callbacks: JobCallbacks, limit: float | None = None) -> dict[str, Any] | None:
+    """Run a job of `sfm.worker` with its result in the folder `out`; None when it was stopped on request.
 
-    Raises SolveFailedError when the process crashes or fails.
+    Raises InterruptedRun when the process was killed, ran out of memory or disk, or took longer than `limit` seconds: that is no answer
+    and must not be stored as one. Raises SolveFailedError when it failed otherwise.
     """
     out.mkdir(parents=True, exist_ok=True)
-    order = out / "job.json"
-    order.write_text(json.dumps({**job, "out": str(out)}))
+    job_file = out / "job.json"
+    job_file.write_text(json.dumps({**job, "out": str(out)}))
     log = out / "colmap.log"
-    counted = _Log(log)
+    log_progress = _LogProgress(log)
     deadline = None if limit is None else time.monotonic() + limit
-    command = python_command("-m", "gsbake.capture.sfm.worker", str(order), str(os.getpid()))
+    command = python_command("-m", "gsbake.capture.sfm.worker", str(job_file), str(os.getpid()))
     with log.open("wb") as sink:
         child = subprocess.Popen(
             command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=sink, env=python_environment(), start_new_session=True
@@ -91,31 +93,36 @@ def run_job(job: Mapping[str, Any], out: Path, watch: Watch, limit: float | None
     try:
         assert child.stdout is not None
         os.set_blocking(child.stdout.fileno(), False)
-        with selectors.DefaultSelector() as ready:
-            ready.register(child.stdout, selectors.EVENT_READ)
+        with selectors.DefaultSelector() as selector:
+            selector.register(child.stdout, selectors.EVENT_READ)
             rest = b""
             while True:
-                if watch.stop() or (deadline is not None and time.monotonic() > deadline):
+                if callbacks.stop():
                     return None
-                if not ready.select(_POLL):
-                    if (done := counted.poll()) is not None:
-                        watch.progress(*done)
+                if deadline is not None and time.monotonic() > deadline:
+                    raise InterruptedRun(f"Structure from motion took longer than {limit:.0f} s; run the same command on an idle machine.")
+                if not selector.select(_POLL_SECONDS):
+                    if (progress := log_progress.poll()) is not None:
+                        callbacks.progress(*progress)
                     continue
                 data = child.stdout.read()
                 if data == b"":
                     break
                 *lines, rest = (rest + (data or b"")).split(b"\n")
                 for line in lines:
-                    with suppress(ValueError, KeyError, TypeError):  # anything else a library prints
-                        note = json.loads(line)
-                        counted.begin(note["part"], note["total"])
-                        watch.progress(note["part"], note["done"], note["total"])
+                    with suppress(ValueError, KeyError, TypeError):  # output of libraries
+                        report = json.loads(line)
+                        log_progress.begin(report["part"], report["total"])
+                        callbacks.progress(report["part"], report["done"], report["total"])
         code = child.wait()
     finally:
         _kill(child)
         if child.stdout is not None:
             child.stdout.close()
     result = out / "result.json"
+    if code < 0 or code == InterruptedRun.exit_code:
+        reason = f"was ended by {signal.Signals(-code).name}" if code < 0 else f"failed ({_last_line(log)})"
+        raise InterruptedRun(f"Structure from motion {reason}; the same command resumes it; free memory and disk if it fails again.")
     if code != 0 or not result.exists():
-        raise SolveFailedError(f"Structure from motion ended with code {code}: {_last_line(log)}")
+        raise SolveFailedError(f"Structure from motion failed ({_last_line(log)}); its log is '{log}'.")
     return dict(json.loads(result.read_text()))

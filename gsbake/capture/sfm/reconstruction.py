@@ -1,7 +1,7 @@
-"""Structure from motion with COLMAP (Schönberger, Frahm, *Structure-from-Motion Revisited*, CVPR 2016), as the steps of one database.
+"""Structure from motion with COLMAP (Schönberger, Frahm, *Structure-from-Motion Revisited*, CVPR 2016) on one database.
 
-Features (SIFT), pairs, matches, mapping in two passes: strict thresholds build a sound core; if photos are missing they are matched
-with all others and registered to it under weaker thresholds. Runs inside the process of `solve_worker`.
+Steps: SIFT features, pair selection, matching, mapping in two passes. The first pass uses strict thresholds; photos that it does not
+register are matched with all others and registered to its model under relaxed thresholds. Runs in the process of `sfm.worker`.
 """
 
 from __future__ import annotations
@@ -22,19 +22,19 @@ from gsbake.capture.sfm.colmap import pycolmap
 
 Tick = Callable[[str, int, int], None]
 
-#: Thresholds of the second pass: inliers and their share that register a photo (COLMAP's own: 30 and 0.25).
-WEAK_INLIERS, WEAK_SHARE = 15, 0.15
+#: Relaxed thresholds of the second pass: inliers, and their ratio, that register a photo (COLMAP's defaults: 30 and 0.25).
+RELAXED_MIN_INLIERS, RELAXED_MIN_INLIER_RATIO = 15, 0.15
 #: Largest features per photo in the ranking of pairs.
 RANKING_FEATURES = 256
-#: Features per photo with which the finest octave is left out, and the share of photos that may then fail before it is added after all.
-ENOUGH, POOR = 1500, 0.05
-#: Pairs matched between two lines in COLMAP's log, by which `solve` tells the progress.
-BLOCK = 64
+#: Median features per photo from which the finest octave is skipped, and the share of unregistered photos above which it is added again.
+ENOUGH_FEATURES, MAX_UNREGISTERED_SHARE = 1500, 0.05
+#: Pairs matched between two lines of COLMAP's log, from which progress is read.
+MATCHING_BLOCK = 64
 
 
 @dataclass(frozen=True)
 class Lens:
-    """Photos taken with one camera: their names, their size in pixels, and its focal length in pixels where it is roughly known."""
+    """Photos that share intrinsics: their names, their size in pixels, and an initial focal length in pixels where EXIF has one."""
 
     names: tuple[str, ...]
     width: int
@@ -43,17 +43,28 @@ class Lens:
 
 
 @dataclass
-class Solver:
-    """One SfM run: photos `folder/<name>.png`, masks `mask_folder/<name>.png.png`, database and models in `work`."""
+class FeatureOptions:
+    """Settings of feature detection: features per photo, SIFT's peak threshold, longer side in pixels, and whether the finest octave
+    (photos enlarged twice) is used: True, False or "auto"."""
+
+    max_features: int
+    peak_threshold: float
+    max_size: int
+    fine: bool | str
+
+
+@dataclass
+class SfmPipeline:
+    """One SfM run: photos `folder/<name>.png`, masks `mask_folder/<name>.png.png`, database and models in `work`.
+
+    `seconds` holds the time of each part, `upsampled` whether the features include the finest octave.
+    """
 
     folder: Path
     work: Path
     lenses: Sequence[Lens]
     mask_folder: Path | None
-    max_features: int
-    peak_threshold: float
-    max_size: int
-    fine: bool | str
+    options: FeatureOptions
     threads: int
     seed: int
     tick: Tick
@@ -62,17 +73,17 @@ class Solver:
 
     @property
     def database(self) -> Path:
-        """The COLMAP database."""
+        """Path of the COLMAP database."""
         return self.work / "database.db"
 
     @property
     def names(self) -> list[str]:
-        """All photos in order."""
+        """Names of all photos, sorted."""
         return sorted(name for lens in self.lenses for name in lens.names)
 
     @contextmanager
     def _timed(self, part: str, total: int) -> Iterator[None]:
-        """Announce a part and time it."""
+        """Report the start of a part and time it."""
         start = time.perf_counter()
         self.tick(part, 0, total)
         try:
@@ -84,14 +95,14 @@ class Solver:
         options = pycolmap.FeatureExtractionOptions()
         options.num_threads = self.threads
         options.use_gpu = False
-        options.max_image_size = self.max_size
-        options.sift.max_num_features = self.max_features
-        options.sift.peak_threshold = self.peak_threshold
+        options.max_image_size = self.options.max_size
+        options.sift.max_num_features = self.options.max_features
+        options.sift.peak_threshold = self.options.peak_threshold
         options.sift.first_octave = -1 if self.upsampled else 0
         return options
 
     def _needs_fine(self) -> bool:
-        """Whether a few photos show that features of the finest octave are needed."""
+        """Whether the finest octave is needed, measured by the features of three photos."""
         names = self.names
         sample = [names[i] for i in sorted({0, len(names) // 2, len(names) - 1})]
         base_file = self.work / "probe.db"
@@ -107,7 +118,7 @@ class Solver:
         )
         with closing(pycolmap.Database.open(str(base_file))) as base:
             counts = [base.num_keypoints_for_image(image.image_id) for image in base.read_all_images()]
-        return not counts or float(np.median(counts)) < min(ENOUGH, 0.5 * self.max_features)
+        return not counts or float(np.median(counts)) < min(ENOUGH_FEATURES, 0.5 * self.options.max_features)
 
     def _reader(self) -> Any:
         reader = pycolmap.ImageReaderOptions()
@@ -117,10 +128,10 @@ class Solver:
         return reader
 
     def features(self) -> None:
-        """Find SIFT features in all photos; kept in the database, so that an interrupted run does not repeat it.
+        """Detect SIFT features in all photos and store them in the database, from which an interrupted run resumes.
 
-        The finest octave (photos enlarged twice) costs five times as much and holds most features but not the best ones; in "auto" it is
-        left out where the others are enough.
+        The finest octave costs five times as much as all others and holds most features but not the best ones; "auto" skips it where the
+        others suffice.
         """
         marker = self.work / "features.done"
         if marker.exists():
@@ -128,7 +139,7 @@ class Solver:
             return
         self._clear()
         with self._timed("features", len(self.names)):
-            self.upsampled = self._needs_fine() if self.fine == "auto" else bool(self.fine)
+            self.upsampled = self._needs_fine() if self.options.fine == "auto" else bool(self.options.fine)
             options = self._extraction()
             for lens in self.lenses:
                 files = [f"{name}.png" for name in lens.names]
@@ -145,35 +156,35 @@ class Solver:
         marker.write_text("fine" if self.upsampled else "coarse")
 
     def _clear(self) -> None:
-        for old in self.work.glob("*"):
-            shutil.rmtree(old) if old.is_dir() else old.unlink()
+        for path in self.work.glob("*"):
+            shutil.rmtree(path) if path.is_dir() else path.unlink()
 
     def choose_pairs(self, kind: str) -> list[pairing.Pair]:
-        """Pairs of photos (indices into `names`) to match."""
+        """Pairs of photos (indices into `names`) to match; `kind` as returned by `choose_matching`."""
         count = len(self.names)
         if kind == "exhaustive":
             return pairing.exhaustive(count)
         with self._timed("pairs", count):
-            few = []
+            features = []
             with closing(pycolmap.Database.open(str(self.database))) as base:
                 for name in self.names:
                     image = _image(base, name)
                     points = np.asarray(base.read_keypoints(image.image_id))
-                    words = np.asarray(base.read_descriptors(image.image_id).data)
+                    descriptors = np.asarray(base.read_descriptors(image.image_id).data)
                     # Keypoints are x, y and the affine shape a11 a12 a21 a22, whose determinant is the scale squared.
                     scale = points[:, 2] * points[:, 5] - points[:, 3] * points[:, 4] if points.shape[1] >= 6 else points[:, 2]
-                    few.append(pairing.strongest(words, np.abs(scale), RANKING_FEATURES))
+                    features.append(pairing.largest_features(descriptors, np.abs(scale), RANKING_FEATURES))
             if kind == "ranked":
-                scores = pairing.preemptive_scores(few, lambda done, total: self.tick("pairs", done, total))
-                return pairing.best_pairs(scores, pairing.PARTNERS, pairing.NEIGHBOURS)
-            scores = pairing.vlad_scores(few, self.seed)
+                scores = pairing.preemptive_scores(features, lambda done, total: self.tick("pairs", done, total))
+                return pairing.best_pairs(scores, pairing.PARTNERS, pairing.NAME_NEIGHBOURS)
+            scores = pairing.vlad_scores(features, self.seed)
             if kind == "vocabulary":
-                return pairing.best_pairs(scores, 2 * pairing.PARTNERS, pairing.NEIGHBOURS)
+                return pairing.best_pairs(scores, 2 * pairing.PARTNERS, pairing.NAME_NEIGHBOURS)
             loops = pairing.best_pairs(scores, 4, 0)
             return sorted({*pairing.sequential(count), *loops})
 
     def match(self, pairs: Sequence[pairing.Pair]) -> None:
-        """Match and verify pairs; those already in the database are not matched again."""
+        """Match and geometrically verify pairs that are not in the database yet."""
         names = self.names
         listing = self.work / "pairs.txt"
         listing.write_text("".join(f"{names[i]}.png {names[j]}.png\n" for i, j in pairs))
@@ -182,13 +193,13 @@ class Solver:
         options.use_gpu = False
         geometry = pycolmap.TwoViewGeometryOptions()
         geometry.ransac.random_seed = self.seed
-        chosen = pycolmap.ImportedPairingOptions()
-        chosen.match_list_path = str(listing)
-        chosen.block_size = BLOCK
+        imported = pycolmap.ImportedPairingOptions()
+        imported.match_list_path = str(listing)
+        imported.block_size = MATCHING_BLOCK
         with self._timed("matching", len(pairs)):
-            pycolmap.match_image_pairs(str(self.database), options, chosen, geometry, pycolmap.Device.cpu)
+            pycolmap.match_image_pairs(str(self.database), options, imported, geometry, pycolmap.Device.cpu)
 
-    def _mapper(self, weak: bool) -> Any:
+    def _mapper(self, relaxed: bool) -> Any:
         options = pycolmap.IncrementalPipelineOptions()
         options.num_threads = self.threads
         options.random_seed = self.seed
@@ -196,27 +207,28 @@ class Solver:
         options.triangulation.random_seed = self.seed
         options.min_model_size = 3
         options.max_num_models = 10
-        # Adjusting all cameras at every 10 % of growth is three quarters of COLMAP's time and gains nothing measurable here.
+        # COLMAP's default, global bundle adjustment at every 10 % of growth, is three quarters of its time without measurable gain.
         options.ba_global_frames_ratio = 1.3
         options.ba_global_points_ratio = 1.3
         options.ba_global_max_refinements = 2
         options.mapper.ba_global_ignore_redundant_points3D = True
-        if weak:
-            options.mapper.abs_pose_min_num_inliers = WEAK_INLIERS
-            options.mapper.abs_pose_min_inlier_ratio = WEAK_SHARE
+        if relaxed:
+            options.mapper.abs_pose_min_num_inliers = RELAXED_MIN_INLIERS
+            options.mapper.abs_pose_min_inlier_ratio = RELAXED_MIN_INLIER_RATIO
         return options
 
-    def _incremental(self, weak: bool, start: Any | None) -> Any | None:
-        out = self.work / ("weak" if weak else "strict")
+    def _incremental(self, relaxed: bool, initial: Any | None) -> Any | None:
+        """The largest model of incremental mapping, continued from the model `initial` if there is one."""
+        out = self.work / ("relaxed" if relaxed else "strict")
         shutil.rmtree(out, ignore_errors=True)
         out.mkdir()
-        seeded = self.work / "start"
-        shutil.rmtree(seeded, ignore_errors=True)
-        if start is not None:
-            seeded.mkdir()
-            start.write(str(seeded))
+        initial_folder = self.work / "initial"
+        shutil.rmtree(initial_folder, ignore_errors=True)
+        if initial is not None:
+            initial_folder.mkdir()
+            initial.write(str(initial_folder))
         total = len(self.names)
-        count = start.num_reg_images() if start is not None else 2
+        count = initial.num_reg_images() if initial is not None else 2
         lock = threading.Lock()
 
         def registered() -> None:
@@ -230,13 +242,14 @@ class Solver:
                 str(self.database),
                 str(self.folder),
                 str(out),
-                self._mapper(weak),
-                input_path=str(seeded) if start is not None else "",
+                self._mapper(relaxed),
+                input_path=str(initial_folder) if initial is not None else "",
                 next_image_callback=registered,
             )
         return largest(list(models.values()))
 
     def _global(self) -> Any | None:
+        """The largest model of global mapping."""
         options = pycolmap.GlobalPipelineOptions()
         options.num_threads = self.threads
         options.random_seed = self.seed
@@ -249,16 +262,16 @@ class Solver:
         return largest(list(models.values()))
 
     def missing(self, model: Any | None) -> list[int]:
-        """Indices of photos that a model does not place."""
-        there = registered_names(model)
-        return [i for i, name in enumerate(self.names) if name not in there]
+        """Indices of photos that a model does not register."""
+        registered = registered_names(model)
+        return [i for i, name in enumerate(self.names) if name not in registered]
 
     def solve(self, kind: str, mapper: str) -> Any | None:
-        """The largest reconstruction found, or None. In "auto" a poor one is tried again with the finest octave of features."""
+        """The largest reconstruction found, or None. With fine "auto", a poor one is repeated with the finest octave of features."""
         model = self._solve(kind, mapper)
-        if self.fine == "auto" and not self.upsampled and len(self.missing(model)) > POOR * len(self.names):
+        if self.options.fine == "auto" and not self.upsampled and len(self.missing(model)) > MAX_UNREGISTERED_SHARE * len(self.names):
             self._clear()
-            self.fine = True
+            self.options.fine = True
             model = largest([m for m in (model, self._solve(kind, mapper)) if m is not None])
         return model
 
@@ -269,32 +282,32 @@ class Solver:
             self.match(self.choose_pairs(kind))
             marker.touch()
         model = self._global() if mapper == "global" else self._incremental(False, None)
-        lost = self.missing(model)
-        if lost and mapper != "global":
-            if kind != "exhaustive" and len(lost) <= max(10, len(self.names) // 4):
-                everyone = range(len(self.names))
-                self.match(sorted({(min(i, j), max(i, j)) for i in lost for j in everyone if i != j}))
+        missing = self.missing(model)
+        if missing and mapper != "global":
+            if kind != "exhaustive" and len(missing) <= max(10, len(self.names) // 4):
+                count = len(self.names)
+                self.match(sorted({(min(i, j), max(i, j)) for i in missing for j in range(count) if i != j}))
             model = largest([m for m in (model, self._incremental(True, model)) if m is not None])
-            if len(self.missing(model)) > 0.2 * len(self.names):  # a poor core: begin anew, weakly from the start
+            if len(self.missing(model)) > 0.2 * len(self.names):  # the strict model was poor: start over with relaxed thresholds
                 model = largest([m for m in (model, self._incremental(True, None)) if m is not None])
         return model
 
 
 def _image(base: Any, name: str) -> Any:
-    """The database's entry of a photo; KeyError when its features could not be found."""
+    """The database entry of a photo; raises KeyError when the photo has none."""
     image = base.read_image_with_name(f"{name}.png")
     if image is None:
-        raise KeyError(f"COLMAP took no features from photo {name}")
+        raise KeyError(f"the COLMAP database has no entry of photo {name}")
     return image
 
 
 def registered_names(model: Any | None) -> set[str]:
-    """Names of the photos a reconstruction places."""
+    """Names of the registered photos of a reconstruction."""
     if model is None:
         return set()
     return {image.name.rsplit(".", 1)[0] for image in model.images.values() if image.has_pose}
 
 
 def largest(models: Sequence[Any]) -> Any | None:
-    """The reconstruction with most photos, then most points; None of none."""
+    """The reconstruction with most registered photos, then most points; None when there is none."""
     return max(models, key=lambda m: (m.num_reg_images(), m.num_points3D()), default=None)

@@ -1,4 +1,4 @@
-"""Structure from motion of a capture, or triangulation with given poses: jobs for the COLMAP process, and their outcome."""
+"""Structure from motion of a capture, or triangulation with given poses, as jobs of the COLMAP process."""
 
 from __future__ import annotations
 
@@ -9,18 +9,19 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from gsbake.capture.photos.undistortion import lens_key
+from gsbake.capture.photos.undistortion import intrinsics_key
 from gsbake.capture.sfm.pairs import choose_matching
-from gsbake.capture.sfm.process import SolveFailedError, Watch, run_job
-from gsbake.capture.sfm.static_background import standing_background
+from gsbake.capture.sfm.process import JobCallbacks, run_job
+from gsbake.capture.sfm.static_background import is_background_static
 from gsbake.config.schema import Poses
-from gsbake.errors import BadInputError
+from gsbake.errors import BadInputError, InterruptedRun
 from gsbake.geometry.cameras import Camera, CameraSet
 from gsbake.monitor import Monitor
 from gsbake.text import shortlist
 
-#: Time limit of triangulation with given poses, per photo and at least: its points only initialise training.
-SECONDS_PER_PHOTO, MIN_SECONDS = 3.0, 120.0
+#: Time limit of triangulation with given poses in seconds, per photo and at least. Far above any measured time: it ends a process that
+#: hangs, and the run with it.
+SECONDS_PER_PHOTO, MIN_SECONDS = 60.0, 1800.0
 
 
 @dataclass(frozen=True)
@@ -33,8 +34,8 @@ class Solved:
 
 
 @dataclass(frozen=True)
-class Solver:
-    """One capture to solve: the `ingest` folder with the `entries` of its photos, the folder `scratch` for COLMAP's files."""
+class PoseSolver:
+    """Solver of one capture: the artifact folder `ingest`, its photo `entries`, and the folder `scratch` for COLMAP's files."""
 
     ingest: Path
     entries: Sequence[dict[str, Any]]
@@ -46,33 +47,32 @@ class Solver:
 
     @property
     def folder(self) -> Path:
-        """Where results are written: `cameras.json`, `points.ply` and `sparse/` (COLMAP binary model)."""
+        """Folder of the results: `cameras.json`, `points.ply` and `sparse/` (COLMAP binary model)."""
         return self.scratch / "solve"
 
     def solve(self) -> Solved:
-        """Structure from motion. Raises BadInputError when too few photos register."""
+        """Run structure from motion. Raises BadInputError when too few photos register."""
         names = sorted(e["name"] for e in self.entries)
-        kind, why = choose_matching(self.options.matching, names)
-        self.monitor.decide("matching", kind, why)
+        kind, evidence = choose_matching(self.options.matching, names)
+        self.monitor.decide("matching", kind, evidence)
         masks = self._feature_masks()
         job = self._job("solve", self.entries, masks) | {"matching": kind, "mapper": self.options.mapper}
         result = self._run(job)
-        assert result is not None  # without a limit only a stop ends it early, and that raises
-        count, lost = int(result["registered"]), list(result["missing"])
+        count, missing = int(result["registered"]), list(result["missing"])
         if count < max(3, self.options.min_registered * len(names)):
             raise BadInputError(
-                f"Structure from motion registered only {count} of {len(names)} photos (not {shortlist(lost)}); take sharp photos that "
-                "overlap by two thirds, with texture in view, remove those of other places, or try poses.matching=exhaustive and more "
+                f"Structure from motion registered only {count} of {len(names)} photos (not {shortlist(missing)}); take sharp photos "
+                "that overlap by two thirds, with texture in view, remove those of other places, or try poses.matching=exhaustive and more "
                 "poses.max_features."
             )
-        if lost:
-            self.monitor.warn(f"{len(lost)} of {len(names)} photos could not be registered and were dropped ({shortlist(lost)}).")
+        if missing:
+            self.monitor.warn(f"{len(missing)} of {len(names)} photos could not be registered and were dropped ({shortlist(missing)}).")
         error = f"reprojection error {result['reprojection_px']:.2f} px"
         self.monitor.decide("structure from motion", f"{count} of {len(names)} photos registered", error)
         figures = {
             "registered": count,
             "registered_share": count / len(names),
-            "not_registered": lost,
+            "not_registered": missing,
             "reprojection_px": result["reprojection_px"],
             "points": result["points"],
             "track_length": result["track_length"],
@@ -85,34 +85,27 @@ class Solver:
         return Solved(list(CameraSet.load(self.folder / "cameras.json").cameras), self.folder / "points.ply", figures)
 
     def triangulate(self) -> Solved:
-        """Tie points for given poses: those that came with them, or triangulated here. Raises BadInputError with fewer than 3 poses."""
+        """Tie points for given poses, from the given model or triangulated. Raises BadInputError with fewer than 3 poses."""
         cameras = list(CameraSet.load(self.ingest / "poses" / "cameras.json").cameras)
         if len(cameras) < 3:
-            raise BadInputError(f"Only {len(cameras)} photos have a pose in the file given, but at least 3 are needed.")
+            raise BadInputError(f"Only {len(cameras)} photos have a pose in the given file; at least 3 are needed.")
         figures: dict[str, Any] = {"registered": len(cameras), "registered_share": len(cameras) / len(self.entries), "points": 0}
         known = self.ingest / "poses" / "points.ply"
         if known.exists():
-            self.monitor.decide("tie points", "taken over", "the given model has them")
+            self.monitor.decide("tie points", "given", "the given model has tie points")
             return Solved(cameras, known, figures)
         posed = {c.name for c in cameras}
         job = self._job("triangulate", [e for e in self.entries if e["name"] in posed], None)
         job |= {"cameras": str(self.ingest / "poses" / "cameras.json"), "lenses": _given_lenses(cameras)}
         limit = max(MIN_SECONDS, SECONDS_PER_PHOTO * len(cameras))
         cloud = self.folder / "points.ply"
-        try:
-            solved = self._run(job, limit)
-        except SolveFailedError as error:
-            self.monitor.decide("tie points", "none", f"triangulation failed: {error}")
-            return Solved(cameras, cloud, figures)
-        if solved is None:
-            self.monitor.decide("tie points", "none", f"triangulation took longer than {limit:.0f} s")
-        else:
-            figures |= {k: solved[k] for k in ("points", "reprojection_px", "track_length", "seconds")}
-            self.monitor.decide("tie points", f"{solved['points']} triangulated", "with the given poses")
+        solved = self._run(job, limit)
+        figures |= {k: solved[k] for k in ("points", "reprojection_px", "track_length", "seconds")}
+        self.monitor.decide("tie points", f"{solved['points']} triangulated", "with the given poses")
         return Solved(cameras, cloud, figures)
 
     def _job(self, task: str, entries: Sequence[dict[str, Any]], masks: Path | None) -> dict[str, Any]:
-        """What the COLMAP process is told."""
+        """Description of a job for the COLMAP process."""
         options = self.options
         return {
             "task": task,
@@ -128,35 +121,36 @@ class Solver:
             "seed": self.seed,
         }
 
-    def _run(self, job: dict[str, Any], limit: float | None = None) -> dict[str, Any] | None:
-        """Run the COLMAP process, timing its parts; None when it took longer than `limit` seconds."""
+    def _run(self, job: dict[str, Any], limit: float | None = None) -> dict[str, Any]:
+        """Run the COLMAP process and time its parts. Raises what `run_job` raises, and what the monitor raises on a stop request."""
         Path(job["work"]).mkdir(parents=True, exist_ok=True)
         shutil.rmtree(self.folder, ignore_errors=True)
-        with ExitStack() as running:
+        with ExitStack() as part_timer:
             current = ""
 
             def progress(part: str, done: int, total: int) -> None:
                 nonlocal current
                 if part != current:
-                    running.close()
-                    running.enter_context(self.monitor.part(part))
+                    part_timer.close()
+                    part_timer.enter_context(self.monitor.part(part))
                     current = part
                 self.monitor.progress(done, total, part)
 
-            result = run_job(job, self.folder, Watch(progress, self.monitor.stop_requested), limit)
+            result = run_job(job, self.folder, JobCallbacks(progress, self.monitor.stop_requested), limit)
         if result is None:
             self.monitor.check_stop()
+            raise InterruptedRun("Stopped on request.")
         return result
 
     def _feature_masks(self) -> Path | None:
-        """Folder of masks under the names COLMAP looks for, when features are detected inside the masks only."""
+        """Folder of masks under COLMAP's file names when features are detected inside the masks only, else None."""
         masked = [e for e in self.entries if e["mask"]]
         if self.options.masked_features is False or not masked:
             return None
         if self.options.masked_features == "auto":
             if len(masked) < len(self.entries):
                 return None
-            static, evidence = standing_background([(self.ingest / e["file"], self.ingest / e["mask"]) for e in self.entries])
+            static, evidence = is_background_static([(self.ingest / e["file"], self.ingest / e["mask"]) for e in self.entries])
             self.monitor.decide("features", "inside the masks" if static else "in whole photos", evidence)
             if not static:
                 return None
@@ -171,7 +165,7 @@ class Solver:
 
 
 def _lenses(entries: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Photos grouped by what took them: photo size, and camera and focal length as EXIF names them."""
+    """Photos grouped by shared intrinsics: photo size, and camera and focal length from EXIF."""
     groups: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
     for entry in entries:
         groups.setdefault((entry["width"], entry["height"], entry["camera_model"]), []).append(entry)
@@ -187,7 +181,7 @@ def _given_lenses(cameras: Sequence[Camera]) -> list[dict[str, Any]]:
     """Photos grouped by their given intrinsics."""
     groups: dict[tuple[float, ...], list[Camera]] = {}
     for camera in cameras:
-        groups.setdefault(lens_key(camera), []).append(camera)
+        groups.setdefault(intrinsics_key(camera), []).append(camera)
     return [
         {"names": [c.name for c in members], "width": members[0].width, "height": members[0].height, "focal": None}
         for members in groups.values()

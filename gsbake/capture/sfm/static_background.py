@@ -1,4 +1,4 @@
-"""Whether the object turned in front of a standing camera: then features on the background contradict those on the object."""
+"""Detection of a static background: the object turned in front of a fixed camera, so background features contradict the object's."""
 
 from __future__ import annotations
 
@@ -9,33 +9,33 @@ from typing import Any
 import cv2
 import numpy as np
 
-#: Spread of a background pixel over all photos, in grey levels, below which the background stands still (noise and flicker pass).
-STILL = 8.0
+#: Standard deviation of background pixels over all photos, in grey levels, below which the background is static (noise and flicker pass).
+MAX_STATIC_DEVIATION = 8.0
 _SIZE = 96
 
 
-def standing_background(files: Sequence[tuple[Path, Path]]) -> tuple[bool, str]:
-    """Whether what lies outside the masks stays the same in all photos, and the evidence in words.
+def is_background_static(files: Sequence[tuple[Path, Path]]) -> tuple[bool, str]:
+    """Whether the background outside the masks is the same in all photos, and the evidence.
 
-    `files` are (photo, mask). Photos of different sizes were not taken by a standing camera.
+    `files` are (photo, mask). Photos of different sizes are not from a fixed camera.
     """
     greys, outside = [], []
     shapes = set()
     for photo, mask in files:
         grey: Any = cv2.imread(str(photo), cv2.IMREAD_REDUCED_GRAYSCALE_2)
-        solid: Any = cv2.imread(str(mask), cv2.IMREAD_REDUCED_GRAYSCALE_2)
+        inside: Any = cv2.imread(str(mask), cv2.IMREAD_REDUCED_GRAYSCALE_2)
         shapes.add(grey.shape)
         greys.append(cv2.resize(grey, (_SIZE, _SIZE), interpolation=cv2.INTER_AREA).astype(np.float32))
-        # A margin keeps shadows and soft edges of the object out.
-        outside.append(cv2.dilate(cv2.resize(solid, (_SIZE, _SIZE), interpolation=cv2.INTER_AREA), np.ones((5, 5), np.uint8)) < 8)
+        # A margin excludes shadows and soft edges of the object.
+        outside.append(cv2.dilate(cv2.resize(inside, (_SIZE, _SIZE), interpolation=cv2.INTER_AREA), np.ones((5, 5), np.uint8)) < 8)
     if len(shapes) > 1:
         return False, "photos of different sizes"
-    stack, free = np.stack(greys), np.stack(outside)
-    count = free.sum(0)
+    stack, background = np.stack(greys), np.stack(outside)
+    count = background.sum(0)
     often = count >= 0.7 * len(files)
     if often.mean() < 0.05:
-        return False, "hardly any background in view"
-    mean = (stack * free).sum(0) / np.maximum(count, 1)
-    spread = np.sqrt(((stack - mean) ** 2 * free).sum(0) / np.maximum(count, 1))[often]
-    typical = float(np.quantile(spread, 0.75))
-    return typical < STILL, f"background varies by {typical:.1f} grey levels over the photos"
+        return False, "too little background visible"
+    mean = (stack * background).sum(0) / np.maximum(count, 1)
+    deviation = np.sqrt(((stack - mean) ** 2 * background).sum(0) / np.maximum(count, 1))[often]
+    typical = float(np.quantile(deviation, 0.75))
+    return typical < MAX_STATIC_DEVIATION, f"the background varies by {typical:.1f} grey levels over the photos"

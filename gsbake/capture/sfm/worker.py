@@ -1,13 +1,13 @@
-"""The process in which COLMAP runs: reads a job (JSON file), writes the result into a folder, tells progress in JSON lines on stdout.
+"""COLMAP worker process: reads a job (JSON file), writes the result into a folder, reports progress in JSON lines on stdout.
 
-A process of its own because COLMAP's long calls cannot be interrupted from within but a process can be killed, and because its memory
-goes back. It ends with its parent.
+COLMAP's long calls cannot be interrupted, but a process can be killed, and its memory is then released. The process ends with its parent.
 """
 
 from __future__ import annotations
 
 import json
 import os
+import re
 import sys
 import threading
 import time
@@ -22,88 +22,88 @@ import numpy as np
 from gsbake.capture.poses.colmap_model import camera_of, cloud
 from gsbake.capture.poses.up_axis import up_direction, upright_rotation
 from gsbake.capture.sfm.colmap import pycolmap
-from gsbake.capture.sfm.pairs import exhaustive, near_views
-from gsbake.capture.sfm.reconstruction import Lens, Solver, registered_names
+from gsbake.capture.sfm.pairs import exhaustive, neighbouring_views
+from gsbake.capture.sfm.reconstruction import FeatureOptions, Lens, SfmPipeline, registered_names
+from gsbake.errors import InterruptedRun
 from gsbake.geometry.cameras import Camera, CameraSet
 from gsbake.geometry.ply import write_cloud
 
-#: When progress was last told: it is rationed, since mapping calls back thousands of times.
-_LAST = {"time": 0.0}
+#: Errors of COLMAP and SQLite that come from the machine, not from the photos.
+_PASSING_FAULT = re.compile(r"disk|I/O|no space|sqlite|database|bad_alloc|memory|failed to (open|write)|cannot (open|write)", re.IGNORECASE)
+#: Time of the last progress line: lines are limited to ten per second, since mapping calls back thousands of times.
+_LAST_REPORT = {"time": 0.0}
 
 
-def _tell(part: str, done: int, total: int) -> None:
+def _report_progress(part: str, done: int, total: int) -> None:
     now = time.monotonic()
-    if now - _LAST["time"] > 0.1 or done in (0, total):
-        _LAST["time"] = now
+    if now - _LAST_REPORT["time"] > 0.1 or done in (0, total):
+        _LAST_REPORT["time"] = now
         sys.stdout.write(json.dumps({"part": part, "done": done, "total": total}) + "\n")
         sys.stdout.flush()
 
 
-def _follow_parent(parent: int) -> None:
-    """End this process when its parent is gone, so that a killed run leaves nothing behind that eats the processor."""
+def _exit_with_parent(parent: int) -> None:
+    """End this process when its parent ends, so that a killed run leaves no process behind."""
 
-    def watch() -> None:
+    def poll() -> None:
         while os.getppid() == parent:
             time.sleep(0.5)
         os._exit(75)
 
-    threading.Thread(target=watch, daemon=True).start()
+    threading.Thread(target=poll, daemon=True).start()
 
 
-def _solver(job: Mapping[str, Any]) -> Solver:
-    return Solver(
+def _pipeline(job: Mapping[str, Any]) -> SfmPipeline:
+    return SfmPipeline(
         folder=Path(job["photos"]),
         work=Path(job["work"]),
         lenses=[Lens(tuple(x["names"]), x["width"], x["height"], x["focal"]) for x in job["lenses"]],
         mask_folder=Path(job["masks"]) if job["masks"] else None,
-        max_features=job["max_features"],
-        peak_threshold=job["peak_threshold"],
-        max_size=job["max_size"],
-        fine=job["fine"],
+        options=FeatureOptions(job["max_features"], job["peak_threshold"], job["max_size"], job["fine"]),
         threads=job["threads"],
         seed=job["seed"],
-        tick=_tell,
+        tick=_report_progress,
     )
 
 
-def _write(model: Any, out: Path, solver: Solver, solved: bool) -> dict[str, Any]:
-    """Write sparse/, cameras.json and points.ply of a reconstruction, turned upright when it was solved; returns its figures."""
-    placed = sorted((im for im in model.images.values() if im.has_pose), key=lambda im: im.name)
+def _write(model: Any, out: Path, pipeline: SfmPipeline, solved: bool) -> dict[str, Any]:
+    """Write sparse/, cameras.json and points.ply of a reconstruction, rotated upright if `solved`; returns its figures."""
+    registered = sorted((im for im in model.images.values() if im.has_pose), key=lambda im: im.name)
     if solved:
-        up = up_direction([np.asarray(im.cam_from_world().rotation.matrix()) for im in placed])
+        up = up_direction([np.asarray(im.cam_from_world().rotation.matrix()) for im in registered])
         rotation = upright_rotation(up)
         model.transform(pycolmap.Sim3d(1.0, pycolmap.Rotation3d(rotation), np.zeros(3)))
-        placed = sorted((im for im in model.images.values() if im.has_pose), key=lambda im: im.name)
+        registered = sorted((im for im in model.images.values() if im.has_pose), key=lambda im: im.name)
     (out / "sparse").mkdir(parents=True, exist_ok=True)
     model.write(str(out / "sparse"))
-    cameras = [replace(camera_of(im, im.name, "the solved model"), name=im.name.rsplit(".", 1)[0]) for im in placed]
+    cameras = [replace(camera_of(im, im.name, "the solved model"), name=im.name.rsplit(".", 1)[0]) for im in registered]
     CameraSet(tuple(cameras), poses="solved" if solved else "given").save(out / "cameras.json")
     points, colours = cloud(model)
     if len(points):
         write_cloud(out / "points.ply", points, colours)
     return {
-        "registered": len(placed),
+        "registered": len(registered),
         "points": len(points),
-        "fine_features": solver.upsampled,
+        "fine_features": pipeline.upsampled,
         "reprojection_px": float(model.compute_mean_reprojection_error()) if len(points) else None,
         "track_length": float(model.compute_mean_track_length()) if len(points) else None,
-        "missing": [name for name in solver.names if name not in registered_names(model)],
+        "missing": [name for name in pipeline.names if name not in registered_names(model)],
     }
 
 
 def solve(job: Mapping[str, Any]) -> dict[str, Any]:
-    """Find cameras and points of photos without poses."""
-    solver = _solver(job)
-    model = solver.solve(job["matching"], job["mapper"])
+    """Estimate cameras and tie points of photos without poses."""
+    pipeline = _pipeline(job)
+    model = pipeline.solve(job["matching"], job["mapper"])
     if model is None or model.num_reg_images() == 0:
-        return {"registered": 0, "points": 0, "reprojection_px": None, "missing": solver.names, "seconds": solver.seconds}
+        return {"registered": 0, "points": 0, "reprojection_px": None, "missing": pipeline.names, "seconds": pipeline.seconds}
     out = Path(job["out"])
-    model.extract_colors_for_all_images(str(solver.folder))
-    return _write(model, out, solver, True) | {"seconds": solver.seconds}
+    model.extract_colors_for_all_images(str(pipeline.folder))
+    return _write(model, out, pipeline, True) | {"seconds": pipeline.seconds}
 
 
-def _known(base: Any, cameras: Mapping[str, Camera]) -> Any:
-    """A reconstruction without points that holds known cameras under the database's ids; sets the intrinsics in the database too."""
+def _posed_model(base: Any, cameras: Mapping[str, Camera]) -> Any:
+    """A reconstruction of known cameras under the database's ids, without points; also sets the intrinsics in the database."""
     model = pycolmap.Reconstruction()
     lenses: dict[int, Any] = {}
     for image in base.read_all_images():
@@ -122,43 +122,49 @@ def _known(base: Any, cameras: Mapping[str, Camera]) -> Any:
             model.add_camera_with_trivial_rig(lens)
             lenses[image.camera_id] = lens
         pose = pycolmap.Rigid3d(pycolmap.Rotation3d(known.R), known.t)
-        fresh = pycolmap.Image(name=image.name, camera_id=image.camera_id, image_id=image.image_id)
-        model.add_image_with_trivial_frame(fresh, pose)
+        posed = pycolmap.Image(name=image.name, camera_id=image.camera_id, image_id=image.image_id)
+        model.add_image_with_trivial_frame(posed, pose)
     return model
 
 
 def triangulate(job: Mapping[str, Any]) -> dict[str, Any]:
-    """Points for photos with known poses; cameras stay as they are."""
-    solver = _solver(job)
+    """Triangulate tie points of photos with known poses, which stay unchanged."""
+    pipeline = _pipeline(job)
     cameras = {c.name: c for c in CameraSet.load(Path(job["cameras"])).cameras}
-    solver.features()
-    ordered = [cameras[name] for name in solver.names]
-    with closing(pycolmap.Database.open(str(solver.database))) as base:
-        model = _known(base, cameras)
+    pipeline.features()
+    ordered = [cameras[name] for name in pipeline.names]
+    with closing(pycolmap.Database.open(str(pipeline.database))) as base:
+        model = _posed_model(base, cameras)
     if len(ordered) <= 12:
         pairs = exhaustive(len(ordered))
     else:
-        pairs = near_views(np.stack([c.centre for c in ordered]), np.stack([c.view_direction for c in ordered]))
-    solver.match(pairs)
+        pairs = neighbouring_views(np.stack([c.centre for c in ordered]), np.stack([c.view_direction for c in ordered]))
+    pipeline.match(pairs)
     out = Path(job["out"])
     (out / "sparse").mkdir(parents=True, exist_ok=True)
     options = pycolmap.IncrementalPipelineOptions()
-    options.num_threads = solver.threads
-    options.random_seed = solver.seed
+    options.num_threads = pipeline.threads
+    options.random_seed = pipeline.seed
     start = time.perf_counter()
-    _tell("triangulation", 0, 1)
-    model = pycolmap.triangulate_points(model, str(solver.database), str(solver.folder), str(out / "sparse"), True, options)
-    solver.seconds["triangulation"] = time.perf_counter() - start
-    return _write(model, out, solver, False) | {"seconds": solver.seconds}
+    _report_progress("triangulation", 0, 1)
+    model = pycolmap.triangulate_points(model, str(pipeline.database), str(pipeline.folder), str(out / "sparse"), True, options)
+    pipeline.seconds["triangulation"] = time.perf_counter() - start
+    return _write(model, out, pipeline, False) | {"seconds": pipeline.seconds}
 
 
 def main() -> None:
-    """Entry: `python -m gsbake.capture.sfm.worker JOB.json PARENT_PID`."""
+    """Entry point: `python -m gsbake.capture.sfm.worker JOB.json PARENT_PID`."""
     job = json.loads(Path(sys.argv[1]).read_text())
-    _follow_parent(int(sys.argv[2]))
+    _exit_with_parent(int(sys.argv[2]))
     pycolmap.set_random_seed(job["seed"])
-    result = solve(job) if job["task"] == "solve" else triangulate(job)
-    (Path(job["out"]) / "result.json").write_text(json.dumps(result))
+    try:
+        result = solve(job) if job["task"] == "solve" else triangulate(job)
+        (Path(job["out"]) / "result.json").write_text(json.dumps(result))
+    except Exception as error:
+        if isinstance(error, OSError | MemoryError) or _PASSING_FAULT.search(str(error)):
+            sys.stderr.write(f"{' '.join(str(error).split())}\n")
+            sys.exit(InterruptedRun.exit_code)
+        raise
 
 
 if __name__ == "__main__":

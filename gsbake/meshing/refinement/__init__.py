@@ -1,1 +1,1 @@
-"""Moving the vertices of a mesh to agree with silhouettes, photos and rendered normals."""
+"""Mesh refinement against silhouettes, photos and rendered normals."""

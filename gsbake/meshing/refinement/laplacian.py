@@ -1,5 +1,5 @@
-"""Displacements known here and there, spread over a mesh: (D + λL) δ = b with the umbrella operator L (Kobbelt et al., *Interactive
-multi-resolution modeling on arbitrary meshes*, SIGGRAPH 1998), by conjugate gradients."""
+"""Screened Laplacian solver that interpolates sparse displacements over a mesh: (D + λL) δ = b with the umbrella operator L (Kobbelt et
+al., *Interactive multi-resolution modeling on arbitrary meshes*, SIGGRAPH 1998), by conjugate gradients."""
 
 from __future__ import annotations
 
@@ -11,17 +11,19 @@ from numpy.typing import NDArray
 from scipy.sparse.linalg import LinearOperator, cg
 
 
-def spread(data: Any, right: NDArray[np.float64], edges: NDArray[np.int64], smooth: float) -> NDArray[np.float64]:
-    """δ (n,) that solves (data + smooth · L) δ = right.
+def solve_screened_laplacian(
+    data: Any, right_side: NDArray[np.float64], edges: NDArray[np.int64], smoothness: float
+) -> NDArray[np.float64]:
+    """δ (n,) that solves (data + smoothness · L) δ = right_side.
 
-    `data` (n, n) sparse, positive definite, holds what is measured and what pulls towards 0; `edges` (e, 2) link vertices. On a surface
-    δᵀLδ hardly depends on how finely it is divided.
+    `data` (n, n), sparse and positive definite, contains the measurements and the zero prior; `edges` (e, 2) connect vertices. δᵀLδ hardly
+    depends on how finely a surface is triangulated.
     """
-    count = len(right)
-    link = sparse.csr_matrix((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(count, count))
-    link = link + link.T
-    umbrella = sparse.diags(np.asarray(link.sum(1)).ravel()) - link
-    system = (data + smooth * umbrella).tocsr()
+    count = len(right_side)
+    adjacency = sparse.csr_matrix((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(count, count))
+    adjacency = adjacency + adjacency.T
+    laplacian = sparse.diags(np.asarray(adjacency.sum(1)).ravel()) - adjacency
+    system = (data + smoothness * laplacian).tocsr()
     inverse = 1.0 / system.diagonal()
-    found, _ = cg(system, right, rtol=1e-4, maxiter=400, M=LinearOperator(system.shape, matvec=lambda x: inverse * x.ravel()))
-    return np.asarray(found, np.float64)
+    solution, _ = cg(system, right_side, rtol=1e-4, maxiter=400, M=LinearOperator(system.shape, matvec=lambda x: inverse * x.ravel()))
+    return np.asarray(solution, np.float64)

@@ -1,9 +1,9 @@
-"""Vertex positions that agree with the normals the views show.
+"""Mesh refinement against rendered normals.
 
-Depth of splats is noisy at short wavelengths, their normals much less so; positions are right at long ones. Nehab et al., *Efficiently
-combining positions and normals for precise 3D geometry*, SIGGRAPH 2005: gather the rendered normals of all views at each vertex, then move
-vertices along them so that every edge lies as square as possible to the mean normal of its ends (exact for circular arcs, so
-nothing shrinks), held back by a pull to where they were. One sparse symmetric system, conjugate gradients.
+Rendered depth is noisy at short wavelengths, rendered normals much less; positions are accurate at long wavelengths. Nehab et al.,
+*Efficiently combining positions and normals for precise 3D geometry*, SIGGRAPH 2005: average the rendered normals of all views at each
+vertex, then move vertices along them so that every edge is as perpendicular as possible to the mean normal of its ends (exact for
+circular arcs, so nothing shrinks), with a data term that keeps the positions. One sparse symmetric system, conjugate gradients.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from gsbake.meshing.depth_views import DepthView, Floats
 from gsbake.surfels.raster.threads import run_chunks
 
 
-class NormalGather:
-    """Weighted mean of the views' normals at `vertices` (v, 3); views stream through `add`."""
+class NormalAccumulator:
+    """Weighted mean of the views' normals at `vertices` (v, 3); `add` takes one view at a time."""
 
     def __init__(self, vertices: Vertices, tolerance: float) -> None:
         self._vertices = np.ascontiguousarray(vertices, np.float32)
@@ -31,16 +31,16 @@ class NormalGather:
         self._weight = np.zeros(len(vertices), np.float32)
 
     def add(self, view: DepthView, normal: Floats) -> None:
-        """Add a view's normals (h, w, 3; unit frame) at the vertices that its depth shows, to within the tolerance along the ray."""
+        """Add a view's normals (h, w, 3; unit frame) at the vertices whose depth agrees with the view's to the tolerance."""
         camera = view.camera
         intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy], np.float32)
         pose = np.concatenate([camera.R, camera.t[:, None]], 1).astype(np.float32)
         maps = (view.inverse, view.weight, np.ascontiguousarray(normal, np.float32))
         fixed: tuple[Any, ...] = (self._vertices, pose, intrinsics, *maps, self._tolerance, self._sum, self._weight)
-        run_chunks(lambda start, stop: _gather(start, stop, *fixed), len(self._vertices))
+        run_chunks(lambda start, stop: _accumulate(start, stop, *fixed), len(self._vertices))
 
     def normals(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Unit normals (v, 3), 0 where no view saw the vertex, and how well the views agree (v,): 1 = all alike, 0 = unseen."""
+        """Unit normals (v, 3), 0 for unobserved vertices, and their agreement (v,): 1 = equal in all views, 0 = unobserved."""
         length = np.linalg.norm(self._sum, axis=1)
         unit = self._sum / np.maximum(length, 1e-12)[:, None]
         agreement = np.where(self._weight > 0, length / np.maximum(self._weight, 1e-12), 0)
@@ -58,50 +58,57 @@ def vertex_normals(vertices: Vertices, faces: Faces) -> NDArray[np.float64]:
     return np.asarray(out / np.maximum(np.linalg.norm(out, axis=1, keepdims=True), 1e-20))
 
 
-def edges_of(faces: NDArray[Any]) -> NDArray[np.int64]:
-    """Each edge once, (e, 2), the smaller vertex first."""
+def unique_edges(faces: NDArray[Any]) -> NDArray[np.int64]:
+    """Each edge once (e, 2), the smaller vertex first."""
     pairs = np.sort(np.asarray(faces)[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1).astype(np.int64)
     return np.unique(pairs[:, 0] << 32 | pairs[:, 1])[:, None] >> np.array([32, 0]) & 0xFFFFFFFF
 
 
-def follow_normals(
-    vertices: Vertices, faces: Faces, target: NDArray[np.float64], trust: NDArray[np.float64], reach: float, limit: float
+def integrate_normals(
+    vertices: Vertices,
+    faces: Faces,
+    target: NDArray[np.float64],
+    confidence: NDArray[np.float64],
+    wavelength: float,
+    max_displacement: float,
 ) -> Vertices:
-    """Vertices (v, 3) moved along the `target` normals (v, 3, weighted by `trust` (v,) in 0..1) to agree with them.
+    """Vertices (v, 3) moved along the `target` normals (v, 3) with `confidence` (v,) in 0..1 to agree with them.
 
-    Waves shorter than `reach` (world units) follow the normals, longer ones the positions. No vertex moves farther than `limit`.
+    Detail below `wavelength` (world units) comes from the normals, above it from the positions. No vertex moves farther than
+    `max_displacement`.
     """
-    if len(faces) == 0 or reach <= 0:
+    if len(faces) == 0 or wavelength <= 0:
         return vertices
-    own = vertex_normals(vertices, faces)
-    agree = (own * target).sum(1)
-    trust = np.where(agree > 0.3, trust, 0.0)  # a normal that contradicts the surface belongs to another one
-    normal = np.where((trust > 0)[:, None], target, own)
-    a, b = edges_of(faces).T
-    middle = normal[a] + normal[b]
-    middle /= np.maximum(np.linalg.norm(middle, axis=1, keepdims=True), 1e-12)
-    span = vertices[a] - vertices[b]
-    # Slopes count, not rises: a sliver's short edge speaks as loudly as a long one (to a point: its slope is less certain).
-    length = np.linalg.norm(span, axis=1)
-    typical = float(length.mean())
-    # A wave as long as the reach rises by 2π · edge / reach of its amplitude per edge along it. Three edges per vertex, most of them
-    # oblique, make that 2/3 in sum over squares: with its inverse such a wave is halved.
-    strength = 1.5 * (reach / (2 * np.pi * np.maximum(length, 0.3 * typical))) ** 2 * np.minimum(trust[a], trust[b])
-    tilt = (span * middle).sum(1)
-    along_a, along_b = (normal[a] * middle).sum(1), (normal[b] * middle).sum(1)
-    n, rows = len(vertices), np.arange(len(a))
-    slope = sparse.csr_matrix(
-        (np.concatenate([along_a, -along_b]), (np.concatenate([rows, rows]), np.concatenate([a, b]))), shape=(len(a), n)
+    current = vertex_normals(vertices, faces)
+    alignment = (current * target).sum(1)
+    confidence = np.where(alignment > 0.3, confidence, 0.0)  # such a normal belongs to another surface
+    normal = np.where((confidence > 0)[:, None], target, current)
+    a, b = unique_edges(faces).T
+    mean_normal = normal[a] + normal[b]
+    mean_normal /= np.maximum(np.linalg.norm(mean_normal, axis=1, keepdims=True), 1e-12)
+    edge_vector = vertices[a] - vertices[b]
+    # Slopes, not heights: short edges have the same weight as long ones, except very short ones, whose slope is uncertain.
+    length = np.linalg.norm(edge_vector, axis=1)
+    mean_length = float(length.mean())
+    # A wave of that length rises by 2π · edge / wavelength of its amplitude per edge along it. Over three edges per vertex, most of them
+    # oblique, the squares sum to 2/3 of that: with the inverse as weight such a wave is halved.
+    edge_weight = 1.5 * (wavelength / (2 * np.pi * np.maximum(length, 0.3 * mean_length))) ** 2 * np.minimum(confidence[a], confidence[b])
+    residual = (edge_vector * mean_normal).sum(1)
+    coefficient_a, coefficient_b = (normal[a] * mean_normal).sum(1), (normal[b] * mean_normal).sum(1)
+    n, edge_rows = len(vertices), np.arange(len(a))
+    gradient = sparse.csr_matrix(
+        (np.concatenate([coefficient_a, -coefficient_b]), (np.concatenate([edge_rows, edge_rows]), np.concatenate([a, b]))),
+        shape=(len(a), n),
     )
-    weighted = sparse.diags(strength) @ slope
-    system = (sparse.identity(n) + slope.T @ weighted).tocsr()
+    weighted = sparse.diags(edge_weight) @ gradient
+    system = (sparse.identity(n) + gradient.T @ weighted).tocsr()
     scale = sparse.diags(1 / system.diagonal())
-    shift, _ = cg(system, -(weighted.T @ tilt), rtol=1e-3, maxiter=200, M=scale)
-    return vertices + np.clip(shift, -limit, limit)[:, None] * normal
+    displacement, _ = cg(system, -(weighted.T @ residual), rtol=1e-3, maxiter=200, M=scale)
+    return vertices + np.clip(displacement, -max_displacement, max_displacement)[:, None] * normal
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
-def _gather(
+def _accumulate(
     start: int,
     stop: int,
     vertices: Any,
@@ -112,9 +119,9 @@ def _gather(
     normal: Any,
     tolerance: Any,
     out: Any,
-    total: Any,
+    weight_total: Any,
 ) -> None:
-    """Bilinear normals where all four pixels show the vertex, the nearest pixel's otherwise."""
+    """Add bilinear normals of the pixels that observe each vertex."""
     height, width = inverse.shape
     for n in range(start, stop):
         x, y, z = vertices[n, 0], vertices[n, 1], vertices[n, 2]
@@ -132,8 +139,8 @@ def _gather(
                     continue
                 if abs(np.float32(1) / inverse[row, col] - depth) > tolerance:
                     continue
-                share = weight[row, col] * (fu if du else np.float32(1) - fu) * (fv if dv else np.float32(1) - fv)
-                out[n, 0] += share * normal[row, col, 0]
-                out[n, 1] += share * normal[row, col, 1]
-                out[n, 2] += share * normal[row, col, 2]
-                total[n] += share
+                pixel_weight = weight[row, col] * (fu if du else np.float32(1) - fu) * (fv if dv else np.float32(1) - fv)
+                out[n, 0] += pixel_weight * normal[row, col, 0]
+                out[n, 1] += pixel_weight * normal[row, col, 1]
+                out[n, 2] += pixel_weight * normal[row, col, 2]
+                weight_total[n] += pixel_weight

@@ -1,9 +1,9 @@
-"""Moving a mesh along its normals until the photos of textured places agree.
+"""Photometric mesh refinement: moves vertices along their normals to maximise photometric consistency on textured surfaces.
 
-Masks cut a little outside or inside the object and splats reach beyond their centres: all views err alike, and no mean over them
-helps. Texture tells better (`photometric_measure`). What photos measure is spread over the mesh by a screened least-squares system, so
-that glossy and plain places follow their textured neighbours or stay; Geman-McClure weights take out what contradicts the result. As a
-refinement of meshes: Vu et al., *High accuracy and visibility-consistent dense multiview stereo*, PAMI 2012.
+Mask boundaries are biased and surfels extend beyond their centres: these errors are equal in all views and do not average out. Measurements
+on texture (`photometric_measure`) are interpolated over the mesh by a screened least-squares system, so that specular and untextured
+regions follow their textured neighbours or are unchanged; Geman-McClure weights remove outliers. Mesh refinement after Vu et al., *High
+accuracy and visibility-consistent dense multiview stereo*, PAMI 2012.
 """
 
 from __future__ import annotations
@@ -14,81 +14,82 @@ import numpy as np
 import scipy.sparse as sparse
 
 from gsbake.meshing.cleanup import Faces, Vertices
-from gsbake.meshing.refinement.laplacian import spread
+from gsbake.meshing.refinement.laplacian import solve_screened_laplacian
 from gsbake.meshing.refinement.normals import vertex_normals
-from gsbake.meshing.refinement.photometric_measure import Capture, Doubles, Plan, Samples, measure
+from gsbake.meshing.refinement.photometric_measure import Doubles, MeasurementPlan, Measurements, PhotometricViews, measure
 
-#: Information (per square pixel) about differences of the displacement along edges, and about its being 0 per area of a patch.
-SMOOTH, STAY = 0.4, 0.03
-#: Displacements differ from a good measurement by about this many pixels.
-ROBUST = 0.6
-#: Solutions with weights from the one before.
-REWEIGHT = 3
-#: Vertices are moved at most this many pixels a round.
-LIMIT = 2.0
-#: A round whose median displacement is below this many pixels is not made.
-SETTLED = 0.1
+#: Information (per square pixel) of the smoothness term per edge, and of the zero prior per area of a patch.
+SMOOTHNESS_WEIGHT, ZERO_WEIGHT = 0.4, 0.03
+#: Scale of the Geman-McClure weight in pixels: typical error of an inlier.
+ROBUST_SCALE = 0.6
+#: Solutions of iteratively reweighted least squares.
+REWEIGHTING_STEPS = 3
+#: Maximum displacement per round in pixels.
+MAX_DISPLACEMENT = 2.0
+#: Minimum median displacement of a round in pixels; refinement ends below it.
+MIN_DISPLACEMENT = 0.1
 
 
 @dataclass(frozen=True)
-class Agreed:
-    """The moved `vertices` (v, 3); `share` of the measured vertices that most photos agree about, their median displacement `move` in
-    pixels (summed over rounds), their median NCC `before` and `after`; `rounds` made: 0 where nothing was measured or gained."""
+class PhotometricResult:
+    """The refined `vertices` (v, 3); `consistent_share` of the measured vertices with a majority of valid measurements, their
+    `median_displacement` in pixels (summed over rounds), their median NCC before and after; `rounds` made, 0 = unchanged."""
 
     vertices: Vertices
-    share: float
-    move: float
-    before: float
-    after: float
+    consistent_share: float
+    median_displacement: float
+    ncc_before: float
+    ncc_after: float
     rounds: int
 
 
-def solve(samples: Samples, plan: Plan, count: int) -> Doubles:
-    """Displacements (count,) in world units that follow the samples and vary slowly between them."""
-    # Patches overlap: a measurement counts as much as the part of a patch that is its own.
-    stride = -(-count // len(plan.chosen))
-    weight, target = samples.weights() * min(stride * plan.share, 1.0), samples.shift / plan.pixel
-    found = np.zeros(count)
-    for turn in range(REWEIGHT):
-        apart = (target - found[samples.vertex]) / ROBUST
-        each = weight / (1 + apart**2) ** 2 if turn else weight
-        data = sparse.diags(np.bincount(samples.vertex, each, count) + STAY * plan.share)
-        right = np.asarray(np.bincount(samples.vertex, each * target, count), np.float64)
-        found = spread(data, right, plan.edges, SMOOTH)
-    return np.clip(found, -LIMIT, LIMIT) * plan.pixel
+def solve_displacements(measurements: Measurements, plan: MeasurementPlan, count: int) -> Doubles:
+    """Displacements (count,) in world units that interpolate the measurements smoothly."""
+    # Patches overlap: a measurement is weighted by the share of a patch that is not shared with others.
+    stride = -(-count // len(plan.measured_vertices))
+    weight, target = measurements.weights() * min(stride * plan.patch_share, 1.0), measurements.displacement / plan.pixel_size
+    displacement = np.zeros(count)
+    for step in range(REWEIGHTING_STEPS):
+        residual = (target - displacement[measurements.vertex]) / ROBUST_SCALE
+        robust_weight = weight / (1 + residual**2) ** 2 if step else weight
+        data = sparse.diags(np.bincount(measurements.vertex, robust_weight, count) + ZERO_WEIGHT * plan.patch_share)
+        right_side = np.asarray(np.bincount(measurements.vertex, robust_weight * target, count), np.float64)
+        displacement = solve_screened_laplacian(data, right_side, plan.edges, SMOOTHNESS_WEIGHT)
+    return np.clip(displacement, -MAX_DISPLACEMENT, MAX_DISPLACEMENT) * plan.pixel_size
 
 
-def gains(before: Samples, after: Samples) -> bool:
-    """Whether most of the measurements `before` that have a weight match better in `after`.
+def improves(before: Measurements, after: Measurements) -> bool:
+    """Whether the median NCC change of the measurements `before` with positive weight is positive.
 
-    Their mean is no judge: the few whose patch slips off the surface or behind an edge lose a hundred times what the others gain.
+    The mean is unsuitable: few patches that slip off the surface or behind an edge lose a hundred times what the others gain.
     """
-    mine, theirs = before.shared(after)
-    return len(mine) > 0 and float(np.median(after.ncc[theirs] - before.ncc[mine])) > 0
+    rows_before, rows_after = before.shared(after)
+    return len(rows_before) > 0 and float(np.median(after.ncc[rows_after] - before.ncc[rows_before])) > 0
 
 
-def agree(vertices: Vertices, faces: Faces, capture: Capture, rounds: int, threads: int) -> Agreed:
-    """Move the `vertices` (v, 3) of a mesh (unit frame, wound outward) until the photos of textured places agree.
+def refine_photometric(vertices: Vertices, faces: Faces, views: PhotometricViews, rounds: int, threads: int) -> PhotometricResult:
+    """Refine the `vertices` (v, 3) of a mesh (unit frame, outward winding) by photometric consistency.
 
-    A round after which most of the same measurements match no better than before is taken back, and is the last.
+    A round that does not increase the NCC of most measurements is discarded and ends the refinement.
     """
-    plan = Plan.make(vertices, faces, capture.cameras)
-    first = samples = measure(vertices, plan, capture, threads)
-    moves: list[float] = []
-    while len(moves) < rounds:
-        trusted = np.unique(samples.vertex[samples.weights() > 0])
-        if len(trusted) == 0:
+    plan = MeasurementPlan.make(vertices, faces, views.cameras)
+    initial = measurements = measure(vertices, plan, views, threads)
+    displacements: list[float] = []
+    while len(displacements) < rounds:
+        used = np.unique(measurements.vertex[measurements.weights() > 0])
+        if len(used) == 0:
             break
-        shift = solve(samples, plan, len(vertices))
-        move = float(np.median(np.abs(shift[trusted]))) / plan.pixel
-        if move < SETTLED:
+        displacement = solve_displacements(measurements, plan, len(vertices))
+        median_displacement = float(np.median(np.abs(displacement[used]))) / plan.pixel_size
+        if median_displacement < MIN_DISPLACEMENT:
             break
-        moved = vertices + vertex_normals(vertices, faces) * shift[:, None]
-        later = measure(moved, plan, capture, threads)
-        if not gains(samples, later):
+        moved = vertices + vertex_normals(vertices, faces) * displacement[:, None]
+        candidate = measure(moved, plan, views, threads)
+        if not improves(measurements, candidate):
             break
-        vertices, samples = moved, later
-        moves.append(move)
-    mine, theirs = first.shared(samples)
-    before, after = (float(np.median(ncc)) if len(mine) else 0.0 for ncc in (first.ncc[mine], samples.ncc[theirs]))
-    return Agreed(vertices, len(np.unique(first.vertex[mine])) / len(plan.chosen), sum(moves), before, after, len(moves))
+        vertices, measurements = moved, candidate
+        displacements.append(median_displacement)
+    rows_before, rows_after = initial.shared(measurements)
+    before, after = (float(np.median(ncc)) if len(rows_before) else 0.0 for ncc in (initial.ncc[rows_before], measurements.ncc[rows_after]))
+    share = len(np.unique(initial.vertex[rows_before])) / len(plan.measured_vertices)
+    return PhotometricResult(vertices, share, sum(displacements), before, after, len(displacements))

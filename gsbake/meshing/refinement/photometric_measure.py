@@ -1,12 +1,12 @@
-"""What photos say about where a mesh should be: displacements along its normals, measured by every photo at points spread over it.
+"""Photometric measurement of mesh displacements along the normals, by every photo at a subset of the vertices.
 
-A patch in a plane, carried from one photo to others by the plane's homography, matches best where the surface is (Goesele et al.,
-*Multi-view stereo for community photo collections*, ICCV 2007). The plane lies through the mean of the mesh over the patch: a plane that
-fits a bent surface lies under its crest, by a quarter of a pixel where the radius is a hundred.
+A planar patch, mapped from one photo to others by the plane's homography, matches best at the true depth (Goesele et al., *Multi-view
+stereo for community photo collections*, ICCV 2007). The plane passes through the mean of the mesh over the patch: a plane fitted to a
+curved surface lies below its apex, by a quarter of a pixel at a radius of a hundred pixels.
 
-A measurement is worth its Fisher information: a summed cost with second derivative b, left at c per view by noise, says s b / (2 c) with s
-samples. It counts only where stereo confirmed the photo's depth, times that confidence, and by majority: of the photos that see a
-place, most must say something useful. Gloss shows every photo another reflection: stereo confirms few of them and fewer agree.
+A measurement is weighted by its Fisher information: a summed cost with second derivative b and residual c per view gives s b / (2 c) with
+s samples. It is used only where stereo confirmed the photo's depth, times that confidence, and by majority: most of the photos that see a
+vertex must give a valid measurement. Specular reflections differ between photos: stereo confirms few of them and fewer are consistent.
 """
 
 from __future__ import annotations
@@ -21,41 +21,41 @@ from numpy.typing import NDArray
 from gsbake.geometry.cameras import Camera
 from gsbake.geometry.raycast import RayCaster
 from gsbake.meshing.cleanup import Faces, Vertices
-from gsbake.meshing.refinement.normals import edges_of, vertex_normals
-from gsbake.meshing.refinement.photometric_kernel import displace
-from gsbake.mvs.ncc import RADIUS, SAMPLES, Pattern
-from gsbake.mvs.pyramids import Pair, Photo
-from gsbake.mvs.view_selection import choose
+from gsbake.meshing.refinement.normals import unique_edges, vertex_normals
+from gsbake.meshing.refinement.photometric_kernel import measure_displacements
+from gsbake.mvs.ncc import RADIUS, SAMPLES, SamplingPattern
+from gsbake.mvs.pyramids import MatchingViews, Photo
+from gsbake.mvs.view_selection import select_views
 from gsbake.surfels.raster.threads import run_chunks
 
 Floats = NDArray[np.float32]
 Doubles = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
-#: Photos each photo is compared with, and how many of them, the best at each point, count.
-NEIGHBOURS, BEST = 6, 4
-#: Points that tell which photos look at the same places.
-PAIRING = 500
-#: A photo that sees a point under a smaller cosine does not measure it.
-LEAST_COSINE = 0.4
-#: Step along the normal to either side, in pixels of the reference: with 14 degrees between photos a quarter of a pixel of disparity.
-STEP = 1.0
-#: The lowest place of a parabola is believed up to this many steps away, and so is a plane on a surface that bends away from it.
-BELIEVED = 1.5
-#: One point is measured per this many square pixels of surface: a patch covers ten times as many.
-SPARSE = 24.0
-#: Mean squared distance of a patch's samples from its middle, by their weights, in square pixels; and most steps that are walked for it.
-PATCH, MOST_STEPS = 36.0, 200
-#: Relative variance of grey that no fit takes away (aliasing, compression).
-FLOOR = 0.02
-#: Most information per square pixel that one measurement is believed to hold.
-MOST = 3.0
+#: Photos with which each photo is compared, and how many of them, the best at each point, are used.
+NEIGHBOURS, BEST_VIEWS = 6, 4
+#: Points from which the photos' shared visibility is determined.
+PAIRING_POINTS = 500
+#: Minimum cosine between normal and viewing direction of a measurement.
+MIN_COSINE = 0.4
+#: Step along the normal in pixels of the reference photo: a quarter of a pixel of disparity at 14 degrees between photos.
+STEP_PIXELS = 1.0
+#: Maximum distance in steps of a parabola's minimum, and of the patch plane from the surface.
+MAX_STEPS = 1.5
+#: Square pixels of surface per measured vertex; a patch covers ten times as many.
+PIXELS_PER_POINT = 24.0
+#: Weighted mean squared distance of a patch's samples from its centre in square pixels; maximum random-walk steps.
+PATCH_VARIANCE, MAX_WALK_STEPS = 36.0, 200
+#: Minimum residual cost (aliasing, compression).
+NOISE_FLOOR = 0.02
+#: Maximum information per square pixel of one measurement.
+MAX_INFORMATION = 3.0
 
 
 @dataclass(frozen=True)
-class Capture:
-    """The photos: their `cameras`, `photo(i)` at the same size, and `depth(i)`: z-depth (h, w; 0 = none) with confidence from stereo at any
-    size of photo i, or None. A depth up to `tolerance` (world units) from the mesh speaks for it."""
+class PhotometricViews:
+    """Photos for photometric refinement: `cameras`, `photo(i)` at the same size, and `depth(i)`: stereo z-depth (h, w; 0 = none) and
+    confidence at any size of photo i, or None. A stereo depth within `tolerance` (world units) of the mesh confirms it."""
 
     cameras: Sequence[Camera]
     photo: Callable[[int], Photo]
@@ -64,127 +64,130 @@ class Capture:
 
 
 @dataclass(frozen=True)
-class Plan:
-    """What stays while a mesh is moved: its `faces` and `edges`, the measured vertices `chosen`, the median size of a `pixel` on
-    it, the photos each photo is paired with, and `share`, how much of a patch's area one vertex has."""
+class MeasurementPlan:
+    """Constants of the refinement of one mesh: `faces`, `edges`, indices of the `measured_vertices`, median `pixel_size` on the surface,
+    the photos paired with each photo, and `patch_share`, one vertex's share of a patch's area."""
 
     faces: Faces
     edges: Indices
-    chosen: Indices
-    pixel: float
+    measured_vertices: Indices
+    pixel_size: float
     pairs: list[list[int]]
-    share: float
+    patch_share: float
 
     @staticmethod
-    def make(vertices: Vertices, faces: Faces, cameras: Sequence[Camera]) -> Plan:
-        """For a mesh (unit frame, wound outward) that these cameras see."""
+    def make(vertices: Vertices, faces: Faces, cameras: Sequence[Camera]) -> MeasurementPlan:
+        """Plan for a mesh (unit frame, outward winding) and its cameras."""
         corners, count = vertices[faces], len(vertices)
         area = 0.5 * float(np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum())
-        pixel = float(np.median([np.linalg.norm(c.centre - vertices.mean(0)) / (0.5 * (c.fx + c.fy)) for c in cameras]))
-        own = area / count / pixel**2
-        some = np.arange(0, count, max(1, count // PAIRING))
-        pairs, _ = choose(cameras, vertices[some], vertex_normals(vertices, faces)[some], NEIGHBOURS, NEIGHBOURS)
-        chosen = np.arange(0, count, max(1, round(SPARSE / own)))
-        return Plan(faces, edges_of(faces), chosen, pixel, pairs, min(own / (np.pi * RADIUS**2), 1.0))
+        pixel_size = float(np.median([np.linalg.norm(c.centre - vertices.mean(0)) / (0.5 * (c.fx + c.fy)) for c in cameras]))
+        vertex_area = area / count / pixel_size**2
+        sample = np.arange(0, count, max(1, count // PAIRING_POINTS))
+        pairs, _ = select_views(cameras, vertices[sample], vertex_normals(vertices, faces)[sample], NEIGHBOURS, NEIGHBOURS)
+        measured_vertices = np.arange(0, count, max(1, round(PIXELS_PER_POINT / vertex_area)))
+        return MeasurementPlan(
+            faces, unique_edges(faces), measured_vertices, pixel_size, pairs, min(vertex_area / (np.pi * RADIUS**2), 1.0)
+        )
 
 
 @dataclass(frozen=True)
-class Samples:
-    """Measurements, one per photo and vertex that it sees (m,): `photo` and `vertex`; `shift` along the normal in world units;
-    `information` per square pixel, 0 when useless; mean `ncc` of the photos that match."""
+class Measurements:
+    """Measurements (m,), one per photo and visible vertex: `photo` and `vertex`; `displacement` along the normal in world units;
+    `information` per square pixel, 0 when invalid; mean `ncc` of the matching photos."""
 
     photo: Indices
     vertex: Indices
-    shift: Doubles
+    displacement: Doubles
     information: Doubles
     ncc: Doubles
 
     def weights(self) -> Doubles:
-        """Information (m,) times the majority at its vertex: the share of useful measurements less that of useless ones, or 0."""
-        seen = np.bincount(self.vertex)
+        """Information (m,) times the majority at its vertex: the share of valid measurements minus that of invalid ones, or 0."""
+        visible = np.bincount(self.vertex)
         useful = np.bincount(self.vertex, self.information > 0)
-        return self.information * np.maximum(2 * useful / np.maximum(seen, 1) - 1, 0)[self.vertex]
+        return self.information * np.maximum(2 * useful / np.maximum(visible, 1) - 1, 0)[self.vertex]
 
-    def shared(self, later: Samples) -> tuple[Indices, Indices]:
-        """Rows of the measurements with a weight, and rows of the `later` ones by the same photos at the same vertices."""
+    def shared(self, other: Measurements) -> tuple[Indices, Indices]:
+        """Rows of the measurements with positive weight, and rows of `other` with the same photos and vertices."""
         rows = np.flatnonzero(self.weights() > 0)
-        keys = [s.vertex << 32 | s.photo for s in (self, later)]
-        _, mine, theirs = np.intersect1d(keys[0][rows], keys[1], assume_unique=True, return_indices=True)
-        return rows[mine], theirs
+        keys = [s.vertex << 32 | s.photo for s in (self, other)]
+        _, rows_self, rows_other = np.intersect1d(keys[0][rows], keys[1], assume_unique=True, return_indices=True)
+        return rows[rows_self], rows_other
 
 
-def patch_means(vertices: Vertices, edges: Indices, spread: float) -> Vertices:
-    """Means (v, 3) of the surface around each vertex, over places whose mean squared distance from it is `spread` (world units²).
+def patch_means(vertices: Vertices, edges: Indices, mean_squared_distance: float) -> Vertices:
+    """Mean (v, 3) of the surface around each vertex, weighted with variance `mean_squared_distance` (world units²).
 
-    A walk from a vertex to one of its n neighbours or to itself, with equal chances, goes n / (n + 1) of a mean squared edge a step.
+    A random walk from a vertex to one of its n neighbours or itself with equal probability adds n / (n + 1) of the mean squared edge
+    per step.
     """
     count = len(vertices)
-    link = sparse.csr_matrix((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(count, count))
-    walk = link + link.T + sparse.identity(count)
-    ways = np.asarray(walk.sum(1)).ravel()
-    walk = sparse.diags(1 / ways) @ walk
-    squared = float(((vertices[edges[:, 0]] - vertices[edges[:, 1]]) ** 2).sum(1).mean() * (1 - 1 / ways.mean()))
-    for _ in range(min(round(spread / squared), MOST_STEPS)):
-        vertices = walk @ vertices
+    adjacency = sparse.csr_matrix((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(count, count))
+    transition = adjacency + adjacency.T + sparse.identity(count)
+    row_sums = np.asarray(transition.sum(1)).ravel()
+    transition = sparse.diags(1 / row_sums) @ transition
+    variance_per_step = float(((vertices[edges[:, 0]] - vertices[edges[:, 1]]) ** 2).sum(1).mean() * (1 - 1 / row_sums.mean()))
+    for _ in range(min(round(mean_squared_distance / variance_per_step), MAX_WALK_STEPS)):
+        vertices = transition @ vertices
     return vertices
 
 
-def measure(vertices: Vertices, plan: Plan, capture: Capture, threads: int) -> Samples:
-    """What every photo with its pairs says about the chosen vertices."""
-    edges, chosen = plan.edges, plan.chosen
+def measure(vertices: Vertices, plan: MeasurementPlan, views: PhotometricViews, threads: int) -> Measurements:
+    """Measurements of every photo, with its paired photos, at the measured vertices."""
+    edges, measured_vertices = plan.edges, plan.measured_vertices
     caster = RayCaster(vertices, plan.faces, threads)
-    means = patch_means(vertices, edges, PATCH * plan.pixel**2)
-    points, normals = vertices[chosen], vertex_normals(means, plan.faces)[chosen]
-    sag = np.einsum("nk,nk->n", normals, means[chosen] - points)
-    lift = 0.5 * float(np.linalg.norm(vertices[edges[:, 0]] - vertices[edges[:, 1]], axis=1).mean())
-    seen = np.stack([caster.seen_from(camera, points, normals, LEAST_COSINE, lift) for camera in capture.cameras])
-    parts = [_of_photo(index, others, seen, (points, normals, sag), capture) for index, others in enumerate(plan.pairs)]
+    means = patch_means(vertices, edges, PATCH_VARIANCE * plan.pixel_size**2)
+    points, normals = vertices[measured_vertices], vertex_normals(means, plan.faces)[measured_vertices]
+    plane_offset = np.einsum("nk,nk->n", normals, means[measured_vertices] - points)
+    ray_offset = 0.5 * float(np.linalg.norm(vertices[edges[:, 0]] - vertices[edges[:, 1]], axis=1).mean())
+    visible = np.stack([caster.visible_from(camera, points, normals, MIN_COSINE, ray_offset) for camera in views.cameras])
+    parts = [_measure_photo(index, others, visible, (points, normals, plane_offset), views) for index, others in enumerate(plan.pairs)]
     photo = np.repeat(np.arange(len(parts)), [len(part[0]) for part in parts])
-    rows, shift, information, ncc = (np.concatenate(column) for column in zip(*parts, strict=True))
-    return Samples(photo, chosen[rows], shift, information, ncc)
+    rows, displacement, information, ncc = (np.concatenate(column) for column in zip(*parts, strict=True))
+    return Measurements(photo, measured_vertices[rows], displacement, information, ncc)
 
 
-def _of_photo(
-    index: int, others: list[int], seen: NDArray[np.bool_], places: tuple[Vertices, Vertices, Doubles], capture: Capture
+def _measure_photo(
+    index: int, others: list[int], visible: NDArray[np.bool_], surface: tuple[Vertices, Vertices, Doubles], views: PhotometricViews
 ) -> tuple[Indices, Doubles, Doubles, Doubles]:
-    """Rows of the points that photo `index` and one of the `others` see, with shift, information and NCC.
+    """Rows of the points visible in photo `index` and one of the `others`, with displacement, information and NCC.
 
-    `places` are points and normals (n, 3), and how far (n,) the mesh's mean over a patch seen head on lies above the point.
+    `surface` is points and normals (n, 3), and the offset (n,) along the normal of the mesh's mean over a patch at normal incidence.
     """
-    camera = capture.cameras[index]
-    rows = np.flatnonzero(seen[index] & seen[others].any(0))
+    camera = views.cameras[index]
+    rows = np.flatnonzero(visible[index] & visible[others].any(0))
     if len(rows) == 0:
         return rows, np.zeros(0), np.zeros(0), np.zeros(0)
-    points, normals, sag = (part[rows] for part in places)
-    way = camera.centre - points
-    cosine = np.einsum("nk,nk->n", normals, way) / np.linalg.norm(way, axis=1)
-    bent = 0.5 * (1 + 1 / cosine**2) * sag  # seen obliquely a patch is longer in one of two directions
-    local = (points + bent[:, None] * normals) @ camera.R.T + camera.t
-    pixel = local[:, 2] / (0.5 * (camera.fx + camera.fy))
-    steps = (STEP * pixel).astype(np.float32)
-    sees = (seen[others][:, rows].astype(np.int64) << np.arange(len(others))[:, None]).sum(0)
-    pair = Pair.of(capture.photo(index), [capture.photo(j) for j in others])
-    pattern = Pattern.make()
-    shift, bend, cost = (np.empty(len(rows), np.float32) for _ in range(3))
+    points, normals, plane_offset = (part[rows] for part in surface)
+    to_camera = camera.centre - points
+    cosine = np.einsum("nk,nk->n", normals, to_camera) / np.linalg.norm(to_camera, axis=1)
+    oblique_offset = 0.5 * (1 + 1 / cosine**2) * plane_offset  # at oblique incidence the patch is elongated in one direction
+    local = (points + oblique_offset[:, None] * normals) @ camera.R.T + camera.t
+    pixel_size = local[:, 2] / (0.5 * (camera.fx + camera.fy))
+    steps = (STEP_PIXELS * pixel_size).astype(np.float32)
+    visible_bits = (visible[others][:, rows].astype(np.int64) << np.arange(len(others))[:, None]).sum(0)
+    pair = MatchingViews.of(views.photo(index), [views.photo(j) for j in others])
+    pattern = SamplingPattern.make()
+    displacement, curvature, cost = (np.empty(len(rows), np.float32) for _ in range(3))
     fixed = (
-        local.astype(np.float32), (normals @ camera.R.T).astype(np.float32), sees, steps, pair.grey, pair.inside, pair.lens,
-        (pattern.du, pattern.dv, pattern.near, pattern.alike), (pair.lenses, pair.packed, pair.starts, pair.sizes), BEST,
-        shift, bend, cost,
+        local.astype(np.float32), (normals @ camera.R.T).astype(np.float32), visible_bits, steps, pair.grey, pair.inside, pair.intrinsics,
+        pattern.arrays, pair.sources, BEST_VIEWS,
+        displacement, curvature, cost,
     )  # fmt: skip
-    run_chunks(lambda start, stop: displace(start, stop, *fixed), len(rows), minimum=256)
-    information = np.minimum(SAMPLES / 2 * bend / STEP**2 / (cost + FLOOR), MOST)
-    believed = (np.abs(shift) <= BELIEVED * steps) & (np.abs(bent) <= BELIEVED * steps)
-    sure = _confidence(camera, points, capture.depth(index), capture.tolerance)
-    return rows, shift.astype(np.float64), np.where(believed, information, 0.0) * sure, 1.0 - cost.astype(np.float64)
+    run_chunks(lambda start, stop: measure_displacements(start, stop, *fixed), len(rows), minimum=256)
+    information = np.minimum(SAMPLES / 2 * curvature / STEP_PIXELS**2 / (cost + NOISE_FLOOR), MAX_INFORMATION)
+    valid = (np.abs(displacement) <= MAX_STEPS * steps) & (np.abs(oblique_offset) <= MAX_STEPS * steps)
+    weight = _confidence(camera, points, views.depth(index), views.tolerance)
+    return rows, displacement.astype(np.float64), np.where(valid, information, 0.0) * weight, 1.0 - cost.astype(np.float64)
 
 
-def _confidence(camera: Camera, points: Vertices, measured: tuple[Floats, Floats] | None, tolerance: float) -> Doubles:
-    """Stereo's confidence (n,) where its depth lies within `tolerance` of the points (n, 3), which are in the picture; else 0."""
-    if measured is None:
+def _confidence(camera: Camera, points: Vertices, stereo: tuple[Floats, Floats] | None, tolerance: float) -> Doubles:
+    """Stereo confidence (n,) at points (n, 3) inside the image whose stereo depth lies within `tolerance`; else 0."""
+    if stereo is None:
         return np.zeros(len(points))
-    depth, confidence = measured
+    depth, confidence = stereo
     uv, z = camera.project(points)
     size = np.array(depth.shape[::-1])
     column, row = np.minimum((uv * (size / (camera.width, camera.height))).astype(np.int64), size - 1).T
-    there = depth[row, column]
-    return np.where((there > 0) & (np.abs(there - z) <= tolerance), confidence[row, column], 0).astype(np.float64)
+    stereo_depth = depth[row, column]
+    return np.where((stereo_depth > 0) & (np.abs(stereo_depth - z) <= tolerance), confidence[row, column], 0).astype(np.float64)

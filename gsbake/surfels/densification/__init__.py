@@ -1,1 +1,1 @@
-"""Adding and removing surfels."""
+"""Densification and pruning of surfels: one module per policy, a registry, clone and split, and the refinement after training."""

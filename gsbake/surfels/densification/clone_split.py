@@ -1,8 +1,7 @@
-"""Adding and dropping surfels: clone and split under a budget, and pruning by opacity, size, visibility and distance from the surface.
+"""Clone and split under a budget, and pruning by opacity, size, visibility and distance from the surface.
 
-Clone/split after 3DGS (Kerbl et al. 2023); children inherit s (Zhu et al. 2025). Instead of a fixed threshold the surfels with the
-largest score (`policies.py`: the mean screen gradient, or that and the SDF sample) are taken, as many as a budget that grows to
-`surfels.max_count` allows: no scene-dependent constant to guess.
+Clone/split after 3DGS (Kerbl et al. 2023); children inherit the SDF sample s (Zhu et al. 2025). Instead of a fixed threshold the surfels
+with the highest score of a densification policy are taken, within a budget that grows to `surfels.max_count`: no scene-dependent constant.
 """
 
 from __future__ import annotations
@@ -13,24 +12,20 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from gsbake.surfels.densification.policies import Placement
 from gsbake.surfels.model import Surfels
 from gsbake.surfels.raster.reference import rotation_matrix
 from gsbake.surfels.training.adam import Adam
 
-#: Share of the transfer's peak opacity below which a surfel is dropped (DSDF: .005, its peak is 1).
-OPACITY_FLOOR = 0.005
-#: Mean weight per view (in pixels) below which a surfel counts as hidden: it lies behind others and costs time without being seen.
-HIDDEN_WEIGHT = 0.05
-#: Discs start with a σ of this share of the distance to their neighbours (`surfels.create`), and keep near it while they cover the surface.
-DISC_SHARE = 0.6
-#: Spacings from the surface beyond which a surfel counts as off it in training; refine has a setting for it.
-FAR_SPACINGS = 3.0
+#: Surfels with a lower opacity, as a share of the transfer function's peak, are pruned (discretized SDF: .005, its peak is 1).
+MIN_RELATIVE_OPACITY = 0.005
+#: Surfels with a lower mean blending weight per view (in pixels) are occluded and pruned.
+MIN_VIEW_WEIGHT = 0.05
 
 
 @dataclass
 class Statistics:
-    """Per surfel since the last change: summed screen gradient (pixels at unit resolution), views that touched it, summed weight."""
+    """Per surfel since the last densification: summed screen-space gradient (pixels at unit resolution), number of views that rendered
+    it, summed blending weight."""
 
     gradient: Tensor
     views: Tensor
@@ -38,26 +33,20 @@ class Statistics:
 
     @staticmethod
     def zeros(n: int, device: str | torch.device = "cpu") -> Statistics:
-        """Fresh statistics for n surfels."""
+        """Empty statistics for n surfels."""
         return Statistics(*(torch.zeros(n, device=device) for _ in range(3)))
 
     def add(self, screen_grad: Tensor, touched: Tensor, size: int) -> None:
-        """Collect one backward pass: gradients (n, ≥2) w.r.t. the screen centre in pixels, weights (n,); `size` makes them
-        resolution-free."""
-        seen = touched > 0
-        self.gradient += torch.where(seen, torch.hypot(screen_grad[:, 0], screen_grad[:, 1]) * (size / 2), 0.0)
-        self.views += seen
+        """Accumulate one backward pass: gradients (n, ≥2) w.r.t. the projected centre in pixels, blending weights `touched` (n,); `size`,
+        the image's longer side in pixels, normalises the gradients."""
+        visible = touched > 0
+        self.gradient += torch.where(visible, torch.hypot(screen_grad[:, 0], screen_grad[:, 1]) * (size / 2), 0.0)
+        self.views += visible
         self.weight += touched
 
     def mean_gradient(self) -> Tensor:
-        """Mean screen gradient (n,) over the views that touched each surfel."""
+        """Mean screen-space gradient (n,) over the views that rendered each surfel."""
         return self.gradient / self.views.clamp_min(1)
-
-
-def placement(surfels: Surfels) -> Placement:
-    """Where the surfels stand by their own SDF samples, the spacing read off the median disc."""
-    spacing = float(surfels.scale.max(1).values.median()) / DISC_SHARE if len(surfels) else 1.0
-    return Placement(surfels.sdf.abs(), surfels.opacity() / surfels.transfer.peak, spacing, FAR_SPACINGS * spacing)
 
 
 def replace_rows(surfels: Surfels, adam: Adam, keep: Tensor, children: Surfels | None) -> Surfels:
@@ -72,9 +61,9 @@ def replace_rows(surfels: Surfels, adam: Adam, keep: Tensor, children: Surfels |
 
 @torch.no_grad()
 def densify(surfels: Surfels, adam: Adam, score: Tensor, budget: int, large: float, generator: torch.Generator) -> Surfels:
-    """Split (scale above `large`) or clone the surfels with the largest `score` (n,) until `budget` surfels exist; a score of 0 never does.
+    """Split (scale above `large`) or clone the surfels with the highest `score` (n,) > 0 until there are `budget` surfels.
 
-    A split surfel becomes two of 1/1.6 its size at random places of its disc; a clone is a copy.
+    A split surfel becomes two of 1/1.6 its size, sampled from its Gaussian; a clone is a copy.
     """
     room = budget - len(surfels)
     chosen = torch.argsort(score, descending=True, stable=True)[: max(0, room)]
@@ -87,12 +76,12 @@ def densify(surfels: Surfels, adam: Adam, score: Tensor, budget: int, large: flo
     children = []
     for _ in range(2):
         offset = torch.randn(len(chosen), 2, generator=generator).to(score.device).clamp(-2, 2) * parents.scale
-        place = parents.position + torch.einsum("nij,nj->ni", axes, offset)
+        sampled = parents.position + torch.einsum("nij,nj->ni", axes, offset)
         child = parents.select(torch.arange(len(chosen)))
-        child.position = torch.where(split[:, None], place, parents.position)
+        child.position = torch.where(split[:, None], sampled, parents.position)
         child.log_scale = torch.where(split[:, None], parents.log_scale - math.log(1.6), parents.log_scale)
         children.append(child)
-    # the first child takes its parent's row, moments and all
+    # the first child replaces its parent and keeps Adam's moments
     surfels.position[chosen] = children[0].position
     surfels.log_scale[chosen] = children[0].log_scale
     return replace_rows(surfels, adam, torch.arange(len(surfels)), children[1])
@@ -102,15 +91,15 @@ def densify(surfels: Surfels, adam: Adam, score: Tensor, budget: int, large: flo
 def prune(
     surfels: Surfels, adam: Adam, stats: Statistics | None, largest: float, off: Tensor | None = None
 ) -> tuple[Surfels, Tensor, dict[str, int]]:
-    """Drop surfels that are transparent, larger than `largest`, not finite, (given statistics) hidden in all views, or `off` (n,) the
-    surface by a rule of `policies.py`; returns also the kept index and how many fell to each reason."""
+    """Prune surfels that are transparent, larger than `largest`, not finite, (given statistics) occluded in all views, or `off` (n,) the
+    surface by a pruning policy; return also the kept indices and the number of surfels by reason."""
     dropped = {
-        "transparent": surfels.opacity() < OPACITY_FLOOR * surfels.transfer.peak,
+        "transparent": surfels.opacity() < MIN_RELATIVE_OPACITY * surfels.transfer.peak,
         "too large": surfels.scale.max(1).values > largest,
         "not finite": ~torch.isfinite(surfels.position).all(1),
     }
     if stats is not None:
-        dropped["unseen"] = (stats.weight <= HIDDEN_WEIGHT * stats.views) & ~dropped["transparent"]
+        dropped["unseen"] = (stats.weight <= MIN_VIEW_WEIGHT * stats.views) & ~dropped["transparent"]
     if off is not None:
         dropped["off the surface"] = off
     bad = torch.stack(list(dropped.values())).any(0)

@@ -28,7 +28,7 @@ _ZERO, _ONE, _HALF = np.float32(0.0), np.float32(1.0), np.float32(0.5)
 _CHUNK = 16384
 _MIN_SQUARED_LENGTH = np.float32(1e-12)
 # the sRGB curve (IEC 61966-2-1)
-_KINK, _SLOPE, _SCALE, _OFFSET = (np.float32(x) for x in (srgb.KINK, srgb.SLOPE, srgb.SCALE, srgb.OFFSET))
+_KINK, _SLOPE, _SCALE, _OFFSET = (np.float32(x) for x in (srgb.LINEAR_THRESHOLD, srgb.SLOPE, srgb.SCALE, srgb.OFFSET))
 _EXPONENT = np.float32(1 / 2.4)
 _TO_BASE_2 = np.float32(1 / np.log(2))
 _POWER = np.array(EXP2_COEFFICIENTS, np.float32)

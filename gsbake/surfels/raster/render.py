@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from gsbake.geometry.cameras import Camera
 from gsbake.surfels.model import Surfels
 from gsbake.surfels.raster.gbuffer import rasterise, rendered_image
-from gsbake.surfels.training.views import TrainView, pose_of
+from gsbake.surfels.training.views import TrainView, camera_tensors
 
 Image = NDArray[np.float32]
 
@@ -64,5 +64,5 @@ class SurfelRenderer:
 
 
 def _view(camera: Camera, device: torch.device) -> TrainView:
-    r, t, centre, pinhole = pose_of(camera)
+    r, t, centre, pinhole = camera_tensors(camera)
     return TrainView(camera.name, torch.empty(0), None, r, t, centre, pinhole).to(device)

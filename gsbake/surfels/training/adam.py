@@ -1,6 +1,6 @@
-"""Adam (Kingma and Ba 2015) over named tensors whose rows come and go as surfels are added and dropped.
+"""Adam (Kingma and Ba 2015) over named tensors whose rows change as surfels are densified and pruned.
 
-On the CPU one fused pass over value, gradient and moments does the update and, at no cost of its own, notices whatever is not finite.
+On the CPU one fused pass over value, gradient and moments does the update and, at no extra cost, detects values that are not finite.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from torch import Tensor
 
 from gsbake.surfels.raster.blocks import JIT
 from gsbake.surfels.raster.threads import run_chunks
-from gsbake.surfels.training.finite import broken
+from gsbake.surfels.training.finite import first_non_finite
 
 EPSILON = 1e-15
 
@@ -23,7 +23,7 @@ EPSILON = 1e-15
 @njit(**JIT)
 def _update(lo, hi, value, grad, first, second, root, rate):  # type: ignore[no-untyped-def]
     """Update elements lo..hi; `root` is 1/√(1 − β₂ⁿ), `rate` the rate over 1 − β₁ⁿ. Returns 0, or NaN when anything is not finite."""
-    seen = np.float32(0.0)
+    probe = np.float32(0.0)
     for i in range(np.uint64(lo), np.uint64(hi)):
         g = grad[i]
         m = np.float32(0.9) * first[i] + np.float32(0.1) * g
@@ -32,15 +32,15 @@ def _update(lo, hi, value, grad, first, second, root, rate):  # type: ignore[no-
         first[i] = m
         second[i] = v
         value[i] = x
-        seen += (x + v) * np.float32(0.0)
-    return seen
+        probe += (x + v) * np.float32(0.0)
+    return probe
 
 
 class Adam:
     """One step count per tensor; β = (.9, .999), ε = 1e-15 as in the splatting literature."""
 
     def __init__(self) -> None:
-        """Start with no moments."""
+        """Without moments."""
         self.first: dict[str, Tensor] = {}
         self.second: dict[str, Tensor] = {}
         self.count: dict[str, int] = {}
@@ -50,7 +50,7 @@ class Adam:
         """Update `value` (contiguous float32) in place.
 
         Raises FloatingPointError naming the tensor when its gradient, its values or its second moment are not finite; the tensor and
-        its moments are then of no further use.
+        its moments are invalid then.
         """
         if name not in self.first:
             self.first[name], self.second[name], self.count[name] = torch.zeros_like(value), torch.zeros_like(value), 0
@@ -66,16 +66,16 @@ class Adam:
             value.addcdiv_(m, v.sqrt().mul_(root).add_(EPSILON), value=-rate)
             fine = bool(torch.isfinite((value + v).sum()))
         if not fine:
-            what = broken({f"the gradient of {name}": grad, name: value, f"the squared gradient of {name}": v})
+            what = first_non_finite({f"the gradient of {name}": grad, name: value, f"the squared gradient of {name}": v})
             raise FloatingPointError(f"{what or name} is not finite after {n} updates")
 
     @staticmethod
     def _fused(value: Tensor, grad: Tensor, m: Tensor, v: Tensor, root: float, rate: float) -> bool:
         arrays: list[Any] = [x.view(-1).numpy() for x in (value, grad.contiguous(), m, v)]
-        seen: list[float] = []  # appending is atomic
+        probe: list[float] = []  # appending is atomic
         factors = np.float32(root), np.float32(rate)
-        run_chunks(lambda lo, hi: seen.append(_update(lo, hi, *arrays, *factors)), value.numel(), 1, 16384)
-        return not any(math.isnan(x) for x in seen)
+        run_chunks(lambda lo, hi: probe.append(_update(lo, hi, *arrays, *factors)), value.numel(), 1, 16384)
+        return not any(math.isnan(x) for x in probe)
 
     def select(self, names: list[str], index: Tensor, added: int) -> None:
         """Keep the rows at `index` of the named tensors and append `added` rows of zero moments."""

@@ -1,4 +1,4 @@
-"""Naming what is not finite: a NaN is found where it costs nothing (the optimiser's own pass) and then looked for by name."""
+"""Locating values that are not finite: the optimiser detects a NaN at no extra cost, then the tensors are searched by name."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 
-def broken(tensors: Mapping[str, Tensor | None]) -> str | None:
-    """The first of the named tensors that holds a NaN or an infinity, as "name (row 17)"; None when all are finite."""
+def first_non_finite(tensors: Mapping[str, Tensor | None]) -> str | None:
+    """The first of the named tensors that contains a NaN or an infinity, as "name (row 17)"; None when all are finite."""
     for name, x in tensors.items():
         if x is None or not x.numel():
             continue

@@ -1,4 +1,4 @@
-"""Training and refinement of surfels from files to files: the work of the stages train and refine."""
+"""Training and refinement of surfels from folders to folders: the stages train and refine."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ from gsbake.capture.posed_photos import PosedPhotos
 from gsbake.config.schema import Refine
 from gsbake.monitor import SILENT, Monitor, decide_skip, skips
 from gsbake.shading.environment import EnvironmentLight
-from gsbake.surfels.densification.policies import growth
 from gsbake.surfels.densification.refinement import prune_and_densify
-from gsbake.surfels.initialisation import begin
+from gsbake.surfels.densification.registry import choose_densification
+from gsbake.surfels.initialisation import initialise_surfels
 from gsbake.surfels.model import Surfels
-from gsbake.surfels.training.session import Execution, Session, TrainOptions
-from gsbake.surfels.training.step_budget import settled_share, settles, spared_steps
+from gsbake.surfels.training.session import Execution, Schedule, Session, TrainOptions
+from gsbake.surfels.training.step_budget import can_skip_steps, confirmed_share, skipped_steps
 
 
 @dataclass(frozen=True)
 class RefineOptions:
-    """Settings of refinement: the pruning, densification and iterations, and those of training that it continues with."""
+    """Settings of refinement: section [refine], and the training settings of its fine-tuning."""
 
     refine: Refine = Refine()
     training: TrainOptions = TrainOptions()
@@ -46,25 +46,24 @@ def train_surfels(
     """
     options = options or TrainOptions()
     posed = PosedPhotos.open(poses)
-    with monitor.part("start"):
-        surfels, kind, why = begin(posed, options.train, options.model, seed, stereo)
-        monitor.decide("initialisation", kind, why)
-    rule, reason = growth(options.train.densify, kind)
-    monitor.decide("densification", rule, reason)
+    with monitor.part("initialisation"):
+        surfels, kind, evidence = initialise_surfels(posed, options.train, options.model, seed, stereo)
+        monitor.decide("initialisation", kind, evidence)
+    policy, reason = choose_densification(options.train.densify, kind)
+    monitor.decide("densification", policy, reason)
     light = EnvironmentLight(options.light_size) if options.model.shading == "pbr" else None
     if light is None:
-        monitor.decide("environment map", "none", "the profile trains plain colours")
-    share = 0.0 if stereo is None else settled_share(posed, stereo)
-    holds, evidence = settles(share, kind, light is not None)
+        monitor.decide("environment map", "none", "colour shading (surfels.shading)")
+    share = 0.0 if stereo is None else confirmed_share(posed, stereo)
+    holds, evidence = can_skip_steps(share, kind, light is not None)
     steps = options.train.iterations
-    trusted = 1.0 if options.confirmed_steps == "always" else share
-    spared = spared_steps(steps, trusted) if skips(options.confirmed_steps, holds) else 0
+    assumed = 1.0 if options.confirmed_steps == "always" else share
+    skipped = skipped_steps(steps, assumed) if skips(options.confirmed_steps, holds) else 0
     run = Execution(out, scratch, seed, threads, device, monitor)
-    session = Session(run, posed, surfels, light, options, steps - spared, options.train.coarse_share, rule)
+    session = Session(run, posed, surfels, light, options, Schedule(steps - skipped, options.train.coarse_share, policy))
     results = session.run()
-    saved = spared * session.step_seconds
-    skipped, done = f"{spared} of {steps} steps skipped", "no steps skipped"
-    decide_skip(monitor, "confirmed_steps", options.confirmed_steps, holds, evidence, skipped, done, saved)
+    saved, outcome = skipped * session.step_seconds, f"{skipped} of {steps} steps skipped"
+    decide_skip(monitor, "confirmed_steps", options.confirmed_steps, holds, evidence, outcome, "no steps skipped", saved)
     return results
 
 
@@ -91,5 +90,5 @@ def refine_surfels(
     with monitor.part("prune and densify"):
         surfels, counts = prune_and_densify(surfels, posed, options.refine, options.training.train.max_size, seed)
     run = Execution(out, scratch, seed, threads, device, monitor)
-    session = Session(run, posed, surfels, light, options.training, options.refine.iterations, 0.0, None, trained)
+    session = Session(run, posed, surfels, light, options.training, Schedule(options.refine.iterations, 0.0, None), trained)
     return session.run() | {"counts": counts}

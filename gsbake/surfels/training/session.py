@@ -1,4 +1,4 @@
-"""A training run from files to files: loads photos, keeps checkpoints, reports progress, survives interruption, writes results."""
+"""A training run: loads photos, trains, reports progress, writes checkpoints and results, resumes after interruption."""
 
 from __future__ import annotations
 
@@ -24,15 +24,17 @@ from gsbake.surfels.training.pose_refinement import Aligner
 from gsbake.surfels.training.trainer import Plan, Trainer
 from gsbake.surfels.training.views import held_out, load_views
 
+#: Checkpoints of other versions are ignored.
 CHECKPOINT_VERSION = 3
+#: Interval between checkpoints.
 CHECKPOINT_SECONDS = 30.0
-#: Logarithms of the exposure gains per photo and linear colour channel, beside the surfels.
+#: File with the logarithms of the exposure gains per photo and linear colour channel.
 EXPOSURE = "exposure.json"
 
 
 @dataclass(frozen=True)
 class TrainOptions:
-    """Settings of a training run; `light_size` is the edge of the environment map's faces in texels, the rest are rules of [skip]."""
+    """Settings of a training run; `light_size` is the edge of the environment map's faces in texels, the rules are those of [skip]."""
 
     train: Train = Train()
     model: SurfelSettings = SurfelSettings()
@@ -46,8 +48,8 @@ class TrainOptions:
 
 @dataclass(frozen=True)
 class Execution:
-    """Where and how a run takes place: the folder `out` for results, `scratch` for checkpoints (None: none are kept), seed, threads,
-    device ("cpu" or "cuda") and monitor."""
+    """Execution of a run: folder `out` for results, `scratch` for checkpoints (None: no checkpoints), seed, threads, device ("cpu" or
+    "cuda") and monitor."""
 
     out: Path
     scratch: Path | None = None
@@ -55,6 +57,16 @@ class Execution:
     threads: int = 2
     device: str = "cpu"
     monitor: Monitor = SILENT
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """Number of `iterations`, the share of them at half resolution, and the densification `policy`, a name in `registry.DENSIFICATION`
+    (None: neither densification nor pruning)."""
+
+    iterations: int
+    coarse_share: float
+    policy: str | None
 
 
 class Session:
@@ -67,15 +79,13 @@ class Session:
         surfels: Surfels,
         light: Any,
         options: TrainOptions,
-        iterations: int,
-        coarse_share: float,
-        growth: str | None,
+        schedule: Schedule,
         trained: Path | None = None,
     ) -> None:
-        """Load the photos at `train.max_size`; continue from the newest checkpoint of an interrupted run.
+        """Load the photos at `train.max_size`; resume from the checkpoint of an interrupted run.
 
-        `growth` is the densification policy of `policies.GROWING`; None neither densifies nor prunes. Poses and exposures are refined (as
-        the options allow), unless an earlier run did that: `trained` is its folder, whose cameras `posed` has.
+        Poses and exposures are refined (as the options allow), unless an earlier run did that: `trained` is its folder, whose cameras
+        `posed` has.
         """
         self.execution, self.posed, self.trained, self.options = run, posed, trained, options
         self.monitor = run.monitor
@@ -84,12 +94,16 @@ class Session:
             full, half = ([view.to(run.device) for view in views] for views in load_views(posed, options.train.max_size))
         if trained is not None and (trained / EXPOSURE).exists():
             gains = json.loads((trained / EXPOSURE).read_text())["log_gains"]
-            known = [Correction(torch.zeros(6).double(), torch.tensor(gains[view.name]).double()) for view in full]
-            full, half = ([c.of(view) for view, c in zip(views, known, strict=True)] for views in (full, half))
-        held = held_out(len(full), options.train.holdout)
+            exposure = [Correction(torch.zeros(6).double(), torch.tensor(gains[view.name]).double()) for view in full]
+            full, half = ([c.apply(view) for view, c in zip(views, exposure, strict=True)] for views in (full, half))
+        validation = held_out(len(full), options.train.holdout)
         sections = options.train, options.model, options.loss
-        plan = Plan(*sections, iterations, coarse_share, growth is not None, run.seed, options.converged_steps, growth or "none")
-        self.trainer = Trainer(plan, surfels.to(run.device), None if light is None else light.to(run.device), full, half, held)
+        policy = schedule.policy
+        plan = Plan(
+            *sections, schedule.iterations, schedule.coarse_share, policy is not None, run.seed, options.converged_steps, policy or "none"
+        )
+        light = None if light is None else light.to(run.device)
+        self.trainer = Trainer(plan, surfels.to(run.device), light, full, half, validation)
         self.aligner = None if trained else Aligner(self.trainer, options.pose_refinement, options.exposure_refinement)
         self.before = len(surfels)
         self.step_seconds = 0.0  # measured by `run`, evaluations included
@@ -123,18 +137,18 @@ class Session:
         part.replace(path)
 
     def run(self) -> dict[str, Any]:
-        """Train to the end (or to a requested stop, which leaves a checkpoint) and write the results."""
+        """Train to the end (or to a requested stop, which writes a checkpoint) and write the results."""
         trainer, monitor = self.trainer, self.monitor
-        begun = saved = time.monotonic()
-        first = trainer.done  # not 0 in a resumed run
+        started = saved = time.monotonic()
+        first = trainer.done  # not 0 after a resume
         live: dict[str, float] = {}
-        every = max(20, min(250, trainer.plan.iterations // 12))  # enough points for a curve, at little cost
-        with monitor.part("train"):
+        interval = max(20, min(250, trainer.plan.iterations // 12))  # of evaluations: enough for a curve, at little cost
+        with monitor.part("training"):
             self._align()  # repeats a trial that was interrupted
             while trainer.done < trainer.end:
                 figures = trainer.step()
                 self._align()
-                if trainer.done % every == 0 or trainer.done >= trainer.end:
+                if trainer.done % interval == 0 or trainer.done >= trainer.end:
                     live["psnr"] = trainer.record()["psnr"]
                 monitor.progress(trainer.done, trainer.end, "", surfels=figures["surfels"], **live)
                 if monitor.stop_requested():
@@ -143,44 +157,44 @@ class Session:
                 if time.monotonic() - saved > CHECKPOINT_SECONDS:
                     self._save_checkpoint()
                     saved = time.monotonic()
-        self.step_seconds = (time.monotonic() - begun) / max(1, trainer.done - first)
+        self.step_seconds = (time.monotonic() - started) / max(1, trainer.done - first)
         self._report_decisions()
         return self._write()
 
     def _align(self) -> None:
         if self.aligner is not None:
-            self.aligner.visit(self.monitor.stop_requested)
+            self.aligner.update(self.monitor.stop_requested)
 
     def _report_decisions(self) -> None:
-        """Report what was decided about early stopping, poses and exposures."""
+        """Report the decisions on early stopping, poses and exposures."""
         trainer, options = self.trainer, self.options
         total = trainer.plan.iterations
-        spared = total - trainer.end
-        stopped, seconds = f"stopped at step {trainer.end} of {total}", spared * self.step_seconds
+        skipped = total - trainer.end
+        stopped, seconds = f"stopped at step {trainer.end} of {total}", skipped * self.step_seconds
         rule = options.converged_steps
-        decide_skip(self.monitor, "converged_steps", rule, spared > 0, trainer.standing, stopped, f"all {total} steps", seconds)
+        decide_skip(self.monitor, "converged_steps", rule, skipped > 0, trainer.plateau_evidence, stopped, f"all {total} steps", seconds)
         if self.aligner is None:
             return
-        on, why = self.aligner.outcome, self.aligner.evidence
-        decide_skip(self.monitor, "pose_refinement", options.pose_refinement, not on.poses, why, "poses kept", "poses refined")
-        constant, learnt = "exposure taken as constant", "exposure gains learnt"
-        decide_skip(self.monitor, "exposure_refinement", options.exposure_refinement, not on.gains, why, constant, learnt)
+        kinds, evidence = self.aligner.decision, self.aligner.evidence
+        decide_skip(self.monitor, "pose_refinement", options.pose_refinement, not kinds.poses, evidence, "poses kept", "poses refined")
+        constant, learnt = "constant exposure", "exposure gains learnt"
+        decide_skip(self.monitor, "exposure_refinement", options.exposure_refinement, not kinds.gains, evidence, constant, learnt)
 
     def _write_corrections(self) -> None:
-        """Write the current cameras and gains where they differ from those of the poses stage."""
+        """Write cameras and exposure gains where they differ from those of the poses stage."""
         out = self.execution.out
         if self.trained is not None:
             for name in ("cameras.json", EXPOSURE):
                 if (self.trained / name).exists():
                     shutil.copyfile(self.trained / name, out / name)
         elif self.aligner is not None:
-            made, on = self.aligner.corrections, self.aligner.outcome
+            corrections, kinds = self.aligner.corrections, self.aligner.decision
             given = self.posed.cameras
-            if on.poses:
-                cameras = tuple(c.camera(camera) for c, camera in zip(made, given.cameras, strict=True))
+            if kinds.poses:
+                cameras = tuple(c.apply_to_camera(camera) for c, camera in zip(corrections, given.cameras, strict=True))
                 replace(given, cameras=cameras).save(out / "cameras.json")
-            if on.gains:
-                gains = {camera.name: c.gain.tolist() for c, camera in zip(made, given.cameras, strict=True)}
+            if kinds.gains:
+                gains = {camera.name: c.gain.tolist() for c, camera in zip(corrections, given.cameras, strict=True)}
                 (out / EXPOSURE).write_text(json.dumps({"log_gains": gains}, indent=1))
 
     def _write(self) -> dict[str, Any]:
@@ -199,7 +213,7 @@ class Session:
             "surfels_before": self.before,
             "surfels": len(trainer.surfels),
             "psnr": round(psnr, 3),
-            "held_out": [trainer.views[i].name for i in trainer.held],
+            "held_out": [trainer.views[i].name for i in trainer.validation_indices],
             "gamma": round(float(trainer.surfels.gamma), 4),
             "sdf_median": round(float(trainer.surfels.sdf.abs().median()), 6) if len(trainer.surfels) else None,
         }

@@ -1,8 +1,7 @@
-"""How much of the shape stereo has settled before training, and how many steps that spares.
+"""Training steps that can be skipped where stereo has confirmed the shape.
 
-Surfels that start on confirmed depths already lie near where training would bring them; what is left to find is the rest of the object. So
-there are fewer steps for all surfels. Holding the confirmed ones in place instead was measured to be worse (docs/skip.md): what training
-moves them by is an improvement.
+Surfels initialised on confirmed depths are already near the surface, so training needs fewer steps. Freezing the confirmed surfels instead
+was measured to be worse (docs/lab/skip.md): training still improves them.
 """
 
 from __future__ import annotations
@@ -14,13 +13,13 @@ import numpy as np
 from gsbake.capture.posed_photos import PosedPhotos
 from gsbake.mvs.depth_maps import read_depth
 
-#: Stereo must have confirmed this share of the object before steps are left out.
-LEAST_SETTLED = 0.5
-#: Share of the steps left out where stereo has confirmed all of it.
-MOST_SPARED = 0.5
+#: Minimum share of the object that stereo confirmed for steps to be skipped.
+MIN_CONFIRMED_SHARE = 0.5
+#: Share of the steps skipped where stereo has confirmed the whole object.
+MAX_SKIPPED_SHARE = 0.5
 
 
-def settled_share(posed: PosedPhotos, folder: Path) -> float:
+def confirmed_share(posed: PosedPhotos, folder: Path) -> float:
     """Share of the object's pixels (of all pixels, without masks) whose depth the stereo stage in `folder` confirmed; 0 without any."""
     confirmed = pixels = 0
     for index, camera in enumerate(posed.cameras.cameras):
@@ -35,18 +34,18 @@ def settled_share(posed: PosedPhotos, folder: Path) -> float:
     return confirmed / pixels if pixels else 0.0
 
 
-def settles(share: float, start: str, materials: bool) -> tuple[bool, str]:
-    """Whether steps can be left out, and the evidence.
+def can_skip_steps(share: float, initialisation: str, materials: bool) -> tuple[bool, str]:
+    """Whether steps can be skipped, and the evidence.
 
-    `share` is that of `settled_share`, `start` what the surfels start from, `materials` whether they learn materials besides the shape.
+    `share` is that of `confirmed_share`, `initialisation` that of the surfels, `materials` whether they learn materials besides the shape.
     """
-    if start != "stereo":
-        return False, f"surfels start from {start}"
+    if initialisation != "stereo":
+        return False, f"initialisation from {initialisation}"
     if materials:
-        return False, "the surfels learn materials, which takes all steps"
-    return share >= LEAST_SETTLED, f"stereo confirmed {100 * share:.0f} % of the object, {100 * LEAST_SETTLED:.0f} % are needed"
+        return False, "learning materials needs all steps"
+    return share >= MIN_CONFIRMED_SHARE, f"stereo confirmed {100 * share:.0f} % of the object; {100 * MIN_CONFIRMED_SHARE:.0f} % are needed"
 
 
-def spared_steps(iterations: int, share: float) -> int:
-    """Steps of `iterations` that are left out where stereo has settled `share` of the object."""
-    return round(MOST_SPARED * share * iterations)
+def skipped_steps(iterations: int, share: float) -> int:
+    """Number of the `iterations` that are skipped where stereo has confirmed `share` of the object."""
+    return round(MAX_SKIPPED_SHARE * share * iterations)

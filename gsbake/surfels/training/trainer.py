@@ -1,8 +1,7 @@
-"""Training: one loop over photos that fits surfels, their SDF samples, materials and the light (Zhu et al., ICCV 2025).
+"""Training loop over photos: fits surfels, their SDF samples, materials and the environment map (Zhu et al., ICCV 2025).
 
-The schedule is the paper's in shares of the run (of 30 000 steps: median, projection and distortion from 1 000, densify 500
-to 15 000), with the
-first part at half resolution. All state is in `state()`: a run resumed from a checkpoint ends with the same result.
+The schedule is the paper's in shares of the run (of 30 000 steps: median, projection and distortion losses from 1 000, densification from
+500 to 15 000), with the first part at half resolution. All state is in `state()`: a run resumed from a checkpoint gives the same result.
 """
 
 from __future__ import annotations
@@ -15,8 +14,9 @@ import torch
 from torch import Tensor
 
 from gsbake.imaging.metrics import decibels
-from gsbake.surfels.densification.clone_split import Statistics, densify, placement, prune
-from gsbake.surfels.densification.policies import GROWING, PRUNING
+from gsbake.surfels.densification.clone_split import Statistics, densify, prune
+from gsbake.surfels.densification.policy import PolicyInputs
+from gsbake.surfels.densification.registry import DENSIFICATION, PRUNING
 from gsbake.surfels.losses import terms as losses
 from gsbake.surfels.losses.image import image_losses
 from gsbake.surfels.losses.projection import projection_loss
@@ -25,24 +25,25 @@ from gsbake.surfels.model import Surfels
 from gsbake.surfels.raster.gbuffer import rasterise, rendered_image
 from gsbake.surfels.raster.rasterise import Rendered
 from gsbake.surfels.training.adam import Adam
-from gsbake.surfels.training.early_stopping import stands_still
-from gsbake.surfels.training.finite import broken
+from gsbake.surfels.training.early_stopping import has_plateaued
+from gsbake.surfels.training.finite import first_non_finite
 from gsbake.surfels.training.views import TrainView
 
-#: Shares of the run: SDF losses start, densifying starts and ends.
-SDF_FROM, DENSIFY_FROM, DENSIFY_TO = 1 / 30, 1 / 60, 0.6
-DENSIFY_EVERY = 100
-#: Share of the steps that a run which stops early cools down in.
-COOL_DOWN = 0.1
-#: A surfel larger than this (unit frame) is dropped; larger than LARGE it is split rather than cloned.
-LARGEST = 0.25
+#: Shares of the run: start of the SDF losses, start and end of densification.
+SDF_START, DENSIFY_START, DENSIFY_END = 1 / 30, 1 / 60, 0.6
+#: Minimum number of steps between densifications.
+DENSIFY_INTERVAL = 100
+#: Share of the run in which learning rates decay after an early stop.
+COOLDOWN_SHARE = 0.1
+#: Surfels with a larger scale (unit frame) are pruned.
+MAX_SCALE = 0.25
 
 
 @dataclass(frozen=True)
 class Plan:
-    """What a run of the trainer needs to know: the profile's sections and which kind of run it is.
+    """Settings of a training run: the profile's sections and the schedule.
 
-    `densify`: whether surfels come and go at all; `growth`: the rule of `policies.GROWING` by which they multiply.
+    `densify`: whether surfels are densified and pruned; `policy`: the densification policy, a name in `registry.DENSIFICATION`.
     `converged` is the rule skip.converged_steps: "auto" stops at a plateau, "always" as soon as the schedule allows, "never" does not stop
     early.
     """
@@ -55,46 +56,54 @@ class Plan:
     densify: bool
     seed: int
     converged: str = "never"
-    growth: str = "gradient"
+    policy: str = "gradient"
 
 
 class Trainer:
-    """Holds the state; `step()` does one iteration and returns its live figures."""
+    """State of the training; `step()` does one iteration and returns its figures."""
 
-    def __init__(self, plan: Plan, surfels: Surfels, light: Any, views: list[TrainView], half: list[TrainView], held: list[int]) -> None:
-        """`views` and `half` are all photos at full and half training size; `held` the indices kept out; `light` an EnvironmentLight
-        or None."""
+    def __init__(
+        self,
+        plan: Plan,
+        surfels: Surfels,
+        light: Any,
+        views: list[TrainView],
+        half_views: list[TrainView],
+        validation_indices: list[int],
+    ) -> None:
+        """`views` and `half_views` are all photos at full and half training size; `validation_indices` those held out; `light` is an
+        `EnvironmentLight` or None."""
         self.plan, self.surfels, self.light = plan, surfels, light
-        self.views, self.half = views, half
-        self.held = held
-        self.used = [i for i in range(len(views)) if i not in set(held)]
+        self.views, self.half_views = views, half_views
+        self.validation_indices = validation_indices
+        self.training_indices = [i for i in range(len(views)) if i not in set(validation_indices)]
         self.adam = Adam()
         self.generator = torch.Generator().manual_seed(plan.seed)
         self.stats = Statistics.zeros(len(surfels), surfels.position.device)
         self.start_count = len(surfels)
         self.done = 0
         self.end = plan.iterations
-        self.cooling_from: int | None = None
-        self.standing = "not looked at"  # how far from converged it is, in words
+        self.cooldown_start: int | None = None
+        self.plateau_evidence = "not measured"
         self.queue: list[int] = []
         self.log: list[dict[str, float]] = []
         self.masked = all(v.mask is not None for v in views)
         self.background = torch.stack([v.colour().mean((1, 2)) for v in views]).mean(0)
 
-    # -- one step -----------------------------------------------------------------------------------------------------------------
+    # -- iteration ----------------------------------------------------------------------------------------------------------------
 
     def _next_view(self) -> TrainView:
         if not self.queue:
-            self.queue = [self.used[i] for i in torch.randperm(len(self.used), generator=self.generator).tolist()]
+            self.queue = [self.training_indices[i] for i in torch.randperm(len(self.training_indices), generator=self.generator).tolist()]
         index = self.queue.pop()
-        return self.half[index] if self.coarse() else self.views[index]
+        return self.half_views[index] if self.coarse() else self.views[index]
 
     def coarse(self) -> bool:
-        """Whether the run is still at half resolution."""
+        """Whether training is at half resolution."""
         return self.done < self.plan.coarse_share * self.plan.iterations
 
     def _background(self, view: TrainView) -> Tensor:
-        """Colour (3,) behind picture and photo: a new one for every step where masks tell the object from what is behind it."""
+        """Background colour (3,) of render and photo: random in every step where there are masks, else the photos' mean."""
         if not self.masked:
             return self.background
         return torch.rand(3, generator=self.generator).to(view.rgb.device)
@@ -102,7 +111,7 @@ class Trainer:
     def _loss(self, out: Rendered, view: TrainView, tables: Any) -> tuple[Tensor, Tensor]:
         """Weighted sum of all losses, and the colour loss alone."""
         w, s = self.plan.loss, self.surfels
-        late = self.done >= SDF_FROM * self.plan.iterations
+        late = self.done >= SDF_START * self.plan.iterations
         weights = ImageWeights(w.ssim, w.normal, w.mask, w.distortion if late else 0.0, w.smoothness)
         total, colour = image_losses(out.planes, tables, view, self.masked, self._background(view), weights)
         if tables is not None and w.neutral_light:
@@ -121,9 +130,9 @@ class Trainer:
         """Adam's rate per tensor at this step: exponential decay of positions (to 1/100) and of materials and light (to 1/10)."""
         t, n = self.plan.train, self.plan.iterations
         share = self.done / max(1, n)
-        if self.cooling_from is not None:  # early stop: the rest of the decay in the cool-down
-            begin = self.cooling_from / max(1, n)
-            share = begin + (1 - begin) * (self.done - self.cooling_from) / max(1, self.end - self.cooling_from)
+        if self.cooldown_start is not None:  # after an early stop the rest of the decay takes place in the cooldown
+            start = self.cooldown_start / max(1, n)
+            share = start + (1 - start) * (self.done - self.cooldown_start) / max(1, self.end - self.cooldown_start)
         slow, fast = 0.1**share, 0.01**share
         rates = {
             "position": t.lr_position * fast, "quaternion": t.lr_rotation * slow, "log_scale": t.lr_scale * slow,
@@ -149,9 +158,9 @@ class Trainer:
         value = float(loss.detach())
         if not math.isfinite(value):
             lights = {} if self.light is None else {f"light.{k}": p for k, p in self.light.named_parameters()}
-            what = broken(leaves | lights)
-            blame = "" if what is None else f": {what} is not finite"
-            raise FloatingPointError(f"the loss became {value} at step {self.done} on photo {view.name}{blame}")
+            what = first_non_finite(leaves | lights)
+            cause = "" if what is None else f": {what} is not finite"
+            raise FloatingPointError(f"the loss became {value} at step {self.done} on photo {view.name}{cause}")
         rates = self.rates()
         with torch.no_grad():
             grad = out.projected.grad
@@ -168,47 +177,48 @@ class Trainer:
                     if p.grad is not None:
                         self.adam.step(f"light.{name}", p.data, p.grad, rates["light"])
         self.done += 1
-        self._adapt()
+        self._densify_and_prune()
         return {"loss": value, "colour": float(colour.detach()), "surfels": float(len(self.surfels))}
 
     def _update(self, name: str, x: Tensor, rate: float, leaves: dict[str, Tensor]) -> None:
-        """One optimiser update; what is not finite is named, the cause (a tensor still to come, as it was in the picture) before its
-        effect."""
+        """One optimiser update. The error for a value that is not finite names its cause first: a tensor not updated yet, with the value
+        that was rendered."""
         assert x.grad is not None
         try:
             self.adam.step(name, x, x.grad, rate)
         except FloatingPointError as effect:
             names = list(leaves)
-            cause = broken({k: leaves[k] for k in names[names.index(name) + 1 :]})
-            blame = f"{cause} is not finite: " if cause else ""
-            raise FloatingPointError(f"{blame}{effect} (step {self.done})") from effect
+            cause = first_non_finite({k: leaves[k] for k in names[names.index(name) + 1 :]})
+            prefix = f"{cause} is not finite: " if cause else ""
+            raise FloatingPointError(f"{prefix}{effect} (step {self.done})") from effect
 
-    # -- adding and dropping ------------------------------------------------------------------------------------------------------
+    # -- densification and pruning ------------------------------------------------------------------------------------------------
 
-    def _adapt(self) -> None:
+    def _densify_and_prune(self) -> None:
         n = self.plan.iterations
-        every = max(DENSIFY_EVERY, len(self.used))  # every photo has its say before anything is dropped
-        if not self.plan.densify or self.done % every or self.done < max(every, DENSIFY_FROM * n):
+        interval = max(DENSIFY_INTERVAL, len(self.training_indices))  # statistics cover every photo
+        if not self.plan.densify or self.done % interval or self.done < max(interval, DENSIFY_START * n):
             return
-        if self.done > DENSIFY_TO * n:
+        if self.done > DENSIFY_END * n:
             return
-        share = (self.done / n - DENSIFY_FROM) / (DENSIFY_TO - DENSIFY_FROM)
+        share = (self.done / n - DENSIFY_START) / (DENSIFY_END - DENSIFY_START)
         budget = int(self.start_count + (self.plan.model.max_count - self.start_count) * min(1.0, share))
-        off = PRUNING[self.plan.train.prune](placement(self.surfels))
-        self.surfels, keep, _ = prune(self.surfels, self.adam, self.stats, LARGEST, off)
+        off = PRUNING[self.plan.train.prune](PolicyInputs.from_surfels(self.surfels))
+        self.surfels, keep, _ = prune(self.surfels, self.adam, self.stats, MAX_SCALE, off)
         kept = Statistics(self.stats.gradient[keep], self.stats.views[keep], self.stats.weight[keep])
         large = float(self.surfels.scale.max(1).values.median()) if len(self.surfels) else 0.01
-        score = GROWING[self.plan.growth](kept.mean_gradient(), placement(self.surfels))
+        score = DENSIFICATION[self.plan.policy](kept.mean_gradient(), PolicyInputs.from_surfels(self.surfels))
         self.surfels = densify(self.surfels, self.adam, score, budget, large, self.generator)
         self.stats = Statistics.zeros(len(self.surfels), self.surfels.position.device)
 
-    # -- quality ------------------------------------------------------------------------------------------------------------------
+    # -- evaluation ---------------------------------------------------------------------------------------------------------------
 
     @torch.no_grad()
-    def evaluate(self, most: int = 6) -> float:
+    def evaluate(self, max_views: int = 6) -> float:
         """PSNR in dB over held-out photos (over training photos when none is held out), inside the mask where there is one."""
-        chosen = self.held[:most] or self.used[:: max(1, len(self.used) // most)][:most]
-        views = self.half if self.coarse() else self.views
+        training = self.training_indices
+        chosen = self.validation_indices[:max_views] or training[:: max(1, len(training) // max_views)][:max_views]
+        views = self.half_views if self.coarse() else self.views
         tables = None if self.light is None else self.light.prefilter()
         total = []
         for i in chosen:
@@ -224,38 +234,38 @@ class Trainer:
         return sum(total) / len(total)
 
     def record(self) -> dict[str, float]:
-        """Evaluate, append to the log, and decide on the early stop."""
+        """Evaluate, append to the log, and decide on early stopping."""
         row = {
             "step": float(self.done), "psnr": self.evaluate(), "surfels": float(len(self.surfels)),
             "sdf_median": float(self.surfels.sdf.abs().median()) if len(self.surfels) else 0.0, "gamma": float(self.surfels.gamma),
         }  # fmt: skip
         self.log.append(row)
-        adapting = self.plan.densify and self.done < DENSIFY_TO * self.plan.iterations
-        if self.plan.converged != "never" and self.cooling_from is None and self.done < self.end and not self.coarse() and not adapting:
-            still, self.standing = stands_still(self.log)
-            if still or self.plan.converged == "always":
-                self.cooling_from = self.done
-                self.end = min(self.end, self.done + int(COOL_DOWN * self.plan.iterations))
+        densifying = self.plan.densify and self.done < DENSIFY_END * self.plan.iterations
+        if self.plan.converged != "never" and self.cooldown_start is None and self.done < self.end and not self.coarse() and not densifying:
+            plateaued, self.plateau_evidence = has_plateaued(self.log)
+            if plateaued or self.plan.converged == "always":
+                self.cooldown_start = self.done
+                self.end = min(self.end, self.done + int(COOLDOWN_SHARE * self.plan.iterations))
         return row
 
     # -- checkpoints --------------------------------------------------------------------------------------------------------------
 
     def state(self) -> dict[str, Any]:
-        """Everything that decides how the run goes on."""
+        """The state for a checkpoint."""
         return {
             "surfels": self.surfels.tensors(), "adam": self.adam.state(), "generator": self.generator.get_state(),
             "light": None if self.light is None else self.light.state_dict(), "queue": self.queue, "log": self.log, "done": self.done,
-            "end": self.end, "cooling_from": self.cooling_from, "standing": self.standing, "start_count": self.start_count,
+            "end": self.end, "cooling_from": self.cooldown_start, "standing": self.plateau_evidence, "start_count": self.start_count,
             "stats": (self.stats.gradient, self.stats.views, self.stats.weight),
         }  # fmt: skip
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Go on from what `state` returned."""
+        """Restore what `state` returned."""
         self.surfels = Surfels.from_tensors(state["surfels"], self.surfels.transfer)
         self.adam.load(state["adam"])
         self.generator.set_state(state["generator"])
         if self.light is not None:
             self.light.load_state_dict(state["light"])
         self.queue, self.log, self.done, self.end = state["queue"], state["log"], state["done"], state["end"]
-        self.cooling_from, self.standing, self.start_count = state["cooling_from"], state["standing"], state["start_count"]
+        self.cooldown_start, self.plateau_evidence, self.start_count = state["cooling_from"], state["standing"], state["start_count"]
         self.stats = Statistics(*state["stats"])

@@ -1,4 +1,4 @@
-"""Training views: photos as 8-bit tensors at the working sizes, and which of them are held out."""
+"""Training views: photos as 8-bit tensors at the working sizes, and the held-out views."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from gsbake.surfels.raster.projection import Pinhole
 
 
 def held_out(count: int, every: int) -> list[int]:
-    """Indices of the photos kept out of training: every n-th in the order of the camera set, none for 0 or tiny sets."""
+    """Indices of the held-out photos: every n-th in the order of the camera set, none for 0 or tiny sets."""
     if every <= 0 or count < 2 * every:
         return []
     return list(range(every // 2, count, every))
@@ -23,7 +23,8 @@ def held_out(count: int, every: int) -> list[int]:
 
 @dataclass(frozen=True)
 class TrainView:
-    """One photo at one size: `rgb` (3, h, w) and `mask` (h, w) or None as 8-bit tensors, world→camera pose, intrinsics."""
+    """One photo at one size: `rgb` (3, h, w) sRGB and `mask` (h, w) or None as 8-bit tensors, world→camera pose, camera `centre`,
+    intrinsics."""
 
     name: str
     rgb: Tensor
@@ -48,14 +49,14 @@ class TrainView:
         return None if self.mask is None else self.mask.float() / 255
 
 
-def pose_of(camera: Camera) -> tuple[Tensor, Tensor, Tensor, Pinhole]:
+def camera_tensors(camera: Camera) -> tuple[Tensor, Tensor, Tensor, Pinhole]:
     """float32 R (3, 3), t (3,), centre (3,) and intrinsics of a camera."""
     r, t, c = (torch.from_numpy(np.asarray(x, np.float32).copy()) for x in (camera.R, camera.t, camera.centre))
     return r, t, c, Pinhole(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
 
 
-def _make(camera: Camera, rgb: np.ndarray, mask: np.ndarray | None) -> TrainView:
-    r, t, c, pinhole = pose_of(camera)
+def _to_view(camera: Camera, rgb: np.ndarray, mask: np.ndarray | None) -> TrainView:
+    r, t, c, pinhole = camera_tensors(camera)
     planes = torch.from_numpy(np.ascontiguousarray(rgb.transpose(2, 0, 1)))
     return TrainView(camera.name, planes, None if mask is None else torch.from_numpy(mask), r, t, c, pinhole)
 
@@ -65,9 +66,9 @@ def load_views(posed: PosedPhotos, max_size: int) -> tuple[list[TrainView], list
     full, half = [], []
     for i in range(len(posed)):
         view = posed.view(i, max_size)
-        full.append(_make(view.camera, view.rgb, view.mask))
+        full.append(_to_view(view.camera, view.rgb, view.mask))
         w, h = max(1, view.camera.width // 2), max(1, view.camera.height // 2)
         rgb = cv2.resize(view.rgb, (w, h), interpolation=cv2.INTER_AREA)
         mask = None if view.mask is None else cv2.resize(view.mask, (w, h), interpolation=cv2.INTER_AREA)
-        half.append(_make(view.camera.scaled(w, h), rgb, mask))
+        half.append(_to_view(view.camera.scaled(w, h), rgb, mask))
     return full, half

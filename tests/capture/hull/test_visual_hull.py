@@ -1,4 +1,4 @@
-"""The hull and the unit frame of a ball photographed by known cameras: every figure has a closed form."""
+"""Visual hull and unit frame of a ball with known cameras: all expected values have a closed form."""
 
 from __future__ import annotations
 
@@ -12,21 +12,12 @@ import pytest
 
 from gsbake.capture.hull.visual_hull import Hull, carve, silhouette_distance, visual_hull
 from gsbake.capture.posed_photos import PosedPhotos
-from gsbake.capture.poses.normalisation import UNIT_RADIUS, extent_from_masks, extent_from_view, looked_at
+from gsbake.capture.poses.normalisation import UNIT_RADIUS, bounding_sphere_from_masks, bounding_sphere_from_views, nearest_point_to_axes
 from gsbake.capture.poses.up_axis import up_direction, upright_rotation
 from gsbake.geometry.cameras import Camera, CameraSet, Similarity
+from tests.support.cameras import look_at
 
 CENTRE, RADIUS = np.array([1.0, -2.0, 0.5]), 0.6
-
-
-def look_at(eye: np.ndarray[Any, Any], target: np.ndarray[Any, Any], size: int = 160, focal: float = 200.0, roll: float = 0.0) -> Camera:
-    forward = (target - eye) / np.linalg.norm(target - eye)
-    right = np.cross(forward, (0, 0, 1.0))
-    right /= np.linalg.norm(right)
-    rot = np.stack([right, np.cross(forward, right), forward])
-    turn = np.array([[np.cos(roll), -np.sin(roll), 0], [np.sin(roll), np.cos(roll), 0], [0, 0, 1]])
-    rot = turn @ rot
-    return Camera("c", size, size, focal, focal, size / 2, size / 2, rot, -rot @ eye)
 
 
 def ring(count: int = 24, distance: float = 3.0, target: np.ndarray[Any, Any] = CENTRE, **kw: Any) -> list[Camera]:
@@ -34,12 +25,12 @@ def ring(count: int = 24, distance: float = 3.0, target: np.ndarray[Any, Any] = 
     for i in range(count):
         a, h = 2 * np.pi * i / count * 3, np.radians(-35 + 110 * i / count)
         eye = target + distance * np.array([np.cos(a) * np.cos(h), np.sin(a) * np.cos(h), np.sin(h)])
-        cameras.append(replace(look_at(eye, target, **kw), name=f"c{i:02d}"))
+        cameras.append(look_at(eye, target, name=f"c{i:02d}", **kw))
     return cameras
 
 
 def ball_mask(camera: Camera) -> np.ndarray[Any, np.dtype[np.uint8]]:
-    """Silhouette of the ball: rays that pass its centre nearer than its radius."""
+    """Silhouette of the ball: rays closer to its centre than its radius."""
     rays = camera.rays()
     rays = rays / np.linalg.norm(rays, axis=-1, keepdims=True)
     offset = CENTRE - camera.centre
@@ -50,7 +41,7 @@ def ball_mask(camera: Camera) -> np.ndarray[Any, np.dtype[np.uint8]]:
 
 def test_ball() -> None:
     cameras = ring()
-    hull = Hull.of(cameras, [ball_mask(c) for c in cameras], CENTRE + 0.1, 1.0, 64)
+    hull = Hull.from_masks(cameras, [ball_mask(c) for c in cameras], CENTRE + 0.1, 1.0, 64)
     assert hull.occupancy.shape == (64, 64, 64) and hull.cell == pytest.approx(2 / 64)
     volume = hull.occupancy.sum() * hull.cell**3
     assert volume == pytest.approx(4 / 3 * np.pi * RADIUS**3, rel=0.08)
@@ -61,7 +52,7 @@ def test_ball() -> None:
     assert np.quantile(np.abs(distance - RADIUS), 0.95) < 1.5 * hull.cell
     assert np.median(np.einsum("ni,ni->n", normals, outward / distance[:, None])) > 0.98
     assert np.linalg.norm(normals, axis=1) == pytest.approx(np.ones(3000))
-    # Evenly spread: each octant holds an eighth.
+    # Evenly spread: an eighth of the points per octant.
     octant = (outward > 0) @ [1, 2, 4]
     assert np.bincount(octant, minlength=8) == pytest.approx(np.full(8, 375), abs=60)
     again, _ = hull.surface_points(3000, seed=1)
@@ -70,7 +61,7 @@ def test_ball() -> None:
 
 def test_signed_distance_of_the_ball() -> None:
     cameras = ring()
-    hull = Hull.of(cameras, [ball_mask(c) for c in cameras], CENTRE, 1.0, 64)
+    hull = Hull.from_masks(cameras, [ball_mask(c) for c in cameras], CENTRE, 1.0, 64)
     rng = np.random.default_rng(0)
     directions = rng.normal(size=(200, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
@@ -87,64 +78,64 @@ def test_silhouette_distance_is_zero_on_the_edge() -> None:
     assert (silhouette_distance(np.full((3, 4), 255, np.uint8)) == -5).all()
 
 
-def test_cut_off_at_the_frame_is_unknown_not_empty() -> None:
-    """Cameras whose frames cut the ball in half leave it whole as long as others see that part."""
+def test_outside_the_frame_is_unknown_not_empty() -> None:
+    """Cameras whose frames cut the ball in half leave it whole as long as others see the rest."""
     cameras = ring(24)
     aside = [look_at(c.centre, CENTRE + np.array([0.9, 0.0, 0.0])) for c in ring(10, focal=300)]
     aside = [replace(c, fx=420.0, fy=420.0) for c in aside]
     masks = [ball_mask(c) for c in [*cameras, *aside]]
     assert any(m[0].any() or m[-1].any() or m[:, 0].any() or m[:, -1].any() for m in masks[24:])
-    hull = Hull.of([*cameras, *aside], masks, CENTRE, 1.0, 48)
+    hull = Hull.from_masks([*cameras, *aside], masks, CENTRE, 1.0, 48)
     assert hull.occupancy.sum() * hull.cell**3 == pytest.approx(4 / 3 * np.pi * RADIUS**3, rel=0.1)
 
 
-def test_one_wrong_mask_does_no_harm_but_many_do() -> None:
+def test_one_wrong_mask_is_tolerated_but_not_three() -> None:
     cameras = ring(24)
     masks = [ball_mask(c) for c in cameras]
     masks[5] = np.zeros_like(masks[5])
-    whole = Hull.of(cameras, masks, CENTRE, 1.0, 32)
+    whole = Hull.from_masks(cameras, masks, CENTRE, 1.0, 32)
     assert whole.occupancy.sum() * whole.cell**3 == pytest.approx(4 / 3 * np.pi * RADIUS**3, rel=0.2)
     masks[6] = masks[7] = np.zeros_like(masks[5])
-    assert Hull.of(cameras, masks, CENTRE, 1.0, 32).empty
+    assert Hull.from_masks(cameras, masks, CENTRE, 1.0, 32).empty
     with pytest.raises(ValueError, match="empty"):
-        Hull.of(cameras, masks, CENTRE, 1.0, 32).surface_points(10, 0)
+        Hull.from_masks(cameras, masks, CENTRE, 1.0, 32).surface_points(10, 0)
 
 
-def test_what_no_one_sees_is_not_object() -> None:
-    cameras = ring(12, focal=1000)  # a narrow look at the ball's middle
+def test_points_that_no_view_sees_are_outside() -> None:
+    cameras = ring(12, focal=1000)  # a narrow field of view on the ball's centre
     field = carve(cameras, [np.full((160, 160), 255, np.uint8)] * 12, CENTRE, 3.0, 24)
     assert field[12, 12, 12] < 0 and field[0, 0, 0] > 0 and field[-1, 12, 12] > 0
 
 
 def test_extent_of_masked_photos() -> None:
     cameras = ring(24)
-    extent = extent_from_masks(cameras, [ball_mask(c) for c in cameras])
+    extent = bounding_sphere_from_masks(cameras, [ball_mask(c) for c in cameras])
     assert extent is not None
     assert extent.centre == pytest.approx(CENTRE, abs=0.03) and extent.radius == pytest.approx(RADIUS, rel=0.06)
     unit = extent.similarity().inverse()
     assert np.linalg.norm(unit.apply(CENTRE)) < 0.05
     assert extent.similarity().scale == pytest.approx(extent.radius / UNIT_RADIUS)
-    assert extent_from_masks(cameras, [np.zeros((160, 160), np.uint8)] * 24) is None
+    assert bounding_sphere_from_masks(cameras, [np.zeros((160, 160), np.uint8)] * 24) is None
 
 
 def test_extent_without_masks() -> None:
     cameras = ring(24)
-    assert looked_at(cameras) == pytest.approx(CENTRE, abs=1e-6)
+    assert nearest_point_to_axes(cameras) == pytest.approx(CENTRE, abs=1e-6)
     rng = np.random.default_rng(0)
     ball = rng.normal(size=(2000, 3))
     ball = CENTRE + RADIUS * ball / np.linalg.norm(ball, axis=1, keepdims=True)
     walls = CENTRE + rng.uniform(-9, 9, (500, 3))
-    extent = extent_from_view(cameras, np.concatenate([ball, walls]))
+    extent = bounding_sphere_from_views(cameras, np.concatenate([ball, walls]))
     assert extent.centre == pytest.approx(CENTRE, abs=0.1) and 0.9 * RADIUS < extent.radius < 1.4 * RADIUS
-    blind = extent_from_view(cameras, None)
+    blind = bounding_sphere_from_views(cameras, None)
     assert blind.centre == pytest.approx(CENTRE, abs=1e-6)
     # The frame's half angle, atan(80/200), at distance 3 shows a radius of 1.2.
     assert blind.radius == pytest.approx(0.85 * 1.2, rel=1e-6)
     outlier = look_at(np.array([50.0, 0, 0]), np.array([50.0, 50.0, 0.1]))
-    assert looked_at([*cameras, outlier]) == pytest.approx(CENTRE, abs=0.1)
+    assert nearest_point_to_axes([*cameras, outlier]) == pytest.approx(CENTRE, abs=0.1)
 
 
-def test_up_is_vertical_even_when_all_look_down_from_one_side() -> None:
+def test_up_is_vertical_when_all_cameras_look_down_from_one_side() -> None:
     rng = np.random.default_rng(3)
     cameras = []
     for angle in np.linspace(-0.9, 0.9, 15):
@@ -156,8 +147,8 @@ def test_up_is_vertical_even_when_all_look_down_from_one_side() -> None:
     assert upright_rotation(up) @ up == pytest.approx([0, 0, 1])
     assert np.linalg.det(upright_rotation(up)) == pytest.approx(1)
     assert upright_rotation(np.array([0, 0, -1.0])) @ (0, 0, -1) == pytest.approx([0, 0, 1])
-    alike = up_direction([cameras[0].R] * 3)
-    assert alike == pytest.approx(-cameras[0].R[1])
+    same_up = up_direction([cameras[0].R] * 3)
+    assert same_up == pytest.approx(-cameras[0].R[1])
 
 
 def test_visual_hull_of_a_poses_folder(tmp_path: Path) -> None:

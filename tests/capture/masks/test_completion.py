@@ -1,4 +1,4 @@
-"""A ring (a true hole in its masks) on a table, seen by 24 cameras; some masks get mistakes, tie points tell which."""
+"""Completion of masks of a torus (whose hole is real) on a table in 24 cameras: wrong masks are detected by tie points."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from gsbake.capture.masks.completion import left_out, mend
+from gsbake.capture.masks.completion import complete_masks, excluded_points
 from gsbake.geometry.cameras import Camera
 from tests.capture.hull.test_visual_hull import ring
 
@@ -41,7 +41,7 @@ def scene() -> tuple[list[Camera], list[Any], Any]:
     return cameras, [true_mask(c) for c in cameras], np.concatenate([torus, table])
 
 
-def blotted(mask: Any, share: float) -> Any:
+def with_missing_disc(mask: Any, share: float) -> Any:
     """The mask without a disc around a pixel of the object."""
     rows, columns = np.nonzero(mask)
     middle = len(rows) // 3
@@ -49,35 +49,35 @@ def blotted(mask: Any, share: float) -> Any:
     return np.where((y - rows[middle]) ** 2 + (x - columns[middle]) ** 2 < (share * SIZE) ** 2, 0, mask).astype(np.uint8)
 
 
-def test_right_masks_stay(scene: Any) -> None:
+def test_correct_masks_are_unchanged(scene: Any) -> None:
     cameras, masks, points = scene
-    assert mend(cameras, masks, points) == []
+    assert complete_masks(cameras, masks, points) == []
 
 
-def test_a_missing_part_comes_back_and_the_true_hole_stays(scene: Any) -> None:
+def test_missing_part_is_completed_and_the_real_hole_stays(scene: Any) -> None:
     cameras, masks, points = scene
     wrong = list(masks)
     for index in (3, 14):
-        wrong[index] = blotted(masks[index], 0.14)
+        wrong[index] = with_missing_disc(masks[index], 0.14)
         assert (masks[index] > 0).sum() - (wrong[index] > 0).sum() > 300
-    mended = mend(cameras, wrong, points)
-    assert [m.index for m in mended] == [3, 14]
-    for one in mended:
+    completions = complete_masks(cameras, wrong, points)
+    assert [m.index for m in completions] == [3, 14]
+    for one in completions:
         truth = masks[one.index] > 0
         lost = truth & (wrong[one.index] == 0)
         assert one.points >= 10
         assert one.missing[lost].mean() > 0.9
-        assert (one.missing & ~truth).sum() < 0.1 * lost.sum()  # and little else: neither the hole nor a rim all around
+        assert (one.missing & ~truth).sum() < 0.1 * lost.sum()  # neither the hole nor a boundary all around
 
 
-def test_what_most_masks_leave_out_is_not_the_object(scene: Any) -> None:
+def test_points_that_most_masks_exclude_are_background(scene: Any) -> None:
     cameras, masks, points = scene
-    # Half of the points lie on the table, outside most masks: alone they accuse nobody.
-    assert not any(len(pixels) for pixels in left_out(cameras, masks, points))
-    assert mend(cameras, masks, points[1500:]) == []
+    # Half of the points lie on the table, outside most masks: they mark no mask as wrong.
+    assert not any(len(pixels) for pixels in excluded_points(cameras, masks, points))
+    assert complete_masks(cameras, masks, points[1500:]) == []
 
 
-def test_many_wrong_masks_are_left_alone(scene: Any) -> None:
+def test_many_wrong_masks_are_not_completed(scene: Any) -> None:
     cameras, masks, points = scene
-    wrong = [blotted(m, 0.14) if i % 3 == 0 else m for i, m in enumerate(masks)]
-    assert mend(cameras, wrong, points) == []
+    wrong = [with_missing_disc(m, 0.14) if i % 3 == 0 else m for i, m in enumerate(masks)]
+    assert complete_masks(cameras, wrong, points) == []

@@ -11,10 +11,10 @@ from PIL import Image, ImageCms
 
 from gsbake.capture.photos.decode import (
     UnreadablePhotoError,
-    fill_clear,
-    orient,
+    apply_orientation,
+    fill_transparent,
     read_photo,
-    to_working,
+    to_working_size,
     working_size,
 )
 from gsbake.capture.photos.exif import camera_key, focal_pixels
@@ -71,7 +71,7 @@ def test_linear_float_is_coded(tmp_path: Path) -> None:
     light = np.zeros((4, 4, 4), np.float32)
     light[:] = (0.25, 0.1, 0.05, 0.5)  # EXR colour is multiplied by alpha: straight light .5, .2, .1
     save_float(tmp_path / "a.exr", light)
-    rgb, _ = to_working(read_photo(tmp_path / "a.exr"), None, 100)
+    rgb, _ = to_working_size(read_photo(tmp_path / "a.exr"), None, 100)
     assert rgb[1, 1].tolist() == encode_bytes(np.array([0.5, 0.2, 0.1], np.float32)).tolist() == [188, 124, 89]
     light[2, 2] = np.nan
     save_float(tmp_path / "nan.exr", light)
@@ -108,11 +108,11 @@ def test_exif_orientation_as_pillow_applies_it(tmp_path: Path, orientation: int)
     photo = read_photo(tmp_path / "o.jpg")
     assert photo.orientation == orientation
     assert (photo.pixels == wanted).all()
-    assert (orient(np.asarray(stored := Image.open(tmp_path / "o.jpg")), orientation) == wanted).all()
+    assert (apply_orientation(np.asarray(stored := Image.open(tmp_path / "o.jpg")), orientation) == wanted).all()
     stored.close()
 
 
-def test_truncated_and_foreign_files(tmp_path: Path) -> None:
+def test_truncated_and_invalid_files(tmp_path: Path) -> None:
     noise = np.random.default_rng(0).integers(0, 255, (64, 64, 3), np.uint8)
     for suffix in ("jpg", "png"):
         Image.fromarray(noise).save(tmp_path / f"whole.{suffix}")
@@ -127,30 +127,30 @@ def test_truncated_and_foreign_files(tmp_path: Path) -> None:
             read_photo(tmp_path / name)
 
 
-def test_area_filter_works_on_light(tmp_path: Path) -> None:
+def test_area_filter_works_on_linear_values(tmp_path: Path) -> None:
     board = np.zeros((64, 64, 3), np.uint8)
     board[::2, ::2] = board[1::2, 1::2] = 255
     Image.fromarray(board).save(tmp_path / "board.png")
-    rgb, _ = to_working(read_photo(tmp_path / "board.png"), None, 16)
+    rgb, _ = to_working_size(read_photo(tmp_path / "board.png"), None, 16)
     assert rgb.shape == (16, 16, 3) and (rgb == 188).all()  # half the light, not half the code (128)
 
 
-def test_alpha_weighs_in_the_filter(tmp_path: Path) -> None:
+def test_area_filter_is_weighted_with_alpha(tmp_path: Path) -> None:
     pixels = np.zeros((32, 32, 4), np.uint8)
     pixels[..., :3] = 255
-    pixels[:, ::2] = (100, 100, 100, 255)  # the other columns are clear, and white below
+    pixels[:, ::2] = (100, 100, 100, 255)  # the other columns are transparent white
     Image.fromarray(pixels).save(tmp_path / "a.png")
     photo = read_photo(tmp_path / "a.png")
-    rgb, mask = to_working(photo, photo.alpha, 16)
+    rgb, mask = to_working_size(photo, photo.alpha, 16)
     assert mask is not None and (np.abs(mask.astype(int) - 128) <= 1).all()
     assert (np.abs(rgb.astype(int) - 100) <= 1).all()
 
 
-def test_clear_pixels_are_made_harmless() -> None:
+def test_transparent_pixels_are_filled() -> None:
     rgb = np.full((40, 40, 3), 255, np.uint8)
     alpha = np.zeros((40, 40), np.uint8)
     rgb[:, :5], alpha[:, :5] = (10, 200, 30), 255
-    out = fill_clear(rgb, alpha)
+    out = fill_transparent(rgb, alpha)
     assert (out[:, 5:12] == (10, 200, 30)).all() and (out[:, 20:] == 0).all()
 
 

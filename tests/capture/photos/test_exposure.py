@@ -1,4 +1,4 @@
-"""Exposure told by tie points: real changes are found, shining points and clipped values do not count as one."""
+"""Exposure from tie points: real changes are found; specular points and clipped values do not count as one."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gsbake.capture.photos.exposure import LEAST_IN_ALL, TiePoints
+from gsbake.capture.photos.exposure import MIN_POINTS, TiePointExposure
 from gsbake.capture.poses.colmap_model import read_tracks
 from gsbake.geometry.cameras import Camera
 from gsbake.imaging.srgb import decode_bytes, encode_bytes
@@ -15,36 +15,36 @@ from gsbake.imaging.srgb import decode_bytes, encode_bytes
 PHOTOS, POINTS, SIDE = 9, 400, 400
 
 
-def tie_points(gain: np.ndarray, shining: float = 0.0, count: int = POINTS) -> TiePoints:
-    """Photos with `gain` (photos,) of `count` points of many paints; a `shining` share of them is of another brightness in each."""
+def tie_points(gain: np.ndarray, specular_share: float = 0.0, count: int = POINTS) -> TiePointExposure:
+    """Photos with `gain` (photos,) of `count` points of random albedo; a share `specular_share` of them has random brightness in each."""
     rng = np.random.default_rng(4)
     columns = int(np.ceil(np.sqrt(count)))
     x, y = np.divmod(np.arange(count), columns)
     points = np.column_stack([(x + 0.5) / columns - 0.5, (y + 0.5) / columns - 0.5, np.zeros(count)])
-    paint = rng.uniform(0.05, 0.3, count)
-    shines = rng.random(count) < shining
+    albedo = rng.uniform(0.05, 0.3, count)
+    specular = rng.random(count) < specular_share
     names = [f"p{k}" for k in range(len(gain))]
-    seen = {name: np.sort(rng.choice(count, int(0.6 * count), replace=False)) for name in names}
-    tied = TiePoints(points, seen)
+    visible = {name: np.sort(rng.choice(count, int(0.6 * count), replace=False)) for name in names}
+    tie_point_exposure = TiePointExposure(points, visible)
     edge = SIDE // columns
     for k, name in enumerate(names):
         camera = Camera(name, SIDE, SIDE, SIDE, SIDE, SIDE / 2, SIDE / 2, np.eye(3), np.array([0, 0, 1.0]))
-        colour = paint * np.where(shines, rng.uniform(0.7, 2.5, count), 1) * gain[k]
+        colour = albedo * np.where(specular, rng.uniform(0.7, 2.5, count), 1) * gain[k]
         grid = np.zeros((columns, columns))
         grid[y, x] = colour
         image = np.kron(grid, np.ones((edge, edge)))
         full = np.full((SIDE, SIDE), 0.1)
         full[: image.shape[0], : image.shape[1]] = image
-        tied.add(camera, decode_bytes(encode_bytes(np.repeat(np.clip(full, 0, 1)[..., None], 3, 2))))
-    return tied
+        tie_point_exposure.add(camera, decode_bytes(encode_bytes(np.repeat(np.clip(full, 0, 1)[..., None], 3, 2))))
+    return tie_point_exposure
 
 
-def test_one_exposure_is_seen_as_one() -> None:
+def test_equal_exposures_have_no_spread() -> None:
     assert tie_points(np.ones(PHOTOS)).spread() == pytest.approx(1, abs=0.01)
 
 
-def test_shining_points_are_no_change_of_exposure() -> None:
-    assert tie_points(np.ones(PHOTOS), shining=0.3).spread() == pytest.approx(1, abs=0.03)
+def test_specular_points_do_not_change_the_exposure() -> None:
+    assert tie_points(np.ones(PHOTOS), specular_share=0.3).spread() == pytest.approx(1, abs=0.03)
 
 
 def test_the_spread_is_that_of_most_photos() -> None:
@@ -62,14 +62,14 @@ def test_tracks_of_a_model_are_read(tmp_path: Path) -> None:
     options.num_points3D = 50
     model = pycolmap.synthesize_dataset(options)
     model.write(str(tmp_path))
-    points, seen = read_tracks(tmp_path)
-    assert points.shape == (50, 3) and len(seen) == model.num_images()
-    assert sum(map(len, seen.values())) == sum(p.track.length() for p in model.points3D.values())
+    points, visible = read_tracks(tmp_path)
+    assert points.shape == (50, 3) and len(visible) == model.num_images()
+    assert sum(map(len, visible.values())) == sum(p.track.length() for p in model.points3D.values())
     image = next(iter(model.images.values()))
     first = next(p for p in image.points2D if p.has_point3D())
     at = model.points3D[first.point3D_id].xyz
-    assert np.abs(points[seen[Path(image.name).stem]] - at).sum(1).min() < 1e-9
+    assert np.abs(points[visible[Path(image.name).stem]] - at).sum(1).min() < 1e-9
 
 
-def test_too_few_points_say_nothing() -> None:
-    assert tie_points(np.ones(PHOTOS), count=LEAST_IN_ALL - 50).spread() is None
+def test_too_few_points_give_no_result() -> None:
+    assert tie_points(np.ones(PHOTOS), count=MIN_POINTS - 50).spread() is None

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from gsbake.capture.photos.undistortion import distort, pinhole_of, remap_tables, resample, undistorted
+from gsbake.capture.photos.undistortion import distort, pinhole_camera, remap_tables, resample, undistort_points
 from gsbake.errors import BadInputError
 from gsbake.geometry.cameras import Camera
 
@@ -26,15 +26,15 @@ def test_against_opencv(k: tuple[float, ...]) -> None:
     plane = np.random.default_rng(1).uniform(-0.6, 0.6, (50, 2))
     cam = camera(k)
     pixels = cv2.projectPoints(np.c_[plane, np.ones(50)], np.zeros(3), np.zeros(3), cam.K, np.asarray(k))[0].reshape(-1, 2)
-    bent = distort(plane, k)
-    assert bent * (cam.fx, cam.fy) + (cam.cx, cam.cy) == pytest.approx(pixels, abs=1e-6)
-    assert undistorted(bent, k) == pytest.approx(plane, abs=1e-6)
+    distorted = distort(plane, k)
+    assert distorted * (cam.fx, cam.fy) + (cam.cx, cam.cy) == pytest.approx(pixels, abs=1e-6)
+    assert undistort_points(distorted, k) == pytest.approx(plane, abs=1e-6)
 
 
 @pytest.mark.parametrize("k", LENSES)
-def test_a_dot_lands_where_the_pinhole_sees_it(k: tuple[float, ...]) -> None:
+def test_a_dot_is_resampled_to_its_pinhole_projection(k: tuple[float, ...]) -> None:
     source = camera(k)
-    target = pinhole_of(source)
+    target = pinhole_camera(source)
     assert (target.fx, target.fy, target.distortion) == (source.fx, source.fy, ())
     points = np.array([[0.0, 0.0, 2.0], [0.7, 0.4, 2.0], [-0.8, -0.5, 2.0]])
     at = cv2.projectPoints(points, np.zeros(3), np.zeros(3), source.K, np.asarray(k))[0].reshape(-1, 2)
@@ -50,9 +50,9 @@ def test_a_dot_lands_where_the_pinhole_sees_it(k: tuple[float, ...]) -> None:
 
 
 @pytest.mark.parametrize("k", LENSES)
-def test_no_blank_pixels_and_no_more_cut_than_needed(k: tuple[float, ...]) -> None:
+def test_no_blank_pixels_and_minimal_cropping(k: tuple[float, ...]) -> None:
     source = camera(k)
-    target = pinhole_of(source)
+    target = pinhole_camera(source)
     x, y = remap_tables(source, target)
     assert x.min() > -0.6 and y.min() > -0.6 and x.max() < 319.6 and y.max() < 239.6
     # The largest such rectangle touches each side of the photo.
@@ -63,13 +63,13 @@ def test_masks_stay_within_their_range() -> None:
     source = camera(LENSES[0])
     mask = np.zeros((240, 320), np.uint8)
     mask[60:180, 80:240] = 255
-    tables = remap_tables(source, pinhole_of(source))
+    tables = remap_tables(source, pinhole_camera(source))
     flat: np.ndarray[Any, Any] = resample(mask, tables, mask=True)
     assert flat.max() == 255 and flat.min() == 0 and flat[flat.shape[0] // 2, flat.shape[1] // 2] == 255
 
 
-def test_hopeless_distortion() -> None:
-    with pytest.raises(BadInputError, match="cannot be undone"):
-        pinhole_of(camera((-8.0, 0.0, 0.0, 0.0)))
-    plain = pinhole_of(camera((0.0, 0.0, 0.0, 0.0)))
+def test_distortion_that_is_not_invertible() -> None:
+    with pytest.raises(BadInputError, match="cannot be inverted"):
+        pinhole_camera(camera((-8.0, 0.0, 0.0, 0.0)))
+    plain = pinhole_camera(camera((0.0, 0.0, 0.0, 0.0)))
     assert plain.distortion == () and (plain.width, plain.height, plain.cx) == (320, 240, 155.0)

@@ -1,4 +1,4 @@
-"""Pose formats against values worked out by hand."""
+"""Pose formats against values computed by hand."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ import cv2
 import numpy as np
 import pytest
 
-from gsbake.capture.photos.decode import orient
-from gsbake.capture.poses.frames import PhotoSize, fit_to_photo, match_frame, upright
+from gsbake.capture.photos.decode import apply_orientation
+from gsbake.capture.poses.frames import PhotoIndex, PhotoSize, fit_to_photo, rotate_upright
 from gsbake.capture.poses.given import read_poses
 from gsbake.capture.sfm.colmap import pycolmap
 from gsbake.errors import BadInputError
@@ -61,14 +61,14 @@ def test_transforms_angle_suffixless_and_frame_wins(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"at": (0, 3), "value": float("nan")}, r"images/a\.jpg.*NaN"),
-        ({"at": (1, 1), "value": float("inf")}, r"images/a\.jpg.*NaN or infinite"),
+        ({"at": (0, 3), "value": float("nan")}, r"Frame 1: .*finite number"),
+        ({"at": (1, 1), "value": float("inf")}, r"Frame 1: .*finite number"),
         ({"scale": 2.0}, r"images/a\.jpg.*no rigid"),
         ({"mirror": True}, r"images/a\.jpg.*no rigid"),
         ({"at": (3, 3), "value": 2.0}, r"images/a\.jpg.*last row"),
     ],
 )
-def test_unusable_matrices(tmp_path: Path, change: dict[str, Any], words: str) -> None:
+def test_invalid_matrices(tmp_path: Path, change: dict[str, Any], words: str) -> None:
     matrix = looking_along_minus_x()
     if "at" in change:
         matrix[change["at"]] = change["value"]
@@ -86,11 +86,11 @@ def test_unusable_matrices(tmp_path: Path, change: dict[str, Any], words: str) -
         ({"camera_model": "OPENCV_FISHEYE"}, "not a perspective"),
         ({"k4": 0.1}, "k4"),
         ({"fl_x": None}, "no focal length"),
-        ({"fl_x": -3.0}, "unusable"),
+        ({"fl_x": -3.0}, "fl_x: input should be greater than 0"),
         ({"w": 100, "h": 200}, "100x200.*200x100"),
     ],
 )
-def test_unusable_intrinsics(tmp_path: Path, extra: dict[str, Any], words: str) -> None:
+def test_invalid_intrinsics(tmp_path: Path, extra: dict[str, Any], words: str) -> None:
     with pytest.raises(BadInputError, match=words):
         read_poses(write_transforms(tmp_path / "t.json", looking_along_minus_x().tolist(), **extra), [], SIZES)
 
@@ -167,18 +167,18 @@ def test_broken_colmap_models(tmp_path: Path) -> None:
         read_poses(folder, [], SIZES)
 
 
-def test_frames_find_their_photos() -> None:
+def test_frames_match_their_photos() -> None:
     photos = ["left/0.jpg", "right/0.jpg", "1.jpg"]
-    assert match_frame("images/right/0.jpg", photos) == "right/0.jpg"
-    assert match_frame("C:\\shots\\1.png", photos) == "1.jpg"
-    assert match_frame("2.jpg", photos) is None
-    with pytest.raises(BadInputError, match="could mean any"):
-        match_frame("0.jpg", photos)
+    assert PhotoIndex(photos).match("images/right/0.jpg") == "right/0.jpg"
+    assert PhotoIndex(photos).match("C:\\shots\\1.png") == "1.jpg"
+    assert PhotoIndex(photos).match("2.jpg") is None
+    with pytest.raises(BadInputError, match="matches several"):
+        PhotoIndex(photos).match("0.jpg")
 
 
 @pytest.mark.parametrize("orientation", [3, 6, 8])
-def test_camera_turns_with_its_photo(orientation: int) -> None:
-    """A camera of the stored photo, turned upright, sees each point at the pixel that the turned photo shows it at."""
+def test_camera_rotates_with_its_photo(orientation: int) -> None:
+    """A camera of the stored photo, rotated upright, projects each point to its pixel in the upright photo."""
     turn = cv2.Rodrigues(np.array([0.2, -0.3, 0.4]))[0]
     lens = (0.1, -0.05, 0.01, -0.02, 0.03)
     stored = Camera("a", 60, 40, 50.0, 55.0, 28.0, 21.0, np.asarray(turn, float), np.array([0.1, 0.2, 4.0]), lens)
@@ -188,10 +188,10 @@ def test_camera_turns_with_its_photo(orientation: int) -> None:
         k = np.asarray(camera.distortion)
         return np.asarray(cv2.projectPoints(point, cv2.Rodrigues(camera.R)[0], camera.t, camera.K, k)[0]).ravel()
 
-    raised = upright(stored, orientation)
+    raised = rotate_upright(stored, orientation)
     x, y = pixel(stored)
     columns, rows = np.meshgrid(np.arange(60) + 0.5, np.arange(40) + 0.5)
-    near = np.hypot(orient(columns, orientation) - x, orient(rows, orientation) - y)  # where the stored pixel comes to lie
+    near = np.hypot(apply_orientation(columns, orientation) - x, apply_orientation(rows, orientation) - y)  # the stored pixel
     row, column = np.unravel_index(near.argmin(), near.shape)
     assert (raised.width, raised.height) == near.shape[::-1]
     assert pixel(raised) == pytest.approx([column + 0.5, row + 0.5], abs=0.51)

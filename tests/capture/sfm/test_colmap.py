@@ -1,4 +1,4 @@
-"""pycolmap breaks zlib when it is loaded first; these tests guard the one door through which it comes."""
+"""pycolmap breaks zlib when it is loaded first; these tests guard its only import."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ ROOT = Path(__file__).resolve().parents[3]
 
 @pytest.mark.parametrize("writer", ["cv2.imwrite(path, image)", "PIL.Image.fromarray(image).save(path)", "zlib.compress(image, 9)"])
 def test_png_is_written_after_pycolmap(tmp_path: Path, writer: str) -> None:
-    """In a fresh process pycolmap comes in first and a PNG is written after it."""
+    """A new process imports pycolmap first and writes a PNG afterwards."""
     code = f"""
 import sys
 sys.path.insert(0, {str(ROOT)!r})
@@ -29,18 +29,18 @@ for _ in range(3):
     assert done.returncode == 0, done.stderr[-500:]
 
 
-def test_zlib_comes_first() -> None:
+def test_zlib_is_imported_first() -> None:
     tree = ast.parse((ROOT / "gsbake/capture/sfm/colmap.py").read_text())
     imports = [a.name for node in tree.body if isinstance(node, ast.Import) for a in node.names]
     assert imports.index("zlib") < imports.index("pycolmap")
 
 
 def test_nothing_else_imports_pycolmap() -> None:
-    guilty = []
+    importers = []
     for path in [p for folder in ("gsbake", "stages") for p in (ROOT / folder).rglob("*.py") if p.name != "colmap.py"]:
         for node in ast.walk(ast.parse(path.read_text())):
             names = [a.name for a in node.names] if isinstance(node, ast.Import) else []
             names += [node.module or ""] if isinstance(node, ast.ImportFrom) else []
             if any(name.split(".")[0] == "pycolmap" for name in names):
-                guilty.append(path.name)
-    assert not guilty
+                importers.append(path.name)
+    assert not importers

@@ -7,16 +7,16 @@ from gsbake.capture.sfm.pairs import (
     choose_matching,
     exhaustive,
     is_sequence,
-    near_views,
+    largest_features,
+    neighbouring_views,
     preemptive_scores,
     sequential,
-    strongest,
     vlad_scores,
 )
 
 
 def ring_of_photos(count: int, per_photo: int = 60) -> list[np.ndarray]:  # type: ignore[type-arg]
-    """Descriptors of photos around an object: each shares half of its features with the next one, the last with the first."""
+    """Descriptors of photos on a closed ring: each shares half of its features with the next."""
     rng = np.random.default_rng(0)
     words = rng.random((count, per_photo // 2, 128)).astype(np.float32) ** 4
     photos = []
@@ -37,7 +37,7 @@ def test_ranking_finds_the_neighbours_on_the_ring() -> None:
     assert preemptive_scores(photos)[0, 6] <= 2
 
 
-def test_best_pairs_leave_no_group_alone() -> None:
+def test_best_pairs_connect_all_groups() -> None:
     scores = np.zeros((6, 6))
     for group in ((0, 1, 2), (3, 4, 5)):
         for i in group:
@@ -50,7 +50,7 @@ def test_best_pairs_leave_no_group_alone() -> None:
 
 def test_strongest_features_are_the_largest() -> None:
     descriptors = np.eye(4, 128, dtype=np.uint8) * 200
-    few = strongest(descriptors, np.array([1.0, 9.0, 4.0, 2.0], np.float32), 2)
+    few = largest_features(descriptors, np.array([1.0, 9.0, 4.0, 2.0], np.float32), 2)
     assert few.shape == (2, 128) and few[0, 1] == 1 and few[1, 2] == 1
 
 
@@ -72,9 +72,9 @@ def test_choice_by_count_and_names() -> None:
     assert choose_matching("sequential", ["a"])[0] == "sequential"
 
 
-def test_near_views_look_alike() -> None:
+def test_neighbouring_views_have_similar_directions() -> None:
     angle = np.arange(24) * 2 * np.pi / 24
     eyes = np.stack([np.cos(angle), np.sin(angle), 0 * angle], 1)
-    pairs = near_views(eyes, -eyes, partners=4)
+    pairs = neighbouring_views(eyes, -eyes, partners=4)
     gaps = [min(j - i, 24 - (j - i)) for i, j in pairs]
     assert max(gaps) <= 2 and (0, 1) in pairs and (0, 23) in pairs and len(pairs) == 48

@@ -1,4 +1,4 @@
-"""Adding and dropping surfels: budgets, inheritance, Adam's rows, files."""
+"""Clone, split and prune: budget, inherited attributes, Adam's moments, files."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from gsbake.surfels.densification.clone_split import Statistics, densify, placement, prune
+from gsbake.surfels.densification.clone_split import Statistics, densify, prune
+from gsbake.surfels.densification.policy import PolicyInputs
 from gsbake.surfels.initialisation import fibonacci_sphere, spacing
 from gsbake.surfels.model import Surfels, create, quaternion_from_normal
 from gsbake.surfels.training.adam import Adam
@@ -39,7 +40,7 @@ def test_quaternions_turn_z_to_the_normal() -> None:
     assert torch.allclose(s.normal(), n, atol=1e-5)
 
 
-def test_densify_keeps_the_budget_and_the_moments() -> None:
+def test_densify_respects_the_budget_and_keeps_moments() -> None:
     s, adam = ball(), Adam()
     for name, x in s.tensors().items():
         adam.step(name, x, torch.ones_like(x), 1e-3)
@@ -53,7 +54,7 @@ def test_densify_keeps_the_budget_and_the_moments() -> None:
     assert adam.first["position"].shape == (220, 3) and torch.all(adam.first["position"][200:] == 0)
     parents = torch.round(big.sdf[200:] * 1000).long()
     assert torch.allclose(big.scale[200:], before[parents] / 1.6) and torch.allclose(big.scale[parents], before[parents] / 1.6)
-    assert densify(big, adam, torch.zeros(220), 300, 0.0, torch.Generator()) is big  # no score, no growth
+    assert densify(big, adam, torch.zeros(220), 300, 0.0, torch.Generator()) is big  # scores of 0 are not densified
 
 
 def test_prune_reasons() -> None:
@@ -64,15 +65,15 @@ def test_prune_reasons() -> None:
     stats = Statistics.zeros(200)
     stats.views[:], stats.weight[:] = 2, 10.0
     stats.views[9], stats.weight[9] = 0, 0.0
-    stats.weight[11] = 0.01  # hidden behind others
+    stats.weight[11] = 0.01  # occluded
     kept, index, counts = prune(s, adam, stats, 0.25)
     assert len(kept) == 195 and set(range(200)) - set(index.tolist()) == {3, 5, 7, 9, 11}
     assert counts == {"transparent": 1, "too large": 1, "not finite": 1, "unseen": 2}
 
 
-def test_prune_takes_what_a_rule_says() -> None:
+def test_prune_removes_surfels_off_the_surface() -> None:
     s, adam = ball(), Adam()
-    s.sdf[3] = 50.0  # transparent, and off the surface
+    s.sdf[3] = 50.0  # transparent and off the surface
     off = torch.zeros(200, dtype=torch.bool)
     off[[3, 8]] = True
     kept, index, counts = prune(s, adam, None, 0.25, off)
@@ -80,17 +81,17 @@ def test_prune_takes_what_a_rule_says() -> None:
     assert counts == {"transparent": 1, "too large": 0, "not finite": 0, "off the surface": 2}
 
 
-def test_standing_reads_the_spacing_off_the_discs() -> None:
+def test_policy_inputs_take_the_spacing_from_the_scales() -> None:
     s = ball()
     s.sdf[0], s.sdf[1] = -0.2, 0.1
-    at = placement(s)
+    at = PolicyInputs.from_surfels(s)
     assert at.spacing == pytest.approx(float(np.median(spacing(s.position.numpy().astype(float)))), rel=1e-3)
-    assert torch.allclose(at.distance[:3], torch.tensor([0.2, 0.1, 0.01])) and at.far == pytest.approx(3 * at.spacing)
+    assert torch.allclose(at.distance[:3], torch.tensor([0.2, 0.1, 0.01])) and at.max_distance == pytest.approx(3 * at.spacing)
     assert float(at.opacity[0]) == pytest.approx(1 / np.cosh(0.1) ** 2, rel=1e-5)  # sech²(γs/2), γ = 1
-    assert placement(s.select(torch.zeros(0, dtype=torch.long))).distance.shape == (0,)
+    assert PolicyInputs.from_surfels(s.select(torch.zeros(0, dtype=torch.long))).distance.shape == (0,)
 
 
-def test_adam_follows_the_published_rule() -> None:
+def test_adam_follows_the_paper() -> None:
     """Two steps by hand (Kingma and Ba 2015, algorithm 1)."""
     adam, x = Adam(), torch.tensor([1.0])
     adam.step("x", x, torch.tensor([2.0]), 0.1)

@@ -1,4 +1,4 @@
-"""The fused optimiser against torch's, and its way of naming what is not finite."""
+"""The fused Adam optimiser against torch's, and its errors for values that are not finite."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import torch
 from gsbake.surfels.training.adam import Adam
 
 
-def test_same_as_torch() -> None:
+def test_matches_torch() -> None:
     g = torch.Generator().manual_seed(0)
     start = torch.randn(1000, 3, generator=g)
     ours, theirs = start.clone(), start.clone().requires_grad_()
@@ -23,7 +23,7 @@ def test_same_as_torch() -> None:
     assert torch.equal(ours[:10], start[:10])
 
 
-def test_rows_come_and_go() -> None:
+def test_selecting_rows_keeps_their_moments() -> None:
     adam, x = Adam(), torch.zeros(4, 2)
     adam.step("x", x, torch.ones(4, 2), 0.1)
     adam.select(["x"], torch.tensor([0, 2]), 3)
@@ -31,7 +31,7 @@ def test_rows_come_and_go() -> None:
 
 
 @pytest.mark.parametrize("bad", [float("nan"), float("inf"), -float("inf")])
-def test_names_what_is_not_finite(bad: float) -> None:
+def test_error_names_the_tensor_that_is_not_finite(bad: float) -> None:
     grad = torch.ones(50, 3)
     grad[17, 1] = bad
     with pytest.raises(FloatingPointError, match=r"gradient of log_scale \(row 17\) is not finite"):

@@ -1,4 +1,4 @@
-"""The real train and refine stages, stopped by SIGTERM and by SIGKILL in the middle of their steps: they end with the same bytes."""
+"""The train and refine stages give identical files after interruption by SIGTERM and SIGKILL."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ SETTINGS = (
     "surfels.max_count=2500", "surfels.shading=pbr", "light.size=8", "refine.iterations=120", "skip.pose_refinement=never",
 )  # fmt: skip
 
-#: Runs up to a stage and, once that stage has done so many steps, sends itself a signal (0: never).
+#: Runs up to a stage and sends itself a signal after a number of that stage's steps (signal 0: never).
 RUNNER = """
 import os, sys
 from pathlib import Path
@@ -56,7 +56,7 @@ def gsbake(*args: object) -> None:
 
 
 def results(out: Path) -> dict[str, bytes]:
-    """The files that training and refining published."""
+    """The files of the stages train and refine."""
     manifests = [path for stage in ("train", "refine") for path in (out / "stages" / stage).glob("*/manifest.json")]
     files = [path for manifest in manifests for path in manifest.parent.iterdir() if path != manifest]
     return {f"{path.parent.parent.name}/{path.name}": path.read_bytes() for path in files}
@@ -64,7 +64,7 @@ def results(out: Path) -> dict[str, bytes]:
 
 @pytest.fixture(scope="module")
 def posed(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """An output folder with everything that training needs."""
+    """An output folder with the inputs of training."""
     root = tmp_path_factory.mktemp("interrupted")
     gsbake("synth", root / "capture", "--views", 10, "--size", 96)
     words = [word for pair in SETTINGS for word in ("--set", pair)]
@@ -72,18 +72,18 @@ def posed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root / "out"
 
 
-def test_stopped_and_killed_stages_end_with_the_same_bytes(posed: Path, tmp_path: Path) -> None:
-    whole, broken = tmp_path / "whole", tmp_path / "broken"
+def test_interrupted_stages_give_identical_files(posed: Path, tmp_path: Path) -> None:
+    whole, interrupted = tmp_path / "whole", tmp_path / "interrupted"
     shutil.copytree(posed, whole)
-    shutil.copytree(posed, broken)
+    shutil.copytree(posed, interrupted)
     assert run(whole, "refine") == 0
-    assert run(broken, "train", 90, signal.SIGTERM) == 75
-    checkpoints = list((broken / "stages" / "train").glob("*.checkpoint/checkpoint.*"))
+    assert run(interrupted, "train", 90, signal.SIGTERM) == 75
+    checkpoints = list((interrupted / "stages" / "train").glob("*.checkpoint/checkpoint.*"))
     assert len(checkpoints) == 1 and checkpoints[0].stat().st_size > 0
-    assert run(broken, "train", 170, signal.SIGKILL) == -signal.SIGKILL
-    assert run(broken, "refine", 60, signal.SIGTERM) == 75
-    assert run(broken, "refine", 100, signal.SIGKILL) == -signal.SIGKILL
-    assert run(broken, "refine") == 0
+    assert run(interrupted, "train", 170, signal.SIGKILL) == -signal.SIGKILL
+    assert run(interrupted, "refine", 60, signal.SIGTERM) == 75
+    assert run(interrupted, "refine", 100, signal.SIGKILL) == -signal.SIGKILL
+    assert run(interrupted, "refine") == 0
     expected = results(whole)
     assert {"train/surfels.safetensors", "train/light.safetensors", "refine/surfels.safetensors", "refine/log.csv"} <= expected.keys()
-    assert results(broken) == expected
+    assert results(interrupted) == expected

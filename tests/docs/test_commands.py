@@ -1,0 +1,136 @@
+"""Every command in the guide, in the concepts and in the README runs: gsbake's over toy stages with the real declarations, page by page."""
+
+from __future__ import annotations
+
+import re
+import shlex
+import signal
+import sys
+from collections.abc import Callable
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from gsbake.cli import main
+from tests.docs import toy_stages
+
+ROOT = Path(__file__).resolve().parents[2]
+PAGES = sorted(
+    path.relative_to(ROOT).as_posix()
+    for path in [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").rglob("*.md")]
+    if "```sh" in path.read_text(encoding="utf-8") or "```python\nimport gsbake" in path.read_text(encoding="utf-8")
+)
+Run = Callable[[list[str]], int]
+
+
+def commands(text: str) -> list[str]:
+    """The lines of a page's `sh` blocks without comments."""
+    lines = [line for block in re.findall(r"```sh\n(.*?)```", text, re.S) for line in block.splitlines()]
+    return [stripped for line in lines if (stripped := re.sub(r"(^|\s)#.*", "", line).strip())]
+
+
+def _call(arguments: list[str], monkeypatch: pytest.MonkeyPatch) -> int:
+    """Run `gsbake ARGUMENTS` in this process; the exit code."""
+    import gsbake.api
+    from gsbake.cli import doctor
+
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    monkeypatch.setattr(gsbake.api, "REGISTRY", toy_stages.REGISTRY)
+    monkeypatch.setattr(doctor, "MODULES", {"numpy": "numpy"})
+    monkeypatch.setattr(sys, "argv", ["gsbake", *arguments])
+    code: Any = 0
+    try:
+        main()
+    except SystemExit as error:
+        code = error.code
+    finally:
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
+    return int(code or 0)
+
+
+@pytest.fixture(scope="module")
+def prepared(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with what the pages assume to be there: photos, masks, an edited mesh, a profile and finished runs."""
+    folder = tmp_path_factory.mktemp("pages")
+    for name in ("photos/a.jpg", "photos/b.jpg", "photos/c.jpg", "photos/d.jpg", "masks/a.png"):
+        (folder / name).parent.mkdir(exist_ok=True)
+        (folder / name).write_text(name)
+    (folder / "transforms.json").write_text("{}")
+    (folder / "edited.ply").write_text("ply\n")
+    (folder / "mine.toml").write_text('extends = "relight"\n[mesh]\nfaces = 10000\n')
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        monkeypatch.chdir(folder)
+        assert _call(["run", "photos", "--out", "out/tankard", "--quiet"], monkeypatch) == 0
+    return folder
+
+
+@pytest.fixture
+def gsbake(prepared: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Run:
+    """Run `gsbake ARGUMENTS` in the prepared folder and return the exit code. Pages share it, so that equal stages run once."""
+    monkeypatch.chdir(prepared)
+
+    def command(arguments: list[str]) -> int:
+        code = _call(arguments, monkeypatch)
+        capsys.readouterr()
+        return code
+
+    return command
+
+
+def check(line: str, gsbake: Run) -> str | None:
+    """Run or look up one command line; what is wrong with it, or None."""
+    words = shlex.split(line)
+    program, arguments = words[0], words[1:]
+    if program == "gsbake":
+        if arguments[0] == "synth":  # the pages' sizes take seconds
+            arguments = [*arguments, "--views", "3", "--size", "16"]
+        code = gsbake(arguments)
+        return None if code == 0 else f"exit code {code}"
+    if program == "make":
+        targets = [word for word in arguments if "=" not in word and not word.startswith("-")]
+        text = (ROOT / "Makefile").read_text(encoding="utf-8")
+        missing = [target for target in targets if not re.search(rf"(?m)^{re.escape(target)}:", text)]
+        return f"no target {missing}" if missing else None
+    if program.rpartition("/")[2].startswith("python"):
+        if arguments[:1] == ["-m"]:
+            return None if find_spec(arguments[1]) else f"no module {arguments[1]}"
+        return None if (ROOT / arguments[0]).is_file() else f"no file {arguments[0]}"
+    return f"'{program}' is not known here"
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_commands_of(page: str, gsbake: Run) -> None:
+    text = (ROOT / page).read_text(encoding="utf-8")
+    wrong = {line: problem for line in commands(text) if (problem := check(line, gsbake))}
+    assert not wrong
+    for block in re.findall(r"```python\n(import gsbake.*?)```", text, re.S):
+        exec(block, {})
+
+
+def test_all_pages_with_commands_are_found() -> None:
+    assert {"README.md", "CONTRIBUTING.md", "docs/guide/first-asset.md", "docs/guide/between-stages.md"} <= set(PAGES)
+    assert len(commands((ROOT / "docs" / "guide" / "between-stages.md").read_text(encoding="utf-8"))) >= 10
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "gsbake bakery photos/",
+        "gsbake run photos/ --fast",
+        "gsbake run photos/ --profile fastest",
+        "gsbake run --out out/tankard --set mesh.triangles=3",
+        "gsbake explain bakery --out out/tankard",
+        "make cake",
+        "python -m benchmarks.nothing",
+        "rm -r /",
+    ],
+)
+def test_a_command_that_does_not_exist_is_found(line: str, gsbake: Run) -> None:
+    assert check(line, gsbake)
+
+
+def test_synth_takes_the_options_the_pages_give(gsbake: Run) -> None:
+    assert check("gsbake synth out/x --views 40 --sise 400", gsbake)

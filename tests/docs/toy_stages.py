@@ -1,0 +1,40 @@
+"""The pipeline with its own declarations and stages that take no time: each writes small files with the names of its real output."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+from gsbake.pipeline.registry import Registry
+from gsbake.pipeline.stage import Context
+from gsbake.stages import ORDER
+from gsbake.stages import REGISTRY as REAL
+
+#: What each stage writes.
+FILES = {
+    "ingest": ("photos.json",),
+    "poses": ("cameras.json", "points.ply"),
+    "stereo": ("points.ply",),
+    "train": ("surfels.safetensors",),
+    "refine": ("surfels.safetensors",),
+    "mesh": ("dense.ply", "mesh.ply"),
+    "bake": ("mesh.safetensors", "base_color.exr"),
+    "export": ("asset.glb", "cameras.json", "light.hdr"),
+    "report": ("report.html",),
+}
+
+
+def _toy(name: str) -> Callable[[Context], dict[str, Any]]:
+    def run(ctx: Context) -> dict[str, Any]:
+        for file in FILES[name]:
+            head = "ply\n" if file.endswith(".ply") else ""
+            (ctx.out / file).write_text(f"{head}{name} {file}")
+        return {}
+
+    return run
+
+
+STAGES = {name: replace(REAL.load(name), run=_toy(name), summary="") for name in ORDER}
+INGEST, POSES, STEREO, TRAIN, REFINE, MESH, BAKE, EXPORT, REPORT = (STAGES[name] for name in ORDER)
+REGISTRY = Registry({name: f"tests.docs.toy_stages:{name.upper()}" for name in ORDER})
