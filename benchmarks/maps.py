@@ -1,6 +1,6 @@
 """Errors of baked textures against the reference asset, per texel and without a renderer.
 
-Every observed texel is compared with the nearest point of the reference surface: base colour as PSNR in dB of sRGB values after one gain
+Every observed texel is compared with the nearest reference surface point: base colour as PSNR in dB of sRGB values after one gain
 per channel (the light's intensity is not observable), roughness and metallic as root mean squares. The independent scorer compares renders
 of the same textures and so weighs texels by their visibility; here all texels weigh the same.
 """

@@ -94,9 +94,7 @@ class FitSurface:
 class MaterialFit:
     """Texels and light while they are optimised."""
 
-    def __init__(
-        self, surface: FitSurface, light_size: int, priors: Priors, roughness: float, options: FitOptions | None = None
-    ) -> None:
+    def __init__(self, surface: FitSurface, light_size: int, priors: Priors, roughness: float, options: FitOptions | None = None) -> None:
         """`light_size` is the edge of the environment map's faces in texels, `roughness` the initial value of all texels."""
         self._surface, self._priors, self._options = surface, priors, options or FitOptions()
         o, n = self._options, len(surface.texels)

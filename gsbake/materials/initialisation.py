@@ -82,9 +82,7 @@ def best_fit(
     return ChosenFit(chosen, fitted, starts[best], made, evidence, metal_evidence)
 
 
-def trial_roughness(
-    make: MakeFit, photos: list[Pixels], seed: int, each: Callable[[int, int], None] | None = None
-) -> dict[float, float]:
+def trial_roughness(make: MakeFit, photos: list[Pixels], seed: int, each: Callable[[int, int], None] | None = None) -> dict[float, float]:
     """Validation PSNR in dB of a short fit from each of `TRIAL_ROUGHNESS`.
 
     Empty with fewer than `TRIAL_HOLDOUT` photos.

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from gsbake.capture.hull.visual_hull import Hull
 from gsbake.capture.posed_photos import PosedPhotos
+from gsbake.checkpoint import is_sealed, seal_file
 from gsbake.geometry.cameras import Array
 from gsbake.mvs.carving import CarvedHull, carve_hull
 from gsbake.mvs.coarse_to_fine import Planes, find_planes
@@ -97,7 +98,7 @@ class StereoRun:
 
         def match_photo(index: int) -> None:
             target = self._planes_path(index)
-            if target.exists():
+            if is_sealed(target):
                 return
             sizes = self.pyramids[index]
             coarse = sizes[0]
@@ -108,6 +109,7 @@ class StereoRun:
             partial = target.with_suffix(".tmp.npy")
             np.save(partial, np.concatenate([planes.plane, planes.cost[..., None]], -1))
             partial.replace(target)
+            seal_file(target)
 
         self.parallel(match_photo, "matching")
 

@@ -20,19 +20,20 @@ MAX_TIE_POINT_SPREAD = 1.15
 MAX_NORMAL_ANGLE, NORMAL_QUANTILE = 2.0, 0.95
 
 
-def constant_exposure(gains: NDArray[Any], explained: float, tied: float | None = None) -> tuple[bool, str]:
+def constant_exposure(gains: NDArray[Any], explained: float, tie_point_spread: float | None = None) -> tuple[bool, str]:
     """Whether all photos have one exposure, and the evidence.
 
     `gains` (photos, channels; 1 = none) are solved on the surface; `explained` is the share of the photos' differences there that they
-    explain; `tied` is the factor within which nine tenths of the photos agree at tie points (`capture.photos.exposure`).
+    explain; `tie_point_spread` is the factor within which nine tenths of the photos agree at tie points (`capture.photos.exposure`).
     """
     spread = float(np.exp(np.abs(np.log(gains)).max()))
     evidence = f"gains on the surface up to {spread:.2f}x, threshold {MAX_GAIN_SPREAD:g}x"
     if spread >= MAX_GAIN_SPREAD:
         evidence += f"; they explain {100 * explained:.0f} % of the differences, threshold {100 * MIN_EXPLAINED:g} %"
-    if tied is not None:
-        evidence += f"; 90 % of tie points agree within {tied:.2f}x, threshold {MAX_TIE_POINT_SPREAD:g}x"
-    return spread < MAX_GAIN_SPREAD or explained < MIN_EXPLAINED or (tied is not None and tied < MAX_TIE_POINT_SPREAD), evidence
+    if tie_point_spread is not None:
+        evidence += f"; 90 % of tie points agree within {tie_point_spread:.2f}x, threshold {MAX_TIE_POINT_SPREAD:g}x"
+    agreeing = tie_point_spread is not None and tie_point_spread < MAX_TIE_POINT_SPREAD
+    return spread < MAX_GAIN_SPREAD or explained < MIN_EXPLAINED or agreeing, evidence
 
 
 def normals_agree(detail: DenseSamples, normal: NDArray[Any]) -> tuple[bool, str]:

@@ -32,13 +32,13 @@ def project_photos(surface: UnwrappedMesh, posed: PosedPhotos, holdout: int, equ
     held_out_views = set(held_out(len(posed), holdout))
     blender = ProjectionBlender(surface.texel_position, surface.texel_normal, surface.caster, 3, surface.texel_size)
     measured = equalisation != "always"
-    tied = TiePointExposure.from_model(posed.folder / "sparse", posed.cameras.to_world.inverse()) if measured else None
+    tie_points = TiePointExposure.from_model(posed.folder / "sparse", posed.cameras.to_world.inverse()) if measured else None
     for index in range(len(posed)):
         monitor.check_stop()
         view = posed.view(index)
         linear = decode_bytes(view.rgb)
-        if tied is not None:
-            tied.add(view.camera, linear)
+        if tie_points is not None:
+            tie_points.add(view.camera, linear)
         margin = MASK_MARGIN * max(view.camera.width, view.camera.height)
         weights = None if view.mask is None else mask_weights(view.mask, margin)
         blender.add(view.camera, linear, weights, HELD_OUT_WEIGHT if index in held_out_views else 1.0)
@@ -46,7 +46,7 @@ def project_photos(surface: UnwrappedMesh, posed: PosedPhotos, holdout: int, equ
     projected = blender.result(solve_exposure=measured)
     constant, evidence = True, "not measured"
     if measured:
-        constant, evidence = constant_exposure(projected.gains, projected.explained, None if tied is None else tied.spread())
+        constant, evidence = constant_exposure(projected.gains, projected.explained, None if tie_points is None else tie_points.spread())
     skipped, done = "exposure taken as constant", "exposure equalised"
     if decide_skip(monitor, "exposure_equalisation", equalisation, constant, evidence, skipped, done) and (projected.gains != 1).any():
         projected = blender.result()

@@ -76,18 +76,21 @@ def test_clock_jumps(reference: Reference, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(5400)
 @pytest.mark.parametrize("seed", range(10))
 def test_many_kills(reference: Reference, tmp_path: Path, capsys: pytest.CaptureFixture[str], seed: int) -> None:
     tell(capsys, "kills", kills(reference, tmp_path, 10, 100 + seed))
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(5400)
 @pytest.mark.parametrize("seed", range(10))
 def test_many_damaged_files(reference: Reference, tmp_path: Path, capsys: pytest.CaptureFixture[str], seed: int) -> None:
     tell(capsys, "damaged files", damages(reference, tmp_path, 20, 200 + seed))
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(5400)
 @pytest.mark.parametrize("processes", [2, 4])
 def test_runs_at_once(reference: Reference, tmp_path: Path, processes: int) -> None:
     """On one folder: the work is done once. On separate folders with one empty kernel cache: all have the same bytes."""
@@ -101,6 +104,7 @@ def test_runs_at_once(reference: Reference, tmp_path: Path, processes: int) -> N
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(5400)
 def test_interrupted_first_compilation(reference: Reference, tmp_path: Path) -> None:
     cache = {"NUMBA_CACHE_DIR": str(tmp_path / "kernels")}
     out = reference.unfinished(tmp_path / "out", "train")
@@ -115,6 +119,7 @@ def test_interrupted_first_compilation(reference: Reference, tmp_path: Path) -> 
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(5400)
 @pytest.mark.skipif(os.name != "posix" or os.geteuid() != 0, reason="mounting a small disk needs root")
 @pytest.mark.parametrize("share", [0.2, 0.5, 0.8, 0.95])
 def test_full_disk(reference: Reference, tmp_path: Path, share: float) -> None:
@@ -166,6 +171,7 @@ def test_a_few_failing_writes(reference: Reference, tmp_path: Path, failing_writ
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(5400)
 @pytest.mark.parametrize("seed", range(5))
 def test_many_failing_writes(
     reference: Reference, tmp_path: Path, failing_writes: Path, capsys: pytest.CaptureFixture[str], seed: int

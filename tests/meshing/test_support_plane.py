@@ -79,7 +79,7 @@ def test_sphere_has_none() -> None:
 
 
 def fused(support: SupportPlane | None) -> tuple[Array, np.ndarray]:
-    field = SparseTsdf([-1.2] * 3, [1.2] * 3, CELL, 4 * CELL, with_object=1.05, empty_outside=support is not None, support=support)
+    field = SparseTsdf([-1.2] * 3, [1.2] * 3, CELL, 4 * CELL, ball=1.05, empty_outside=support is not None, support=support)
     views = []
     for camera in cameras_around((15, 50)):
         depth, _, cosine = trace(object_on_table, camera)

@@ -25,12 +25,14 @@ def test_exposure_is_constant_below_the_gain_threshold(gain: float, constant: bo
     assert holds is constant and f"{max(gain, 1 / gain):.2f}x" in evidence
 
 
-@pytest.mark.parametrize(("tied", "constant"), [(MAX_TIE_POINT_SPREAD - 0.02, True), (MAX_TIE_POINT_SPREAD + 0.02, False), (None, False)])
-def test_tie_points_decide_on_specular_surfaces(tied: float | None, constant: bool) -> None:
+@pytest.mark.parametrize(
+    ("tie_point_spread", "constant"), [(MAX_TIE_POINT_SPREAD - 0.02, True), (MAX_TIE_POINT_SPREAD + 0.02, False), (None, False)]
+)
+def test_tie_points_decide_on_specular_surfaces(tie_point_spread: float | None, constant: bool) -> None:
     gains = np.ones((5, 3))
     gains[3] = 1.6
-    assert constant_exposure(gains, 0.5, tied)[0] is constant
-    assert constant_exposure(np.ones((5, 3)), 0.5, tied)[0]
+    assert constant_exposure(gains, 0.5, tie_point_spread)[0] is constant
+    assert constant_exposure(np.ones((5, 3)), 0.5, tie_point_spread)[0]
 
 
 @pytest.mark.parametrize(("explained", "constant"), [(MIN_EXPLAINED - 0.02, True), (MIN_EXPLAINED + 0.02, False)])

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import shutil
+import sqlite3
 from collections.abc import Sequence
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack, closing, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 from gsbake.capture.photos.undistortion import intrinsics_key
 from gsbake.capture.sfm.pairs import choose_matching
@@ -123,7 +125,11 @@ class PoseSolver:
 
     def _run(self, job: dict[str, Any], limit: float | None = None) -> dict[str, Any]:
         """Run the COLMAP process and time its parts. Raises what `run_job` raises, and what the monitor raises on a stop request."""
-        Path(job["work"]).mkdir(parents=True, exist_ok=True)
+        work = Path(job["work"])
+        if not _database_is_intact(work / "database.db"):
+            self.monitor.warn("COLMAP's database of the interrupted run is damaged; structure from motion starts over.")
+            shutil.rmtree(work)
+        work.mkdir(parents=True, exist_ok=True)
         shutil.rmtree(self.folder, ignore_errors=True)
         with ExitStack() as part_timer:
             current = ""
@@ -162,6 +168,17 @@ class PoseSolver:
                 target.unlink()
             shutil.copyfile(self.ingest / entry["mask"], target)
         return folder
+
+
+def _database_is_intact(path: Path) -> bool:
+    """Whether an SQLite database passes its own check; True where there is none."""
+    if not path.exists():
+        return True
+    try:
+        with closing(sqlite3.connect(f"file:{quote(str(path))}?mode=ro", uri=True)) as base:
+            return bool(base.execute("PRAGMA integrity_check").fetchone() == ("ok",))
+    except sqlite3.Error:
+        return False
 
 
 def _lenses(entries: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import json
-import os
 import shutil
 import time
 from dataclasses import dataclass, replace
@@ -14,6 +13,7 @@ from typing import Any
 import torch
 
 from gsbake.capture.posed_photos import PosedPhotos
+from gsbake.checkpoint import DamagedCheckpointError, load_checkpoint, save_checkpoint
 from gsbake.config.schema import Loss, Train
 from gsbake.config.schema import Surfels as SurfelSettings
 from gsbake.monitor import SILENT, Monitor, Rule, decide_skip
@@ -25,7 +25,7 @@ from gsbake.surfels.training.trainer import Plan, Trainer
 from gsbake.surfels.training.views import held_out, load_views
 
 #: Checkpoints of other versions are ignored.
-CHECKPOINT_VERSION = 3
+CHECKPOINT_VERSION = 4
 #: Interval between checkpoints.
 CHECKPOINT_SECONDS = 30.0
 #: File with the logarithms of the exposure gains per photo and linear colour channel.
@@ -111,13 +111,18 @@ class Session:
 
     @property
     def _checkpoint(self) -> Path | None:
-        return None if self.execution.scratch is None else self.execution.scratch / "checkpoint.pt"
+        return None if self.execution.scratch is None else self.execution.scratch / "checkpoint.safetensors"
 
     def _resume(self) -> None:
         path = self._checkpoint
         if path is None or not path.exists():
             return
-        body = torch.load(path, weights_only=True)
+        try:
+            body = load_checkpoint(path)
+        except DamagedCheckpointError as error:
+            self.monitor.warn(f"The checkpoint of the interrupted run is damaged ({error}); training starts over.")
+            path.unlink(missing_ok=True)
+            return
         if body["version"] == CHECKPOINT_VERSION:
             self.trainer.restore(body["trainer"])
             if self.aligner is not None:
@@ -128,13 +133,8 @@ class Session:
         path = self._checkpoint
         if path is None:
             return
-        part = path.with_suffix(".part")
-        with part.open("wb") as file:
-            aligned = None if self.aligner is None else self.aligner.state()
-            torch.save({"version": CHECKPOINT_VERSION, "trainer": self.trainer.state(), "aligner": aligned}, file)
-            file.flush()
-            os.fsync(file.fileno())
-        part.replace(path)
+        aligned = None if self.aligner is None else self.aligner.state()
+        save_checkpoint(path, {"version": CHECKPOINT_VERSION, "trainer": self.trainer.state(), "aligner": aligned})
 
     def run(self) -> dict[str, Any]:
         """Train to the end (or to a requested stop, which writes a checkpoint) and write the results."""

@@ -55,6 +55,12 @@ def gsbake(*args: object) -> None:
     assert done.returncode == 0, done.stderr[-2000:]
 
 
+def flip_a_byte(path: Path) -> None:
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 1
+    path.write_bytes(bytes(data))
+
+
 def results(out: Path) -> dict[str, bytes]:
     """The files of the stages train and refine."""
     manifests = [path for stage in ("train", "refine") for path in (out / "stages" / stage).glob("*/manifest.json")]
@@ -82,6 +88,7 @@ def test_interrupted_stages_give_identical_files(posed: Path, tmp_path: Path) ->
     assert len(checkpoints) == 1 and checkpoints[0].stat().st_size > 0
     assert run(interrupted, "train", 170, signal.SIGKILL) == -signal.SIGKILL
     assert run(interrupted, "refine", 60, signal.SIGTERM) == 75
+    flip_a_byte(next((interrupted / "stages" / "refine").glob("*.checkpoint/checkpoint.*")))  # refining starts over
     assert run(interrupted, "refine", 100, signal.SIGKILL) == -signal.SIGKILL
     assert run(interrupted, "refine") == 0
     expected = results(whole)

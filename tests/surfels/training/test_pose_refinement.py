@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from gsbake.capture.posed_photos import PosedPhotos
+from gsbake.checkpoint import load_checkpoint, save_checkpoint
 from gsbake.config.schema import Profile
 from gsbake.geometry.cameras import Camera, CameraSet
 from gsbake.surfels.initialisation import fibonacci_sphere, spacing
@@ -347,8 +348,8 @@ def test_stopped_trial_is_repeated_and_resumed_run_is_bit_identical(tmp_path: Pa
         first.step()
         aligner.update(stopped)
     assert aligner.decided is None and first.done == asked[0]  # restored to the start of the trial
-    torch.save({"trainer": first.state(), "aligner": aligner.state()}, tmp_path / "c.pt")
-    body = torch.load(tmp_path / "c.pt", weights_only=True)
+    save_checkpoint(tmp_path / "c", {"trainer": first.state(), "aligner": aligner.state()})
+    body = load_checkpoint(tmp_path / "c")
     second = trainer(given)
     again = Aligner(second, "auto", "auto")
     second.restore(body["trainer"])
@@ -358,8 +359,8 @@ def test_stopped_trial_is_repeated_and_resumed_run_is_bit_identical(tmp_path: Pa
     for _ in range(3):
         second.step()
         again.update(lambda: False)
-    torch.save({"trainer": second.state(), "aligner": again.state()}, tmp_path / "d.pt")
-    body = torch.load(tmp_path / "d.pt", weights_only=True)
+    save_checkpoint(tmp_path / "d", {"trainer": second.state(), "aligner": again.state()})
+    body = load_checkpoint(tmp_path / "d")
     third = trainer(given)
     last = Aligner(third, "auto", "auto")
     third.restore(body["trainer"])

@@ -12,6 +12,7 @@ import torch
 from scipy.spatial import cKDTree
 
 from gsbake.capture.posed_photos import PosedPhotos
+from gsbake.checkpoint import load_checkpoint, save_checkpoint
 from gsbake.config.schema import Profile
 from gsbake.errors import BadInputError
 from gsbake.geometry.cameras import CameraSet
@@ -104,9 +105,9 @@ def test_resumed_run_is_bit_identical(posed: PosedPhotos, tmp_path: Path) -> Non
     first = trainer(posed, p)
     for _ in range(37):
         first.step()
-    torch.save(first.state(), tmp_path / "c.pt")
+    save_checkpoint(tmp_path / "c", first.state())
     second = trainer(posed, p)
-    second.restore(torch.load(tmp_path / "c.pt", weights_only=True))
+    second.restore(load_checkpoint(tmp_path / "c"))
     while second.done < second.end:
         second.step()
     assert all(torch.equal(v, second.surfels.tensors()[k]) for k, v in whole.surfels.tensors().items())
