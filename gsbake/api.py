@@ -17,7 +17,7 @@ from gsbake.config.load import DEFAULT, LoadedProfile, load_profile
 from gsbake.errors import BadInputError, UsageError
 from gsbake.pipeline.digest import list_files
 from gsbake.pipeline.engine import Engine, Observer, artifacts_by_stage
-from gsbake.pipeline.files import disk_error, ensure_output_folder
+from gsbake.pipeline.files import disk_error
 from gsbake.pipeline.machine import default_threads, resolve_device
 from gsbake.pipeline.plan import Request, StageState
 from gsbake.pipeline.project import Project
@@ -63,7 +63,6 @@ class Session:
         Raises what `Engine.run` raises.
         """
         try:
-            ensure_output_folder(self.out)
             states = self.engine.run(target, on_accepted=lambda: self.project.save(self.out))
             digests = self.engine.store.digests
             files, project = publish_results(self.out, artifacts_by_stage(states), self.project, digests)

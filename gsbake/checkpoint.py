@@ -7,13 +7,14 @@ its owner starts over. Nothing in a checkpoint is executed (no pickle).
 from __future__ import annotations
 
 import json
-import os
 from pathlib import Path
 from typing import Any
 
 import torch
 from blake3 import blake3
 from safetensors.torch import load, save
+
+from gsbake.atomic import sync, write_atomic
 
 _TENSOR = "tensor"
 _STRUCTURE = "structure"
@@ -29,7 +30,7 @@ def save_checkpoint(path: Path, state: Any) -> None:
     tensors: dict[str, torch.Tensor] = {}
     structure = _flatten(state, tensors)
     body = save(tensors, {_STRUCTURE: json.dumps(structure)})
-    _write(path, blake3(body).digest() + body)
+    write_atomic(path, blake3(body).digest() + body, durable=True)
 
 
 def load_checkpoint(path: Path) -> Any:
@@ -48,9 +49,8 @@ def load_checkpoint(path: Path) -> Any:
 
 def seal_file(path: Path) -> None:
     """Write the digest of a finished file beside it; the file is flushed first."""
-    with path.open("rb+") as file:
-        os.fsync(file.fileno())
-    _write(_seal_path(path), blake3(path.read_bytes()).digest())
+    sync(path)
+    write_atomic(_seal_path(path), blake3(path.read_bytes()).digest(), durable=True)
 
 
 def is_sealed(path: Path) -> bool:
@@ -63,15 +63,6 @@ def is_sealed(path: Path) -> bool:
 
 def _seal_path(path: Path) -> Path:
     return path.with_name(f"{path.name}.digest")
-
-
-def _write(path: Path, data: bytes) -> None:
-    part = path.with_name(f"{path.name}.part")
-    with part.open("wb") as file:
-        file.write(data)
-        file.flush()
-        os.fsync(file.fileno())
-    part.replace(path)
 
 
 def _flatten(value: Any, tensors: dict[str, torch.Tensor]) -> Any:

@@ -1,4 +1,4 @@
-"""The errors a person sees, each with its documented exit code (0 done, 2 usage, 42 bad input, 75 interrupted)."""
+"""Errors shown to the user, each with its documented exit code (0 done, 2 usage, 42 bad input, 75 interrupted)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Python children that parse files of strangers: with a limit on memory and time, so that a hostile file costs a sentence, not the machine.
+"""Python children that parse untrusted files: with a limit on memory and time, so that a hostile file costs a sentence, not the machine.
 
 A parser in native code may loop, exhaust memory or crash. In a child, each of these is an exit status.
 """
@@ -69,7 +69,7 @@ def apply_limits(memory: int) -> None:
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
 
 
-def answer(result: dict[str, Any]) -> None:
+def print_answer(result: dict[str, Any]) -> None:
     """Print the result of a child as its last line."""
     sys.stdout.write(json.dumps(result) + "\n")
     sys.stdout.flush()

@@ -1,6 +1,6 @@
 """Command and environment of every Python process that gsbake starts.
 
-A child never imports from the current folder, which may hold a stranger's files beside the photos: `-P` keeps the current folder and the
+A child never imports from the current folder, which may hold untrusted files beside the photos: `-P` keeps the current folder and the
 script's folder off the search path, and PYTHONPATH is set to this process's own absolute search path without the current folder. Other
 PYTHON* variables are dropped, except those that only choose encodings, warnings and byte code. The other descriptors are closed by
 `subprocess` (`close_fds`), and no shell is involved.

@@ -282,7 +282,7 @@ def _read_one(
     path: Path, relative: str, name: str, source: _MaskSource | None, out: Path, settings: Ingest, budget: MemoryBudget
 ) -> _Photo:
     """Convert one photo and its mask (none without a `source`) to working files; runs in a thread."""
-    with budget.reserve(BYTES_PER_DECODED_BYTE * read_header(path).decoded_bytes):
+    with budget.reserve(BYTES_PER_DECODED_BYTE * read_header(path, settings.max_megapixels).decoded_bytes):
         photo = read_photo(path, settings.max_megapixels)
         mask = None if source is None else read_photo_mask(photo, relative, source.file, source.invert, settings.max_megapixels)
         rgb, mask = to_working_size(photo, mask, settings.max_size)

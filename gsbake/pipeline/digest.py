@@ -16,7 +16,7 @@ from pathlib import Path
 
 from blake3 import blake3
 
-from gsbake.pipeline.files import write_atomic
+from gsbake.atomic import write_atomic
 
 #: Minimum time since the last modification, in seconds, for a digest to be cached. FAT has the coarsest timestamps, 2 s.
 MIN_FILE_AGE = 2.5

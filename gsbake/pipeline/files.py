@@ -1,4 +1,4 @@
-"""Atomic file writes, and error messages for full or read-only disks."""
+"""Copies, folders, and the errors of full, failing or read-only disks."""
 
 from __future__ import annotations
 
@@ -6,30 +6,16 @@ import errno
 import os
 import shutil
 import uuid
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from pathlib import Path
 
+from gsbake.atomic import atomic_replacement, sync
 from gsbake.errors import BadInputError, InterruptedRun, UsageError
 
 #: errno values of a full disk or quota.
 DISK_FULL = frozenset({errno.ENOSPC, errno.EDQUOT})
-#: errno values of a file system that does not flush folders; any other failure means that data may be lost.
-CANNOT_SYNC = frozenset({errno.EINVAL, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS, errno.EBADF})
 #: errno values of a location without write access.
 NOT_WRITABLE = frozenset({errno.EROFS, errno.EACCES, errno.EPERM})
-
-
-def sync(path: Path) -> None:
-    """Flush a file or folder to disk. Raises OSError when that fails; file systems that cannot flush folders are accepted."""
-    handle = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    except OSError as error:
-        if error.errno not in CANNOT_SYNC or not path.is_dir():
-            raise
-    finally:
-        os.close(handle)
 
 
 def sync_tree(folder: Path) -> None:
@@ -40,32 +26,10 @@ def sync_tree(folder: Path) -> None:
         sync(Path(root))
 
 
-@contextmanager
-def _atomic_replacement(path: Path) -> Iterator[Path]:
-    """A temporary path beside `path` that replaces it when the block succeeds and is deleted when it fails."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.{uuid.uuid4().hex[:8]}.tmp")
-    try:
-        yield temporary
-        temporary.replace(path)
-    except BaseException:
-        with suppress(OSError):
-            temporary.unlink()
-        raise
-
-
-def write_atomic(path: Path, text: str, *, durable: bool = False) -> None:
-    """Replace the content of `path` atomically; `durable` also flushes it to disk."""
-    with _atomic_replacement(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
-        if durable:
-            sync(temporary)
-
-
 def copy_atomic(source: Path, target: Path) -> None:
     """Replace `target` atomically by a copy of `source`."""
-    with _atomic_replacement(target) as temporary:
+    with atomic_replacement(target, durable=True) as temporary:
         shutil.copyfile(source, temporary)
-        sync(temporary)
 
 
 def remove_tree(folder: Path) -> None:

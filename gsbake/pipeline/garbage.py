@@ -16,7 +16,7 @@ from pathlib import Path
 from gsbake.pipeline.files import remove_tree
 from gsbake.pipeline.key import KEY_PREFIX_LENGTH
 from gsbake.pipeline.lease import Lease, LeaseHolder
-from gsbake.pipeline.store import REPLACEMENT_PREFIX, Store
+from gsbake.pipeline.store import ARTIFACT_FOLDER, REPLACEMENT_PREFIX, Store
 
 
 @dataclass(frozen=True)
@@ -76,10 +76,8 @@ def delete(entries: Iterable[Entry]) -> list[Entry]:
         held = Lease(lease)
         held.acquire()
         try:
-            if entry.path.is_dir():
+            if entry.path.is_dir():  # a lease file goes with the lease's release
                 remove_tree(entry.path)
-            elif entry.kind != "lease":
-                entry.path.unlink(missing_ok=True)
         finally:
             held.release()
         if not entry.path.exists():
@@ -102,10 +100,10 @@ def _entry(path: Path, stage: str) -> Entry | None:
         kind = "temporary folder"
     elif name.endswith(".checkpoint"):
         kind = "checkpoint"
-    elif name.startswith(REPLACEMENT_PREFIX) or len(name) != KEY_PREFIX_LENGTH:
-        return None
-    else:
+    elif ARTIFACT_FOLDER.fullmatch(name):
         kind = "artifact"
+    else:
+        return None
     return Entry(path, stage, kind, _tree_size(path), path.stat().st_mtime)
 
 

@@ -28,7 +28,7 @@ from pathlib import Path
 import psutil
 from filelock import FileLock, Timeout
 
-from gsbake.pipeline.files import write_atomic
+from gsbake.atomic import write_atomic
 
 #: Seconds between heartbeats, and seconds without one after which the lease of another host or boot is stale.
 HEARTBEAT_INTERVAL = 5.0
@@ -151,7 +151,7 @@ class Lease:
         try:
             temporary.write_text(json.dumps(asdict(holder)), encoding="utf-8")
             _link(temporary, self.path)
-        except FileExistsError:
+        except (FileExistsError, FileNotFoundError):  # another holder, which may also have cleaned up
             return False
         finally:
             temporary.unlink(missing_ok=True)
@@ -171,7 +171,7 @@ class Lease:
             return True
         found = LeaseHolder.read(aside)
         if found != stale:  # another process has taken it over meanwhile
-            with suppress(FileExistsError):
+            with suppress(FileExistsError, FileNotFoundError):
                 _link(aside, self.path)
         aside.unlink(missing_ok=True)
         return found == stale
@@ -211,10 +211,10 @@ class Lease:
 
 
 def _link(source: Path, target: Path) -> None:
-    """Create `target` with the content of `source`. Raises FileExistsError when there is one."""
+    """Create `target` with the content of `source`. Raises FileExistsError when there is one, FileNotFoundError without a source."""
     try:
         os.link(source, target)
-    except FileExistsError:
+    except (FileExistsError, FileNotFoundError):
         raise
     except OSError:  # a file system without hard links: exclusive creation is the next best
         with target.open("x", encoding="utf-8") as file:

@@ -8,8 +8,8 @@ from pathlib import Path
 
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 
+from gsbake.atomic import write_atomic
 from gsbake.errors import BadInputError
-from gsbake.pipeline.files import write_atomic
 
 PROJECT = "project.json"
 

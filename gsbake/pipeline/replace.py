@@ -7,10 +7,11 @@ import shutil
 from collections.abc import Mapping
 from pathlib import Path
 
+from gsbake.atomic import write_atomic
 from gsbake.errors import UsageError
 from gsbake.pipeline.digest import list_files, tree_digest
 from gsbake.pipeline.events import now
-from gsbake.pipeline.files import remove_tree, write_atomic
+from gsbake.pipeline.files import remove_tree
 from gsbake.pipeline.lease import Lease
 from gsbake.pipeline.store import MANIFEST, REPLACEMENT, REPLACEMENT_PREFIX, Artifact, Store
 

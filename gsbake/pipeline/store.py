@@ -20,15 +20,17 @@ from typing import Any
 
 from blake3 import blake3
 
+from gsbake.atomic import sync, write_atomic
 from gsbake.pipeline.digest import DigestCache, tree_digest
-from gsbake.pipeline.files import remove_tree, sync, sync_tree, write_atomic
+from gsbake.pipeline.files import remove_tree, sync_tree
 from gsbake.pipeline.key import KEY_PREFIX_LENGTH, CacheKey
 
 MANIFEST = "manifest.json"
 REPLACEMENT = "replaced.json"
 #: Start of the folder name of the user's replacement of a stage's output.
 REPLACEMENT_PREFIX = "by-hand"
-_ARTIFACT_FOLDER = re.compile(rf"[0-9a-f]{{{KEY_PREFIX_LENGTH}}}")
+#: Folder name of a computed artifact, and of a replacement.
+ARTIFACT_FOLDER = re.compile(rf"[0-9a-f]{{{KEY_PREFIX_LENGTH}}}")
 _REPLACEMENT_FOLDER = re.compile(rf"{REPLACEMENT_PREFIX}-[0-9a-f]{{8}}")
 #: Files that file managers leave in folders they show; no stage reads them.
 _FILE_MANAGER_FILES = frozenset({".DS_Store", "Thumbs.db", "desktop.ini", ".directory"})
@@ -125,7 +127,7 @@ class Store:
         found = []
         with suppress(FileNotFoundError):
             for folder in self.stage_folder(stage).iterdir():
-                if len(folder.name) == KEY_PREFIX_LENGTH and (manifest := read_manifest(folder)) is not None:
+                if ARTIFACT_FOLDER.fullmatch(folder.name) and (manifest := read_manifest(folder)) is not None:
                     found.append((folder, manifest))
         return sorted(found, key=lambda pair: str(pair[1].get("finished", "")), reverse=True)
 
@@ -138,7 +140,7 @@ class Store:
     def publish(self, temporary: Path, final: Path, manifest: Mapping[str, Any]) -> Artifact:
         """Publish the folder `temporary` as the artifact `final`; digests and sizes of its files are added to the manifest."""
         sync_tree(temporary)
-        names = _unexpected(temporary, {})
+        names = [name for name in _list_all(temporary) if name != MANIFEST]
         files = self.digests.files(temporary, names)
         sizes = {name: (temporary / name).stat().st_size for name in names}
         body = {**manifest, "digest": tree_digest(files), "files": {n: {"digest": files[n], "bytes": sizes[n]} for n in names}}
@@ -179,7 +181,7 @@ class Store:
         """Folders of published artifacts and replacements of a stage, damaged ones included."""
         with suppress(FileNotFoundError, NotADirectoryError):
             entries = list(self.stage_folder(stage).iterdir())
-            return [e for e in entries if e.is_dir() and (_ARTIFACT_FOLDER.fullmatch(e.name) or _REPLACEMENT_FOLDER.fullmatch(e.name))]
+            return [e for e in entries if e.is_dir() and (ARTIFACT_FOLDER.fullmatch(e.name) or _REPLACEMENT_FOLDER.fullmatch(e.name))]
         return []
 
     def set_aside_unexpected(self, stage: str) -> list[Path]:
@@ -218,14 +220,19 @@ class Store:
         return Artifact(folder, files, manifest, by_hand=bool(manifest.get("replaced")))
 
 
-def _unexpected(folder: Path, manifest: Mapping[str, Any]) -> list[str]:
-    """Relative names of the files, and of links to folders, that the manifest does not list."""
-    listed = {MANIFEST, *manifest.get("files", {})}
+def _list_all(folder: Path) -> list[str]:
+    """Sorted relative POSIX names of all files, hidden ones included, and of links to folders; without those of file managers."""
     found = []
     for root, folders, names in os.walk(folder):
         links = [name for name in folders if os.path.islink(os.path.join(root, name))]
-        found += [os.path.relpath(os.path.join(root, name), folder) for name in [*names, *links] if name not in _FILE_MANAGER_FILES]
-    return sorted(name for name in (n.replace(os.sep, "/") for n in found) if name not in listed)
+        found += [Path(root, name).relative_to(folder).as_posix() for name in [*names, *links] if name not in _FILE_MANAGER_FILES]
+    return sorted(found)
+
+
+def _unexpected(folder: Path, manifest: Mapping[str, Any]) -> list[str]:
+    """The files of an artifact's folder that its manifest does not list."""
+    listed = {MANIFEST, *manifest.get("files", {})}
+    return [name for name in _list_all(folder) if name not in listed]
 
 
 def read_manifest(folder: Path) -> dict[str, Any] | None:

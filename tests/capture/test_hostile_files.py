@@ -1,4 +1,4 @@
-"""Files of strangers: photos, pose files and COLMAP models that are broken on purpose cost one sentence each."""
+"""Untrusted files: photos, pose files and COLMAP models that are broken on purpose cost one sentence each."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import OpenImageIO as oiio
 import pytest
 
 from gsbake.capture.ingest import IngestOptions, ingest, photo_names
-from gsbake.capture.photos.decode import UnreadablePhotoError, read_photo
+from gsbake.capture.photos.decode import UnreadablePhotoError, read_header, read_photo
 from gsbake.capture.photos.memory_budget import MemoryBudget
 from gsbake.capture.poses.frames import PhotoIndex, PhotoSize
 from gsbake.capture.poses.given import read_poses
@@ -71,6 +71,7 @@ def test_flipped_bytes_in_a_header_are_unreadable_or_read(tmp_path: Path) -> Non
         changed[at] ^= 0x80
         (tmp_path / "b.exr").write_bytes(bytes(changed))
         try:
+            read_header(tmp_path / "b.exr")
             read_photo(tmp_path / "b.exr", 1.0)
         except UnreadablePhotoError as error:
             assert "\n" not in str(error)

@@ -22,14 +22,6 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 @pytest.fixture
-def photos(tmp_path: Path) -> Path:
-    folder = tmp_path / "photos"
-    folder.mkdir()
-    (folder / "a.txt").write_text("one two three")
-    return folder
-
-
-@pytest.fixture
 def started() -> Iterator[list[subprocess.Popen[str]]]:
     """Processes that a test started; killed at its end."""
     processes: list[subprocess.Popen[str]] = []

@@ -11,14 +11,6 @@ from gsbake.pipeline.replace import folder_files, replace_output, undo_replaceme
 from tests.pipeline.toy import engine
 
 
-@pytest.fixture
-def photos(tmp_path: Path) -> Path:
-    folder = tmp_path / "photos"
-    folder.mkdir()
-    (folder / "a.txt").write_text("one two three")
-    return folder
-
-
 def test_later_stages_read_the_replaced_output(tmp_path: Path, photos: Path) -> None:
     out, mine = tmp_path / "out", tmp_path / "mine.txt"
     mine.write_text("777")

@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import io
 import os
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -89,19 +90,38 @@ class ImageHeader:
         return self.width * self.height * self.channels * self.sample_bytes
 
 
-def read_header(path: Path) -> ImageHeader:
-    """The header of an image file; no pixel is decoded. Raises UnreadablePhotoError."""
-    handle = _open(path)
+@contextmanager
+def _failures_as_unreadable() -> Iterator[None]:
+    """Raise UnreadablePhotoError for whatever a decoder raises: damaged files cause exceptions of many types."""
     try:
-        return _header(handle.spec())
-    finally:
-        handle.close()
+        yield
+    except UnreadablePhotoError:
+        raise
+    except MemoryError:
+        raise UnreadablePhotoError("decoding it needs more memory than there is") from None
+    except Exception as error:
+        raise UnreadablePhotoError(f"{type(error).__name__}: {' '.join(str(error).split())[:200]}") from error
 
 
-def _header(spec: oiio.ImageSpec) -> ImageHeader:
+def read_header(path: Path, max_megapixels: float = MAX_MEGAPIXELS) -> ImageHeader:
+    """The header of an image file; no pixel is decoded. Raises UnreadablePhotoError, also for more than `max_megapixels`."""
+    with _failures_as_unreadable():
+        handle = _open(path)
+        try:
+            return _header(handle.spec(), max_megapixels)
+        finally:
+            handle.close()
+
+
+def _header(spec: oiio.ImageSpec, max_megapixels: float) -> ImageHeader:
     if not (0 < spec.width <= _MAX_EDGE and 0 < spec.height <= _MAX_EDGE and 0 < spec.nchannels <= _MAX_CHANNELS and spec.depth <= 1):
         raise UnreadablePhotoError(f"it has {spec.width}x{spec.height} pixels of {spec.nchannels} channels")
-    return ImageHeader(spec.width, spec.height, spec.nchannels, 1 if spec.format == oiio.UINT8 else 4)
+    header = ImageHeader(spec.width, spec.height, spec.nchannels, 1 if spec.format == oiio.UINT8 else 4)
+    if header.megapixels > max_megapixels:
+        raise UnreadablePhotoError(
+            f"it has {header.megapixels:.0f} megapixels, more than ingest.max_megapixels = {max_megapixels:g}; raise that setting"
+        )
+    return header
 
 
 def _open(path: Path) -> Any:
@@ -121,11 +141,7 @@ def _decode(path: Path, max_megapixels: float) -> tuple[NDArray[Any], oiio.Image
     handle = _open(path)
     try:
         spec = handle.spec()
-        header = _header(spec)
-        if header.megapixels > max_megapixels:
-            raise UnreadablePhotoError(
-                f"it has {header.megapixels:.0f} megapixels, more than ingest.max_megapixels = {max_megapixels:g}; raise that setting"
-            )
+        _header(spec, max_megapixels)
         pixels = handle.read_image(oiio.UINT8 if spec.format == oiio.UINT8 else oiio.FLOAT)
         if pixels is None or handle.has_error:  # a truncated JPEG is decoded as far as it goes, with an error set
             raise UnreadablePhotoError(" ".join(handle.geterror().split())[:200] or "no pixels")
@@ -156,14 +172,8 @@ def read_photo(path: Path, max_megapixels: float = MAX_MEGAPIXELS) -> RawPhoto:
 
     Raises UnreadablePhotoError when the file is broken, truncated, larger than `max_megapixels`, or holds NaN or infinite values.
     """
-    try:
+    with _failures_as_unreadable():
         return _read_photo(path, max_megapixels)
-    except UnreadablePhotoError:
-        raise
-    except MemoryError:
-        raise UnreadablePhotoError("decoding it needs more memory than there is") from None
-    except Exception as error:  # decoders report damaged metadata in exceptions of many types
-        raise UnreadablePhotoError(f"{type(error).__name__}: {' '.join(str(error).split())[:200]}") from error
 
 
 def _tags(spec: oiio.ImageSpec) -> dict[str, Any]:
@@ -220,10 +230,8 @@ def read_mask(path: Path, max_megapixels: float = MAX_MEGAPIXELS) -> tuple[Bytes
 
     The mask of an RGBA file is its alpha channel unless that is opaque. Raises UnreadablePhotoError.
     """
-    try:
+    with _failures_as_unreadable():
         pixels, spec = _decode(path, max_megapixels)
-    except (MemoryError, RuntimeError, ValueError, OSError) as error:
-        raise UnreadablePhotoError(f"{type(error).__name__}: {' '.join(str(error).split())[:200]}") from error
     orientation = _orientation(spec.get_int_attribute("Orientation", 1))
     plane = pixels[..., 0]
     if spec.alpha_channel >= 0 and float(pixels[..., spec.alpha_channel].min()) < (255 if pixels.dtype == np.uint8 else 1.0):

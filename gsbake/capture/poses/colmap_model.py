@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gsbake.capture.poses.frames import MAX_TRANSLATION, GivenPoses, PhotoSize, checked_rigid, match_cameras
+from gsbake.capture.poses.frames import GivenPoses, PhotoSize, checked_rigid, match_cameras
+from gsbake.capture.poses.validation import MAX_COORDINATE
 from gsbake.errors import BadInputError
 from gsbake.geometry.cameras import Camera
 from gsbake.limited_process import Limits, ParserFailedError, run_limited
@@ -27,7 +28,6 @@ _LAYOUT = {
     "OPENCV": (0, 1, 2, 3, 4, 5, 6, 7),
     "FULL_OPENCV": (0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11),
 }
-
 
 #: Address space of the process that reads a model: at least, and per byte of the model. Seconds it may take.
 MIN_READER_MEMORY, READER_MEMORY_FACTOR, READER_SECONDS = 2 << 30, 40, 600.0
@@ -45,14 +45,17 @@ def intrinsics(model: str, params: Any, where: str) -> dict[str, Any]:
 
 def camera_of(image: Any, name: str, where: str) -> Camera:
     """The `Camera` of a registered image of a pycolmap reconstruction."""
-    pose = image.cam_from_world()
-    rot, t = checked_rigid(np.asarray(pose.rotation.matrix(), float), np.asarray(pose.translation, float), name, where)
-    lens = image.camera
-    return Camera(name=name, width=lens.width, height=lens.height, R=rot, t=t, **intrinsics(lens.model_name, lens.params, where))
+    pose, lens = image.cam_from_world(), image.camera
+    return _camera(name, pose.rotation.matrix(), pose.translation, (lens.width, lens.height), lens.model_name, lens.params, where)
+
+
+def _camera(name: str, rotation: Any, translation: Any, size: tuple[int, int], model: str, params: Any, where: str) -> Camera:
+    rot, t = checked_rigid(np.asarray(rotation, float), np.asarray(translation, float), name, where)
+    return Camera(name=name, width=size[0], height=size[1], R=rot, t=t, **intrinsics(model, params, where))
 
 
 def read_model(folder: Path, sizes: Mapping[str, PhotoSize]) -> GivenPoses:
-    """Poses and points of a stranger's COLMAP model folder, read in a child process with limited memory and time.
+    """Poses and points of an untrusted COLMAP model folder, read in a child process with limited memory and time.
 
     Raises BadInputError for damaged files, values that are not finite or out of bounds, and camera models that are not perspective.
     """
@@ -68,15 +71,14 @@ def read_model(folder: Path, sizes: Mapping[str, PhotoSize]) -> GivenPoses:
             arrays = {name: body[name] for name in body.files}
     frames = []
     for k, (name, model) in enumerate(zip(listed["names"], listed["models"], strict=True)):
-        rot, t = checked_rigid(arrays["rotations"][k], arrays["translations"][k], name, str(folder))
         width, height = (int(x) for x in arrays["sizes"][k])
-        inner = intrinsics(model, arrays["params"][k], str(folder))
-        frames.append((name, Camera(name=name, width=width, height=height, R=rot, t=t, **inner)))
+        pose = arrays["rotations"][k], arrays["translations"][k]
+        frames.append((name, _camera(name, *pose, (width, height), model, arrays["params"][k], str(folder))))
     if not frames:
         raise BadInputError(f"The COLMAP model {folder} holds no image with a pose.")
     cameras, missing = match_cameras(frames, sizes, str(folder))
-    finite = np.isfinite(arrays["points"]).all(1) & (np.abs(arrays["points"]) < MAX_TRANSLATION).all(1)
-    points, colours = arrays["points"][finite], arrays["colours"][finite]
+    near = (np.abs(arrays["points"]) < MAX_COORDINATE).all(1)
+    points, colours = arrays["points"][near], arrays["colours"][near]
     return GivenPoses(cameras, missing, points if len(points) else None, colours if len(points) else None)
 
 

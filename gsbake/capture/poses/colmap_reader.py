@@ -1,4 +1,4 @@
-"""The child process that reads a stranger's COLMAP model: `python -m … MEMORY FOLDER OUT.npz`.
+"""The child process that reads an untrusted COLMAP model: `python -m … MEMORY FOLDER OUT.npz`.
 
 pycolmap trusts the counts in binary models: a file of 8 bytes can ask for 2⁶³ points. Here it may, under a limit on memory and time.
 """
@@ -9,8 +9,9 @@ import sys
 
 import numpy as np
 
+from gsbake.capture.poses.colmap_model import cloud
 from gsbake.capture.sfm.colmap import pycolmap
-from gsbake.limited_process import answer, apply_limits
+from gsbake.limited_process import apply_limits, print_answer
 
 
 def main() -> None:
@@ -26,20 +27,20 @@ def main() -> None:
         for row, lens in zip(params, lenses, strict=True):
             row[: len(lens.params)] = lens.params
         poses = [image.cam_from_world() for image in images]
-        points = list(model.points3D.values())
+        points, colours = cloud(model)
         np.savez(
             sys.argv[3],
             rotations=np.array([pose.rotation.matrix() for pose in poses], float).reshape(-1, 3, 3),
             translations=np.array([pose.translation for pose in poses], float).reshape(-1, 3),
             params=params,
             sizes=np.array([(min(lens.width, 2**40), min(lens.height, 2**40)) for lens in lenses], np.int64).reshape(-1, 2),
-            points=np.array([p.xyz for p in points], float).reshape(-1, 3),
-            colours=np.array([p.color for p in points], np.uint8).reshape(-1, 3),
+            points=points,
+            colours=colours,
         )
-        answer({"names": names, "models": [lens.model_name for lens in lenses]})
+        print_answer({"names": names, "models": [lens.model_name for lens in lenses]})
     except (ValueError, RuntimeError, OSError, IndexError, KeyError, TypeError, OverflowError) as error:
         text = " ".join(str(error).split()) or type(error).__name__
-        answer({"error": text[-300:]})
+        print_answer({"error": text[-300:]})
 
 
 if __name__ == "__main__":

@@ -11,15 +11,13 @@ from pathlib import PurePosixPath
 
 import numpy as np
 
-from gsbake.capture.poses.validation import ImportedCamera, validate
+from gsbake.capture.poses.validation import MAX_COORDINATE, ImportedCamera, validate
 from gsbake.errors import BadInputError
 from gsbake.geometry.cameras import Array, Camera
 from gsbake.text import shortlist
 
 #: Largest deviation of RᵀR from the identity that is attributed to rounding in a text file.
 RIGID_TOLERANCE = 1e-2
-#: Largest coordinate of a camera's position, in units of the file; beyond it double precision loses the object.
-MAX_TRANSLATION = 1e9
 
 
 @dataclass(frozen=True)
@@ -56,7 +54,7 @@ def checked_rigid(rotation: Array, translation: Array, frame: str, source: str) 
         raise BadInputError(
             f"The pose of frame {frame} in {source} is no rigid motion (its matrix scales, shears or mirrors); export the poses again."
         )
-    if np.abs(translation).max() > MAX_TRANSLATION:
+    if np.abs(translation).max() > MAX_COORDINATE:
         far = float(np.abs(translation).max())
         raise BadInputError(f"The pose of frame {frame} in {source} is {far:.0e} units from the origin; export it again.")
     u, _, vt = np.linalg.svd(rotation)
@@ -151,7 +149,6 @@ def fit_to_photo(camera: Camera, size: PhotoSize, source: str) -> Camera:
         return min(width, height) > 0 and abs(camera.width / camera.height * height / width - 1) < 0.01
 
     checked_intrinsics(camera, source)
-
     if (camera.width, camera.height) == (size.width, size.height):
         return camera
     if same_aspect(size.width, size.height):

@@ -15,6 +15,8 @@ from gsbake.errors import BadInputError
 
 #: Largest pose file in bytes: a transforms.json of 100 000 frames has about 100 MB.
 MAX_FILE_SIZE = 256 << 20
+#: Largest coordinate of a camera or point, in units of the file; beyond it double precision loses the object.
+MAX_COORDINATE = 1e9
 #: Most frames of a pose file.
 MAX_FRAMES = 100_000
 
@@ -23,7 +25,7 @@ Focal = Annotated[float, Field(gt=0, le=1e7)]
 Principal = Annotated[float, Field(ge=-1e6, le=1e6)]
 Angle = Annotated[float, Field(gt=0, lt=math.pi)]
 Coefficient = Annotated[float, Field(ge=-1e3, le=1e3)]
-Coordinate = Annotated[float, Field(ge=-1e9, le=1e9)]
+Coordinate = Annotated[float, Field(ge=-MAX_COORDINATE, le=MAX_COORDINATE)]
 
 
 class Strict(BaseModel):
