@@ -125,43 +125,34 @@ def close_holes(vertices: Vertices, faces: Faces, max_edges: int) -> tuple[Verti
     return _from_meshlab(meshes)
 
 
-def decimate(vertices: Vertices, faces: Faces, target: int, max_error: float | None = None) -> tuple[Vertices, Faces, float]:
-    """Quadric edge collapse to about `target` faces that preserves boundaries, normals and topology; also returns the error.
-
-    The error is the maximum distance from a vertex of the input to the result. Above `max_error` (same units) the collapse is repeated
-    with twice the faces.
-    """
-    while True:
-        if len(faces) <= target:
-            return vertices, faces, 0.0
-        meshes = _to_meshlab(vertices, faces)
-        meshes.meshing_decimation_quadric_edge_collapse(
-            targetfacenum=int(target),
-            qualitythr=0.3,
-            preserveboundary=True,
-            boundaryweight=2.0,
-            preservenormal=True,
-            preservetopology=True,
-            optimalplacement=True,
-            planarquadric=True,  # avoids slivers on flat surfaces
-            autoclean=True,
-        )
-        fewer = _from_meshlab(meshes)
-        error = deviation(vertices, *fewer)
-        if max_error is None or error <= max_error:
-            return (*fewer, error)
-        target *= 2
+def decimate(vertices: Vertices, faces: Faces, target: int) -> tuple[Vertices, Faces]:
+    """Quadric edge collapse to about `target` faces that preserves boundaries, normals and topology."""
+    if len(faces) <= target:
+        return vertices, faces
+    meshes = _to_meshlab(vertices, faces)
+    meshes.meshing_decimation_quadric_edge_collapse(
+        targetfacenum=int(target),
+        qualitythr=0.3,
+        preserveboundary=True,
+        boundaryweight=2.0,
+        preservenormal=True,
+        preservetopology=True,
+        optimalplacement=True,
+        planarquadric=True,  # avoids slivers on flat surfaces
+        autoclean=True,
+    )
+    return _from_meshlab(meshes)
 
 
-def deviation(points: Vertices, vertices: Vertices, faces: Faces) -> float:
-    """Maximum distance from `points` (n, 3) to a mesh (one-sided Hausdorff distance)."""
-    if len(points) == 0 or len(faces) == 0:
-        return float("inf") if len(points) else 0.0
+def surface_distances(points: Vertices, vertices: Vertices, faces: Faces) -> NDArray[np.float64]:
+    """Distance (n,) from each of `points` (n, 3) to the surface of a mesh with faces."""
     meshes = pymeshlab.MeshSet(verbose=False)
-    meshes.add_mesh(pymeshlab.Mesh(np.asarray(points, np.float64)))
-    meshes.add_mesh(pymeshlab.Mesh(np.asarray(vertices, np.float64), np.asarray(faces, np.int32)))
-    measures = meshes.get_hausdorff_distance(sampledmesh=0, targetmesh=1, samplevert=True, samplenum=len(points))
-    return float(measures["max"])
+    meshes.add_mesh(pymeshlab.Mesh(np.ascontiguousarray(points, np.float64)))
+    meshes.add_mesh(pymeshlab.Mesh(np.ascontiguousarray(vertices, np.float64), np.ascontiguousarray(faces, np.int32)))
+    meshes.compute_scalar_by_distance_from_another_mesh_per_vertex(
+        measuremesh=0, refmesh=1, signeddist=False, maxdist=pymeshlab.PercentageValue(100)
+    )
+    return np.abs(np.asarray(meshes.mesh(0).vertex_scalar_array(), np.float64))
 
 
 def _edge_keys(vertices: Vertices, faces: Faces) -> NDArray[np.int64]:

@@ -17,6 +17,7 @@ from gsbake.errors import BadInputError
 from gsbake.geometry.cameras import Camera
 from gsbake.geometry.ply import write_mesh
 from gsbake.meshing import cleanup
+from gsbake.meshing.decimation import decimate_to_error_bound
 from gsbake.meshing.depth_cache import DepthViewCache
 from gsbake.meshing.depth_views import DepthView, depth_noise
 from gsbake.meshing.imls import imls_field
@@ -51,12 +52,18 @@ MAX_HOLE_EDGES = 400
 @dataclass(frozen=True)
 class MeshOptions:
     """Settings of mesh extraction; `train_size` and `stereo_size` are the longer sides in pixels of the photos in training and stereo,
-    `empty_cells` is the rule of [skip]."""
+    `empty_cells` is the rule of [skip], `max_triangles` the limit of the exported asset."""
 
     mesh: Mesh = Mesh()
     train_size: int = 512
     stereo_size: int = 800
     empty_cells: Rule = "auto"
+    max_triangles: int = 100_000
+
+    @property
+    def max_faces(self) -> int:
+        """Maximum faces of the low-poly mesh under the error bound."""
+        return max(self.mesh.faces, self.mesh.max_faces or min(4 * self.mesh.faces, self.max_triangles))
 
 
 @dataclass(frozen=True)
@@ -310,23 +317,24 @@ class _Extraction:
 
     def _decimate(self, vertices: Doubles, faces: Faces, cell: float) -> dict[str, Any]:
         """Decimate and write the low-poly mesh; its results for the manifest."""
-        low_poly_vertices, low_poly_faces, error = cleanup.decimate(vertices, faces, self.options.mesh.faces)
-        topology = cleanup.topology(low_poly_vertices, low_poly_faces)
-        if topology.non_manifold_edges:
-            low_poly_vertices, low_poly_faces = cleanup.repair(low_poly_vertices, low_poly_faces)
-            topology = cleanup.topology(low_poly_vertices, low_poly_faces)
-        write_mesh(self.out / "mesh.ply", low_poly_vertices, low_poly_faces)
-        if error > 2 * cell:
-            self.monitor.warn(
-                f"mesh: decimation to {len(low_poly_faces)} faces deviates by up to {error / cell:.1f} voxels; raise mesh.faces."
-            )
+        settings, monitor = self.options.mesh, self.monitor
+        result = decimate_to_error_bound(
+            vertices, faces, settings.faces, self.options.max_faces, settings.max_error * cell, monitor.check_stop
+        )
+        write_mesh(self.out / "mesh.ply", result.vertices, result.faces)
+        deviation, bound = result.deviation.quantile / cell, f"bound {settings.max_error:g}" if settings.max_error else "no bound"
+        choice = f"{len(result.faces)} faces" + (f" instead of {settings.faces}" if result.retries else "")
+        monitor.decide("decimation", choice, f"deviation from the dense mesh {deviation:.2f} voxels ({bound})")
+        if 0 < settings.max_error < deviation:
+            monitor.warn(f"mesh: decimation to {len(result.faces)} faces deviates by {deviation:.2f} voxels; raise mesh.faces.")
         return {
-            "vertices": len(low_poly_vertices),
-            "faces": len(low_poly_faces),
-            "components": topology.components,
-            "watertight": topology.watertight,
-            "border_edges": topology.border_edges,
-            "decimation_error_cells": error / cell,
+            "vertices": len(result.vertices),
+            "faces": len(result.faces),
+            "components": result.topology.components,
+            "watertight": result.topology.watertight,
+            "border_edges": result.topology.border_edges,
+            "decimation_deviation_cells": deviation,
+            "decimation_error_cells": result.deviation.maximum / cell,
         }
 
 

@@ -79,25 +79,7 @@ def test_repair_removes_non_manifold_faces() -> None:
     assert found.non_manifold_edges == 0
 
 
-def test_decimation_keeps_the_shape() -> None:
-    vertices, faces = sphere(5)
-    decimated_vertices, decimated, error = clean.decimate(vertices, faces, 1000)
-    assert 900 <= len(decimated) <= 1000
-    assert clean.topology(decimated_vertices, decimated).watertight
-    # A chord of an even mesh of 1000 faces has a sagitta of edge²/8r, edge² = 4/√3 · area: about 0.4 %.
-    assert error < 0.012
-    assert error == pytest.approx(clean.deviation(vertices, decimated_vertices, decimated))
-    assert trimesh.Trimesh(decimated_vertices, decimated, process=False).volume == pytest.approx(4 / 3 * np.pi, rel=0.01)
-
-
-def test_decimation_to_an_error() -> None:
-    vertices, faces = sphere(5)
-    decimated_vertices, decimated, error = clean.decimate(vertices, faces, 100, max_error=0.005)
-    assert error <= 0.005
-    assert 800 <= len(decimated) <= 6400
-    assert len(clean.decimate(vertices, faces, 10**6)[1]) == len(faces)
-
-
-def test_deviation_is_the_distance_to_the_triangles() -> None:
+def test_surface_distances_are_to_the_triangles() -> None:
     vertices, faces = np.array([[0.0, 0, 0], [4, 0, 0], [0, 4, 0]]), np.array([[0, 1, 2]], np.int32)
-    assert clean.deviation(np.array([[1.0, 1, 0.25], [1, 1, 0]]), vertices, faces) == pytest.approx(0.25)
+    points = np.array([[1.0, 1, 0.25], [1, 1, 0], [-3, 0, 4], [1, 1, -2]])
+    np.testing.assert_allclose(clean.surface_distances(points, vertices, faces), [0.25, 0, 5, 2], atol=1e-9)

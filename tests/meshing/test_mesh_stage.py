@@ -59,10 +59,37 @@ def test_torus_is_reconstructed(capture: Path, tmp_path: Path, field: str) -> No
         assert mesh.volume == pytest.approx(2 * np.pi**2 * 0.55 * 0.22**2, rel=0.04)
     assert results["components"] == 1 and results["watertight"]
     assert results["decimation_error_cells"] < 2 and not monitor.warnings
+    assert results["decimation_deviation_cells"] <= 0.5
+    assert monitor.decisions["decimation"][0] == f"{len(low.faces)} faces"
     assert {"field resolution", "truncation"} <= set(monitor.decisions)
     assert "surfel spacing" in monitor.decisions["field resolution"][1]
     assert list(tmp_path.iterdir()) == [out]  # the depth cache is removed
     assert sorted(p.name for p in out.iterdir()) == ["dense.ply", "mesh.ply"]
+
+
+@pytest.mark.parametrize(("max_error", "max_faces"), [(0.5, 0), (0.5, 1300), (0.0, 0)])
+def test_error_bound_raises_the_face_count(capture: Path, tmp_path: Path, max_error: float, max_faces: int) -> None:
+    monitor = Recorder()
+    results = run(capture, tmp_path / "out", monitor, faces=1200, max_resolution=80, max_error=max_error, max_faces=max_faces)
+    choice, evidence = monitor.decisions["decimation"]
+    assert choice.startswith(f"{results['faces']} faces") and f"{results['decimation_deviation_cells']:.2f} voxels" in evidence
+    if max_error == 0:
+        assert results["faces"] <= 1200 and results["decimation_deviation_cells"] > 0.5 and not monitor.warnings
+    elif max_faces:
+        assert 1200 < results["faces"] <= 1300 and len(monitor.warnings) == 1
+        assert f"{results['decimation_deviation_cells']:.2f} voxels" in monitor.warnings[0]
+    else:
+        assert 1200 < results["faces"] <= 4800 and results["decimation_deviation_cells"] <= 0.5 and not monitor.warnings
+        assert "instead of 1200" in choice
+
+
+def test_maximum_face_count() -> None:
+    """Four times mesh.faces, at most the export limit, never below mesh.faces; mesh.max_faces replaces it."""
+    assert MeshOptions(Mesh(faces=20_000), max_triangles=100_000).max_faces == 80_000
+    assert MeshOptions(Mesh(faces=60_000), max_triangles=100_000).max_faces == 100_000
+    assert MeshOptions(Mesh(faces=60_000), max_triangles=50_000).max_faces == 60_000
+    assert MeshOptions(Mesh(faces=20_000, max_faces=200_000), max_triangles=100_000).max_faces == 200_000
+    assert MeshOptions(Mesh(faces=20_000, max_faces=10_000)).max_faces == 20_000
 
 
 @pytest.mark.parametrize("support", ["remove", "keep"])

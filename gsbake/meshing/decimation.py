@@ -1,0 +1,81 @@
+"""Decimation of the dense mesh to a low-poly mesh under an error bound.
+
+The error is the deviation of the two surfaces: the distances of the vertices and face centres of either mesh to the other's surface.
+Their maximum depends on single vertices, such as the tip of a spike; the bound is on their 99.9 % quantile.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from gsbake.meshing.cleanup import Faces, Topology, Vertices, decimate, repair, surface_distances, topology
+
+#: Quantile of the distances that the bound applies to.
+QUANTILE = 0.999
+#: Minimum factor between the face counts of two attempts, and maximum number of attempts above the first face count.
+MIN_FACTOR, MAX_RETRIES = 1.5, 3
+#: Deviation falls with the face count to about this power (measured: 0.63 to 0.99 on dense meshes of 160 000 to 1 000 000 faces).
+DEVIATION_EXPONENT = 0.75
+#: Share of the bound in the estimate of the next face count: an error of the estimate must not cost another retry.
+SAFETY_FACTOR = 0.95
+
+
+@dataclass(frozen=True)
+class Deviation:
+    """Distances between two surfaces: the larger one of the two sides' 99.9 % quantiles, and the maximum; in units of the meshes."""
+
+    quantile: float
+    maximum: float
+
+
+@dataclass(frozen=True)
+class DecimatedMesh:
+    """The low-poly mesh with its topology, its deviation from the dense mesh, and the number of `retries` above the first face count."""
+
+    vertices: Vertices
+    faces: Faces
+    topology: Topology
+    deviation: Deviation
+    retries: int
+
+
+def surface_deviation(first: tuple[Vertices, Faces], second: tuple[Vertices, Faces]) -> Deviation:
+    """Deviation of two meshes, each `vertices` (v, 3) and `faces` (f, 3), from the vertices and face centres of both."""
+    sides = [
+        surface_distances(np.concatenate([vertices, vertices[faces].mean(1)]), *other)
+        for (vertices, faces), other in ((first, second), (second, first))
+    ]
+    return Deviation(max(float(np.quantile(side, QUANTILE)) for side in sides), max(float(side.max()) for side in sides))
+
+
+def decimate_to_error_bound(
+    vertices: Vertices,
+    faces: Faces,
+    target: int,
+    max_target: int,
+    max_error: float,
+    check_stop: Callable[[], None] = lambda: None,
+) -> DecimatedMesh:
+    """Decimate to `target` faces, or to more, at most `max_target`, until the deviation is at most `max_error` (units of the mesh).
+
+    `max_error` 0 sets no bound. The bound can be missed at `max_target` faces or after `MAX_RETRIES` retries. `check_stop` is called before
+    each retry.
+    """
+    retries = 0
+    while True:
+        low_poly = decimate(vertices, faces, target)
+        mesh_topology = topology(*low_poly)
+        if mesh_topology.non_manifold_edges:
+            low_poly = repair(*low_poly)
+            mesh_topology = topology(*low_poly)
+        deviation = Deviation(0.0, 0.0) if len(faces) <= target else surface_deviation((vertices, faces), low_poly)
+        exceeded = 0 < max_error < deviation.quantile
+        if not exceeded or target >= max_target or retries == MAX_RETRIES:
+            return DecimatedMesh(*low_poly, mesh_topology, deviation, retries)
+        check_stop()
+        factor = max(MIN_FACTOR, (deviation.quantile / (SAFETY_FACTOR * max_error)) ** (1 / DEVIATION_EXPONENT))
+        target = min(max_target, int(np.ceil(target * factor)))
+        retries += 1
