@@ -28,6 +28,8 @@ Floats = NDArray[np.float64]
 
 #: Roughnesses tried beside a texel's own.
 TRIED_ROUGHNESS = (0.1, 0.2, 0.35, 0.55)
+#: Roughest metal: rougher ones shade like dielectrics, and oxides, which are rough, are dielectrics.
+MAX_METAL_ROUGHNESS = 0.6
 #: Lowest linear base colour of a metal, and lowest mean base colour of a clean one.
 MIN_METAL_ALBEDO, CLEAN_METAL_ALBEDO = 0.1, 0.3
 #: The metal's residual must be below this share of the dielectric's: for dark metals, which are rarer, and for clean ones.
@@ -78,11 +80,12 @@ def observed_weight(photos: Sequence[PhotoSamples], texels: int) -> Floats:
 
 @dataclass(frozen=True)
 class MetalTexels:
-    """Texels (m,) detected as metal, with linear base colour (m, 3) and roughness (m,)."""
+    """Texels (m,) detected as metal, with linear base colour (m, 3) and roughness (m,); `dielectric` the same of the other decided ones."""
 
     texel: NDArray[np.int64]
     base: Floats
     roughness: Floats
+    dielectric: tuple[NDArray[np.int64], Floats, Floats]
 
 
 @dataclass(frozen=True)
@@ -141,36 +144,45 @@ def find_metals(
     `average` filters values (texels,) over similar neighbours, which decide together.
     """
     texels = len(own)
-    dielectric, metal, base, roughness = _compare_models(photos, own)
+    dielectric, metal = _compare_models(photos, own)
     visible = sum((average((np.bincount(e.texel, e.weight, texels) > 0).astype(np.float64)) > MIN_PHOTO_SHARE for e in photos),
                   np.zeros(texels, int))  # fmt: skip
     decided = (observed_weight(photos, texels) > MIN_WEIGHT) & (visible >= MIN_PHOTOS)
     count = np.maximum(average(decided.astype(np.float64)), 1e-9)
-    albedo = average(np.where(decided, base.mean(1), 0.0)) / count
+    albedo = average(np.where(decided, metal.base.mean(1), 0.0)) / count
     ratio = np.where(albedo < CLEAN_METAL_ALBEDO, *MAX_RESIDUAL_RATIO)
-    better = np.asarray(average(metal) < ratio * average(dielectric))
-    chosen = np.flatnonzero(majority_vote(better, decided, average))
-    return MetalTexels(chosen, base[chosen], roughness[chosen])
+    better = np.asarray(average(metal.residual) < ratio * average(dielectric.residual))
+    is_metal = majority_vote(better, decided, average)
+    chosen, others = np.flatnonzero(is_metal), np.flatnonzero(decided & ~is_metal)
+    rest = others, dielectric.base[others], dielectric.roughness[others]
+    return MetalTexels(chosen, metal.base[chosen], metal.roughness[chosen], rest)
 
 
-def _compare_models(photos: Sequence[PhotoSamples], own: NDArray[np.float32]) -> tuple[Floats, Floats, Floats, Floats]:
-    """Lowest residuals (texels,) as dielectric and as metal over all roughnesses tried, and the metal's base colour (texels, 3) and
-    roughness (texels,)."""
+class _BestModel:
+    """The base colour (texels, 3) and roughness (texels,) with the lowest `residual` (texels,) so far."""
+
+    def __init__(self, texels: int) -> None:
+        self.residual, self.base, self.roughness = np.full(texels, np.inf), np.zeros((texels, 3)), np.zeros(texels)
+
+    def offer(self, residual: Floats, base: Floats, roughness: NDArray[np.float32]) -> None:
+        better = residual < self.residual
+        self.residual[better], self.base[better], self.roughness[better] = residual[better], base[better], roughness[better]
+
+
+def _compare_models(photos: Sequence[PhotoSamples], own: NDArray[np.float32]) -> tuple[_BestModel, _BestModel]:
+    """The best dielectric and the best metal of each texel over all roughnesses tried."""
     texels = len(own)
     weights = [unclipped_weights(e) for e in photos]
-    dielectric, metal = np.full(texels, np.inf), np.full(texels, np.inf)
-    base, roughness = np.zeros((texels, 3)), np.zeros(texels)
+    dielectric, metal = _BestModel(texels), _BestModel(texels)
     for tried in (own, *(np.full(texels, r, np.float32) for r in TRIED_ROUGHNESS)):
         for metallic, lowest in ((0.0, 0.0), (1.0, MIN_METAL_ALBEDO)):
+            if metallic and tried is own:
+                tried = np.minimum(own, np.float32(MAX_METAL_ROUGHNESS))
             shadings = [LinearShading.of(samples, tried, metallic) for samples in photos]
             equations = _LeastSquares(texels)
             for samples, weight, shading in zip(photos, weights, shadings, strict=True):
                 equations.add(samples, weight, shading)
             b = equations.solve(lowest)
             residual = sum((s.residual(samples, b) for samples, s in zip(photos, shadings, strict=True)), np.zeros(texels))
-            if not metallic:
-                dielectric = np.minimum(dielectric, residual)
-                continue
-            better = residual < metal
-            metal[better], base[better], roughness[better] = residual[better], b[better], tried[better]
-    return dielectric, metal, base, roughness
+            (metal if metallic else dielectric).offer(residual, b, tried)
+    return dielectric, metal
