@@ -14,7 +14,9 @@ from typing import Any
 
 from gsbake.capture.sources import PHOTO_FOLDERS, discover, list_photos
 from gsbake.config.load import DEFAULT, LoadedProfile, load_profile
+from gsbake.config.schema import Profile
 from gsbake.errors import BadInputError, UsageError
+from gsbake.meshing.decimator_choice import resolve_decimator
 from gsbake.pipeline.digest import list_files
 from gsbake.pipeline.engine import Engine, Observer, artifacts_by_stage
 from gsbake.pipeline.files import disk_error
@@ -168,7 +170,7 @@ def open_session(options: RunOptions, observer: Observer | None = None) -> Sessi
     request = Request(
         out=out,
         sources=sources,
-        profile=profile.profile,
+        profile=_with_resolved_tools(profile.profile),
         seed=project.seed,
         device=resolve_device(options.device),
         threads=options.threads or default_threads(),
@@ -183,6 +185,12 @@ def open_store(out: Path | None) -> tuple[Store, tuple[str, ...]]:
     if not (out / "stages").is_dir():
         raise UsageError(f"'{out}' holds no run; name its folder with --out.")
     return Store(out), tuple(REGISTRY.names)
+
+
+def _with_resolved_tools(profile: Profile) -> Profile:
+    """The profile with the library that decimates here instead of "auto": an artifact's key must not hide what is installed."""
+    mesh = profile.mesh.model_copy(update={"decimator": resolve_decimator(profile.mesh.decimator)})
+    return profile.model_copy(update={"mesh": mesh})
 
 
 def _source_names(sources: dict[str, Path]) -> dict[str, list[str]]:

@@ -26,9 +26,12 @@ from gsbake.text import size
 #: {pip package: module that is imported to check it}.
 MODULES = {
     "numpy": "numpy", "scipy": "scipy", "numba": "numba", "torch": "torch", "pycolmap": "pycolmap", "opencv-contrib-python-headless": "cv2",
-    "OpenImageIO": "OpenImageIO", "scikit-image": "skimage.measure", "trimesh": "trimesh", "pymeshlab": "pymeshlab", "xatlas": "xatlas",
-    "embreex": "embreex", "safetensors": "safetensors", "jinja2": "jinja2",
+    "OpenImageIO": "OpenImageIO", "scikit-image": "skimage.measure", "trimesh": "trimesh", "fast-simplification": "fast_simplification",
+    "pymeshlab": "pymeshlab", "xatlas": "xatlas", "embreex": "embreex", "safetensors": "safetensors", "jinja2": "jinja2",
 }  # fmt: skip
+
+#: {pip package that gsbake does without: what it does then}.
+OPTIONAL = {"pymeshlab": "fast-simplification decimates"}
 
 #: {shared library: Debian package that contains it}.
 DEBIAN = {
@@ -112,6 +115,8 @@ def library_findings() -> list[Finding]:
     for (library, _), (seconds, error) in zip(MODULES.items(), tried, strict=True):
         if seconds is not None:
             findings.append(Finding(library, f"{known.get(library, '?')}, loads in {seconds:.1f} s", True))
+        elif library in OPTIONAL and library not in known:
+            findings.append(Finding(library, f"not installed: {OPTIONAL[library]}", True))
         else:
             found = f"{known[library]}, does not load: {error}" if library in known else "not installed"
             findings.append(Finding(library, found, False, advice_for(library, error, installed=library in known)))

@@ -139,6 +139,7 @@ class Mesh(Section):
     faces: int = Field(30_000, ge=100, le=10_000_000, description="Triangles of the low-poly mesh, where mesh.max_error does not require more.")
     max_error: float = Field(0.5, ge=0, le=100, description="Maximum deviation of the low-poly from the dense mesh in voxels (99.9 % quantile of the distances between both surfaces); above it the mesh gets more triangles. 0 is off.")
     max_faces: int = Field(0, ge=0, le=10_000_000, description="Maximum triangles of the low-poly mesh under mesh.max_error; 0 derives 4 × mesh.faces, at most export.max_triangles.")
+    decimator: Literal["auto", "pymeshlab", "fast-simplification"] = Field("auto", description="Library that decimates. auto: pymeshlab (GPL) where it is installed, else fast-simplification (MIT).")
     smoothing_iterations: int = Field(2, ge=0, le=1000, description="Taubin smoothing iterations on the dense mesh.")
     normal_wavelength: float = Field(8.0, ge=0, le=1000, description="Wavelength in voxels below which detail comes from rendered normals instead of depth; 0 is off.")
     silhouette_iterations: int = Field(3, ge=0, le=100, description="Mesh refinement iterations against the masks; 0 is off.")

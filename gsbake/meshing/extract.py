@@ -18,11 +18,13 @@ from gsbake.geometry.cameras import Camera
 from gsbake.geometry.ply import write_mesh
 from gsbake.meshing import cleanup
 from gsbake.meshing.decimation import decimate_to_error_bound
+from gsbake.meshing.decimator_choice import resolve_decimator
 from gsbake.meshing.depth_cache import DepthViewCache
 from gsbake.meshing.depth_views import DepthView, depth_noise
 from gsbake.meshing.imls import imls_field
 from gsbake.meshing.refinement.normals import NormalAccumulator, integrate_normals
 from gsbake.meshing.refinement.silhouette import refine_silhouettes
+from gsbake.meshing.repair import close_holes, repair
 from gsbake.meshing.resolution import Resolution, choose_resolution, pixel_footprint, surfel_spacing
 from gsbake.meshing.stereo_depth import merge_stereo_depth
 from gsbake.meshing.support_plane import SupportPlane, find_support_plane, remove_background_components
@@ -250,9 +252,9 @@ class _Extraction:
             vertices = _integrate_normals(cache, vertices, faces, settings.normal_wavelength, cell)
         vertices = cleanup.smooth(vertices, faces, settings.smoothing_iterations)
         if not cleanup.topology(vertices, faces).watertight:
-            vertices, faces = cleanup.repair(vertices, faces)
+            vertices, faces = repair(vertices, faces)
             if settings.holes == "close":
-                vertices, faces = cleanup.close_holes(vertices, faces, MAX_HOLE_EDGES)
+                vertices, faces = close_holes(vertices, faces, MAX_HOLE_EDGES)
         return vertices, faces, dropped + background
 
     def _refine_silhouettes(self, vertices: Doubles, faces: Faces) -> Doubles:
@@ -318,13 +320,14 @@ class _Extraction:
     def _decimate(self, vertices: Doubles, faces: Faces, cell: float) -> dict[str, Any]:
         """Decimate and write the low-poly mesh; its results for the manifest."""
         settings, monitor = self.options.mesh, self.monitor
+        decimator = resolve_decimator(settings.decimator)
         result = decimate_to_error_bound(
-            vertices, faces, settings.faces, self.options.max_faces, settings.max_error * cell, monitor.check_stop
+            vertices, faces, settings.faces, self.options.max_faces, settings.max_error * cell, decimator, monitor.check_stop
         )
         write_mesh(self.out / "mesh.ply", result.vertices, result.faces)
         deviation, bound = result.deviation.quantile / cell, f"bound {settings.max_error:g}" if settings.max_error else "no bound"
         choice = f"{len(result.faces)} faces" + (f" instead of {settings.faces}" if result.retries else "")
-        monitor.decide("decimation", choice, f"deviation from the dense mesh {deviation:.2f} voxels ({bound})")
+        monitor.decide("decimation", choice, f"{decimator}; deviation from the dense mesh {deviation:.2f} voxels ({bound})")
         if 0 < settings.max_error < deviation:
             monitor.warn(f"mesh: decimation to {len(result.faces)} faces deviates by {deviation:.2f} voxels; raise mesh.faces.")
         return {
@@ -332,6 +335,7 @@ class _Extraction:
             "faces": len(result.faces),
             "components": result.topology.components,
             "watertight": result.topology.watertight,
+            "decimator": decimator,
             "border_edges": result.topology.border_edges,
             "decimation_deviation_cells": deviation,
             "decimation_error_cells": result.deviation.maximum / cell,

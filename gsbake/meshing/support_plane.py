@@ -12,6 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from gsbake.meshing.cleanup import component_areas, face_components, remove_unused_vertices
+
 Floats = NDArray[np.float64]
 
 #: Maximum distance (unit frame) from the plane and minimum cosine (25 degrees) between normals of inliers.
@@ -113,8 +115,6 @@ def remove_background_components(vertices: Floats, faces: NDArray[np.int32], rad
 
     All are kept when every component above a fifth of the largest one's area does so: the object itself fills the ball.
     """
-    from gsbake.meshing.cleanup import component_areas, face_components, remove_unused_vertices  # loads PyMeshLab
-
     if len(faces) == 0:
         return vertices, faces, 0
     component = face_components(vertices, faces)
