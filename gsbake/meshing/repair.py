@@ -14,6 +14,10 @@ from scipy.sparse.csgraph import connected_components
 
 from gsbake.meshing.cleanup import Faces, Vertices, edge_keys, remove_unused_vertices, topology
 
+#: How far the copies of a split vertex move apart: share of the way to the mean of their fan's other vertices. Programs that merge vertices
+#: at equal positions would undo the split.
+SEPARATION = 0.01
+
 
 def repair(vertices: Vertices, faces: Faces) -> tuple[Vertices, Faces]:
     """Remove duplicate vertices, duplicate and degenerate faces, and non-manifold edges and vertices; the result may have new holes."""
@@ -38,7 +42,10 @@ def close_holes(vertices: Vertices, faces: Faces, max_edges: int) -> tuple[Verti
 
 
 def split_non_manifold_vertices(vertices: Vertices, faces: Faces) -> tuple[Vertices, Faces]:
-    """Give each fan of faces around a vertex a vertex of its own; faces are adjacent across edges of two faces of equal orientation."""
+    """Give each fan of faces around a vertex a vertex of its own, slightly towards its faces.
+
+    Faces are adjacent across edges of two faces of equal orientation.
+    """
     corners, count = faces.ravel(), 3 * len(faces)
     ends = faces[:, [1, 2, 0]].ravel()
     following = np.arange(count).reshape(-1, 3)[:, [1, 2, 0]].ravel()  # index of the corner after each corner
@@ -61,7 +68,12 @@ def split_non_manifold_vertices(vertices: Vertices, faces: Faces) -> tuple[Verti
     further[by_vertex[1:]] = vertex[by_vertex[1:]] == vertex[by_vertex[:-1]]
     index = vertex.copy()
     index[further] = len(vertices) + np.arange(further.sum())
-    return np.concatenate([vertices, vertices[vertex[further]]]), index[fan].reshape(-1, 3).astype(np.int32)
+    out = np.concatenate([vertices, vertices[vertex[further]]])
+    others = vertices[ends] + vertices[faces[:, [2, 0, 1]].ravel()]
+    mean = np.stack([np.bincount(fan, others[:, axis], fans) for axis in range(3)], 1) / (2 * np.bincount(fan, minlength=fans))[:, None]
+    parted = np.isin(vertex, vertex[further])
+    out[index[parted]] += SEPARATION * (mean[parted] - vertices[vertex[parted]])
+    return out, index[fan].reshape(-1, 3).astype(np.int32)
 
 
 def _merge_vertices(vertices: Vertices) -> tuple[Vertices, NDArray[np.int32]]:

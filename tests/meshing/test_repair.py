@@ -37,7 +37,7 @@ def test_holes_are_closed_up_to_a_maximum_size() -> None:
 
 
 def test_a_hole_is_filled_with_least_area() -> None:
-    """A bent rectangle: along the short diagonal of the bend the two halves are flat."""
+    """A square above an apex: the flat square has the least area."""
     vertices = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0.5, 0.5, -3], [0.5, 0.0, 0], [0.5, 1, 0]])
     ring = [0, 5, 1, 2, 6, 3]
     skirt = np.array([[ring[(i + 1) % 6], ring[i], 4] for i in range(6)], np.int32)
@@ -89,7 +89,9 @@ def test_touching_spheres_get_vertices_of_their_own() -> None:
         if len(shared) == 1:
             split = split_non_manifold_vertices(both[0], joined)
             assert is_solid(split) and topology(*split).components == 2 and len(split[0]) == 2 * n + 1
-        assert is_solid(close_holes(*repair(both[0], joined), 20))
+        fixed = close_holes(*repair(both[0], joined), 20)
+        assert is_solid(fixed)
+        assert trimesh.Trimesh(*fixed, process=True).is_watertight  # also for a program that merges vertices at equal positions
 
 
 @pytest.mark.parametrize("faces", [np.zeros((0, 3), np.int32), np.array([[0, 0, 0]], np.int32), np.array([[0, 1, 2]] * 3, np.int32)])
