@@ -15,6 +15,7 @@ from gsbake.api import Session
 from gsbake.cli.options import Options
 from gsbake.config.load import LoadedProfile, bounds, fields, load_profile, shipped
 from gsbake.pipeline.plan import StageState
+from gsbake.pipeline.settings import flatten
 from gsbake.text import duration, figures, size
 
 _WORDS = {"cached": "cached", "replaced": "replaced", "run": "will run", "waits": "will run"}
@@ -88,7 +89,7 @@ def explain(options: Options, stage: str | None) -> None:
         typer.echo(json.dumps(plan_document(session, states), indent=1, ensure_ascii=False))
         return
     console = Console(highlight=False, soft_wrap=True)
-    origins = session.profile.origins
+    origins, given = session.profile.origins, flatten(session.profile.profile)
     for state in states:
         console.print(Text(f"{state.name}: {_WORDS[state.status]}", style=f"bold {_STYLES[state.status]}"))
         for reason in state.reasons:
@@ -107,7 +108,8 @@ def explain(options: Options, stage: str | None) -> None:
             if what.seed is not None:
                 console.print(Text(f"    seed {what.seed}"))
         for name, value in state.settings.items():
-            console.print(Text(f"    {name} = {value}  ({origins[name]})"))
+            resolved = "" if given[name] == value else f"{given[name]}, "  # "auto", resolved for this machine
+            console.print(Text(f"    {name} = {value}  ({resolved}{origins[name]})"))
 
 
 def list_profiles(as_json: bool) -> None:
