@@ -138,7 +138,7 @@ class _Baking:
             try:
                 atlas = make_atlas(vertices, faces, size)
             except ValueError as error:
-                raise BadInputError(f"bake: {error}; raise bake.size or lower mesh.faces.") from error
+                raise BadInputError(f"bake: {error}.") from error
         with self.monitor.part("texels"):
             surface = UnwrappedMesh.of(vertices, faces, atlas, size, self.threads)
         self.monitor.progress(1, 4, "atlas", charts=atlas.charts, fill=atlas.fill)

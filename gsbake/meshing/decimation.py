@@ -51,11 +51,14 @@ class DecimatedMesh:
 
 
 def surface_deviation(first: tuple[Vertices, Faces], second: tuple[Vertices, Faces]) -> Deviation:
-    """Deviation of two meshes, each `vertices` (v, 3) and `faces` (f, 3), from the vertices and face centres of both."""
+    """Deviation of two meshes, each `vertices` (v, 3) and `faces` (f, 3), from the vertices and face centres of both; inf when one is
+    empty."""
     sides = [
         surface_distances(np.concatenate([vertices, vertices[faces].mean(1)]), *other)
         for (vertices, faces), other in ((first, second), (second, first))
     ]
+    if not all(np.isfinite(side).all() and len(side) for side in sides):  # one of the meshes is empty
+        return Deviation(np.inf, np.inf)
     return Deviation(max(float(np.quantile(side, QUANTILE)) for side in sides), max(float(side.max()) for side in sides))
 
 
@@ -86,7 +89,7 @@ def decimate_to_error_bound(
             return DecimatedMesh(*low_poly, mesh_topology, deviation, retries)
         check_stop()
         factor = max(MIN_FACTOR, (deviation.quantile / (SAFETY_FACTOR * max_error)) ** (1 / DEVIATION_EXPONENT))
-        target = min(max_target, int(np.ceil(target * factor)))
+        target = int(np.ceil(min(max_target, target * factor)))
         retries += 1
 
 

@@ -19,13 +19,21 @@ AGGRESSIVENESS = (3.0, 5.0, 7.0)
 #: measured best among 1, 10 and 100; for pymeshlab it is about that of the unit frame.
 DIAGONAL: dict[Decimator, float] = {"pymeshlab": 2.0, "fast-simplification": 10.0}
 
+#: Diagonal of a mesh over its distance from the origin, below which it is a point.
+MIN_EXTENT = 1e-12
+
 
 def decimate(vertices: Vertices, faces: Faces, target: int, decimator: Decimator) -> tuple[Vertices, Faces]:
-    """About `target` faces; boundaries and normals are kept. A mesh with fewer faces is returned as it is."""
+    """About `target` faces; boundaries and normals are kept.
+
+    A mesh with fewer faces is returned as it is; of one that is a point, or nearly flat beside so few faces, nothing may be left.
+    """
     if len(faces) <= target:
         return vertices, faces
-    diagonal = max(float(np.linalg.norm(np.ptp(vertices, axis=0))), np.finfo(np.float64).tiny)
-    scale = 2.0 ** np.round(np.log2(DIAGONAL[decimator] / diagonal))  # a power of two: exact
+    diagonal = float(np.linalg.norm(np.ptp(vertices, axis=0)))
+    if not diagonal > MIN_EXTENT * np.abs(vertices).max():
+        return vertices[:0], faces[:0]
+    scale = 2.0 ** np.round(np.log2(DIAGONAL[decimator]) - np.log2(diagonal))  # a power of two: exact
     reduce = _pymeshlab if decimator == "pymeshlab" else _fast_simplification
     low_vertices, low_faces = reduce(vertices * scale, faces, target)
     return low_vertices / scale, low_faces

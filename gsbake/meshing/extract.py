@@ -324,6 +324,8 @@ class _Extraction:
         result = decimate_to_error_bound(
             vertices, faces, settings.faces, self.options.max_faces, settings.max_error * cell, decimator, monitor.check_stop
         )
+        if len(result.faces) == 0:
+            raise BadInputError(f"mesh: nothing is left of the surface at {settings.faces} faces; raise mesh.faces or mesh.resolution.")
         write_mesh(self.out / "mesh.ply", result.vertices, result.faces)
         deviation, bound = result.deviation.quantile / cell, f"bound {settings.max_error:g}" if settings.max_error else "no bound"
         choice = f"{len(result.faces)} faces" + (f" instead of {settings.faces}" if result.retries else "")
