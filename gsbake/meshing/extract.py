@@ -47,6 +47,8 @@ STEREO_TOLERANCE = 3.0
 PHOTO_CACHE_BYTES = 1 << 29
 #: Minimum opacity of a surfel, as a share of the transfer function's peak.
 MIN_OPACITY = 0.05
+#: Minimum extent of the surfels in the unit frame.
+MIN_EXTENT = 1e-9
 #: Maximum boundary edges of a hole that is filled after meshing; larger ones are openings.
 MAX_HOLE_EDGES = 400
 
@@ -160,14 +162,13 @@ class _Extraction:
         normal = surfels.normal().detach().cpu().numpy().astype(np.float64)
         sdf = surfels.sdf.detach().cpu().numpy().astype(np.float64).reshape(-1, 1)
         points = surfels.position.detach().cpu().numpy().astype(np.float64) - sdf * normal
-        weights = surfels.scale.detach().cpu().numpy().astype(np.float64).prod(1)
         opacity = surfels.opacity().detach().cpu().numpy().astype(np.float64).reshape(-1)
-        keep = (
-            np.isfinite(points).all(1) & (np.linalg.norm(points, axis=1) <= BALL_RADIUS) & (opacity > MIN_OPACITY * surfels.transfer.peak)
-        )
+        weights = surfels.scale.detach().cpu().numpy().astype(np.float64).prod(1) * opacity
+        keep = np.isfinite(points).all(1) & np.isfinite(normal).all(1) & np.isfinite(weights)
+        keep &= (np.linalg.norm(points, axis=1) <= BALL_RADIUS) & (opacity > MIN_OPACITY * surfels.transfer.peak)
         if keep.sum() < 10:
             raise BadInputError("mesh: fewer than ten surfels lie inside the unit sphere; training failed, see its figures in the report.")
-        weights = (weights * opacity)[keep]
+        weights = weights[keep]
         return OrientedPoints(points[keep], normal[keep], weights / max(float(np.median(weights)), 1e-12))
 
     def _choose_resolution(self, points: Doubles) -> tuple[Doubles, Doubles, Resolution]:
@@ -177,6 +178,8 @@ class _Extraction:
         settings = self.options.mesh
         footprint = pixel_footprint(cameras, (lower + upper) / 2)
         longest = float((upper - lower).max())
+        if longest < MIN_EXTENT:
+            raise BadInputError("mesh: all surfels lie in one point; training failed, see its figures in the report.")
         resolution = choose_resolution(longest, surfel_spacing(points), footprint, settings.resolution, settings.max_resolution)
         self.monitor.decide("field resolution", f"{resolution.cells} voxels of {resolution.cell:.4g}", resolution.reason)
         pad = 16 * resolution.cell  # for the truncation distance and the boundary layers of the coarse lattice

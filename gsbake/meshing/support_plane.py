@@ -58,6 +58,8 @@ def find_support_plane(points: Floats, normals: Floats, weights: Floats, centres
     rng = np.random.default_rng(seed)
     subset = rng.choice(len(points), min(RANSAC_SAMPLES, len(points)), replace=False)
     p, n, w = points[subset], normals[subset], weights[subset]
+    if not w.sum() > 0:
+        return None, "there are no surfels"
     best, best_weight = None, 0.0
     for trial in rng.choice(len(p), RANSAC_TRIALS, p=w / w.sum()):
         offset = float(p[trial] @ n[trial])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-
 import numpy as np
 import pytest
 
@@ -119,7 +118,9 @@ def test_silhouette_refinement(name: str, kind: str) -> None:
 def test_contour_points_of_a_camera_in_a_vertex() -> None:
     vertices, faces = sphere()
     camera = look_at(vertices[0], size=SIZE, focal=60)
-    points = find_contour_points(RayCaster(vertices, faces, 1), vertex_normals(vertices, faces), unique_edges(faces), camera, masks("noise")[0])
+    points = find_contour_points(
+        RayCaster(vertices, faces, 1), vertex_normals(vertices, faces), unique_edges(faces), camera, masks("noise")[0]
+    )
     assert np.isfinite(points.offset).all() and np.isfinite(points.pixel).all()
 
 
@@ -159,5 +160,3 @@ def test_normal_accumulation(name: str) -> None:
         accumulator.add(DepthView.from_depth(camera, depth), normal)
     normals, agreement = accumulator.normals()
     assert np.isfinite(normals).all() and np.isfinite(agreement).all()
-
-
