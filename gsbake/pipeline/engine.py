@@ -111,7 +111,7 @@ class Engine:
                 state = self._compute(stage, state, artifacts, stop)
             else:
                 self.store.mark_used(state.artifact)
-                self.events.write("stage cached", stage=stage.name, folder=state.artifact.folder, by_hand=state.artifact.by_hand)
+                self.events.write("stage cached", stage=stage.name, folder=state.artifact.folder, replaced=state.artifact.replaced)
                 self.observer.stage_reused(state)
             assert state.artifact is not None
             artifacts[stage.name] = state.artifact

@@ -38,12 +38,12 @@ _FILE_MANAGER_FILES = frozenset({".DS_Store", "Thumbs.db", "desktop.ini", ".dire
 
 @dataclass(frozen=True)
 class Artifact:
-    """A published artifact folder: {file: digest} and the manifest; `by_hand` when it holds the user's files."""
+    """A published artifact folder: {file: digest} and the manifest; `replaced` when it holds the user's files."""
 
     folder: Path
     files: Mapping[str, str]
     manifest: Mapping[str, Any]
-    by_hand: bool = False
+    replaced: bool = False
 
     @property
     def digest(self) -> str:
@@ -217,7 +217,7 @@ class Store:
     @staticmethod
     def _artifact(folder: Path, manifest: Mapping[str, Any]) -> Artifact:
         files = {name: str(entry["digest"]) for name, entry in manifest.get("files", {}).items()}
-        return Artifact(folder, files, manifest, by_hand=bool(manifest.get("replaced")))
+        return Artifact(folder, files, manifest, replaced=bool(manifest.get("replaced")))
 
 
 def _list_all(folder: Path) -> list[str]:
