@@ -1,0 +1,1 @@
+"""Test objects with known materials: procedural models, and captures of them rendered with Cycles."""
