@@ -12,10 +12,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from gsbake.capture.sources import PHOTO_FOLDERS, discover, list_photos
+from gsbake.capture.sources import PHOTO_FOLDERS, discover, list_masks, list_photos
 from gsbake.config.load import DEFAULT, LoadedProfile, load_profile
 from gsbake.errors import BadInputError, UsageError
-from gsbake.pipeline.digest import list_files
 from gsbake.pipeline.engine import Engine, Observer, artifacts_by_stage
 from gsbake.pipeline.files import disk_error
 from gsbake.pipeline.machine import default_threads, resolve_device
@@ -156,7 +155,7 @@ def open_session(options: RunOptions, observer: Observer | None = None) -> Sessi
             found = discover(Path(stored.photos), options.masks or _path(stored.masks), options.poses or _path(stored.poses))
             project = replace(project, masks=_text(found.masks), poses=_text(found.poses))
     last = {text.partition("=")[0].strip(): text for text in [*project.overrides, *options.overrides]}
-    name = options.profile or project.profile or DEFAULT
+    name = next(name for name in (options.profile, project.profile, DEFAULT) if name is not None)
     profile = load_profile(name, list(last.values()))
     if Path(name).is_file():
         name = str(Path(name).resolve())
@@ -189,7 +188,7 @@ def _source_names(sources: dict[str, Path]) -> dict[str, list[str]]:
     """Names of the input files in the folders of photos and masks."""
     names = {"photos": [path.relative_to(sources["photos"]).as_posix() for path in list_photos(sources["photos"])]}
     if "masks" in sources and sources["masks"].is_dir():
-        names["masks"] = list_files(sources["masks"])
+        names["masks"] = list_masks(sources["masks"])
     return names
 
 
@@ -211,4 +210,7 @@ def _text(path: Path | None) -> str | None:
 
 
 def _path(text: str | Path | None) -> Path | None:
+    """The path of an argument; an empty one is refused, because `Path("")` is the current folder."""
+    if text == "":
+        raise UsageError("A path is empty; '.' is the current folder.")
     return None if text is None else Path(text)
