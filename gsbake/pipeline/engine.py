@@ -22,7 +22,7 @@ from gsbake.pipeline.stage import Stage
 from gsbake.pipeline.store import Artifact, Store
 from gsbake.pipeline.supervise import Outcome, StageFailed, StopSignals, supervise
 from gsbake.pipeline.worker import Job
-from gsbake.text import shortlist, summarise
+from gsbake.text import printable, shortlist, summarise
 
 
 class Observer:
@@ -123,7 +123,7 @@ class Engine:
         moved = self.store.set_aside_unexpected(name)
         if moved:
             names, folder = shortlist([path.name for path in moved]), self.request.out / "unexpected"
-            text = f"{names}: not part of the stage's output; moved to '{folder}'."
+            text = printable(f"{names}: not part of the stage's output; moved to '{folder}'.")
             self.events.write("warning", stage=name, text=text)
             self.observer.warning(name, text)
 

@@ -1,6 +1,7 @@
 """HTML page of the report: plain data filled into a Jinja template, as one file that opens offline.
 
-Images, model, style, script and the 3D viewer (vendored, see `vendor/`) are inlined; nothing is fetched. Jinja escapes all text.
+Images, model, style, script and the 3D viewer (vendored, see `vendor/`) are inlined; nothing is fetched. All text is made printable, and
+Jinja escapes it.
 """
 
 from __future__ import annotations
@@ -14,6 +15,8 @@ import jinja2
 import numpy as np
 from markupsafe import Markup
 from numpy.typing import NDArray
+
+from gsbake.text import printable
 
 
 @dataclass(frozen=True)
@@ -159,6 +162,11 @@ def inline_script(text: str) -> Markup:
     return Markup(text.replace("<!--", "<\\!--").replace("</script", "<\\/script"))
 
 
+def _shown(value: object) -> object:
+    """What the template shows of a value: text is made printable, markup and numbers stay."""
+    return printable(value) if isinstance(value, str) and not isinstance(value, Markup) else value
+
+
 def render_page(page: Page) -> str:
     """HTML of the page."""
     here = resources.files("gsbake.report")
@@ -166,7 +174,9 @@ def render_page(page: Page) -> str:
     def text(name: str) -> str:
         return here.joinpath(name).read_text(encoding="utf-8")
 
-    environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    environment = jinja2.Environment(
+        autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True, finalize=_shown
+    )
     template = environment.from_string(text("page.html.j2"))
     charts = {name: Markup(getattr(page, name)) for name in ("time_chart", "memory_chart")}
     filled = {**vars(page), **charts, "curves": tuple(Markup(curve) for curve in page.curves)}
