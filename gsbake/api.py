@@ -27,6 +27,8 @@ from gsbake.text import number
 
 #: Largest seed that all libraries accept (32-bit signed integer).
 MAX_SEED = 2**31 - 1
+#: Most threads: more than any machine has cores, few enough for every library's pool.
+MAX_THREADS = 512
 
 
 @dataclass(frozen=True)
@@ -122,7 +124,7 @@ def run(
     masks, poses: paths of masks and known poses outside the capture folder.
     target: last stage to run, for example "mesh"; None runs all.
     device: "auto", "cpu" or "cuda".
-    threads: number of threads; 0 uses the physical cores.
+    threads: number of threads, at most 512; 0 uses the physical cores.
     seed: seed of all random numbers, 0 to 2**31 − 1; default 0.
     observer: receives progress, decisions and warnings.
 
@@ -139,7 +141,7 @@ def open_session(options: RunOptions, observer: Observer | None = None) -> Sessi
     """Merge the options with those stored in the output folder; nothing is written.
 
     With `photos` the stored options are discarded; without it they hold and the given ones are added. Raises UsageError when photos are
-    neither given nor stored, and for a seed out of range.
+    neither given nor stored, and for a seed or a number of threads out of range.
     """
     out = options.out or _default_out(options.photos)
     stored = Project.load(out)
@@ -162,6 +164,8 @@ def open_session(options: RunOptions, observer: Observer | None = None) -> Sessi
     seed = project.seed if options.seed is None else options.seed
     if not 0 <= seed <= MAX_SEED:
         raise UsageError(f"The seed must be a whole number from 0 to {number(MAX_SEED)}, not {seed}.")
+    if not 0 <= options.threads <= MAX_THREADS:
+        raise UsageError(f"The number of threads must be from 0 (the physical cores) to {MAX_THREADS}, not {options.threads}.")
     project = replace(project, profile=name, overrides=tuple(last.values()), seed=seed)
     sources = project.sources()
     request = Request(

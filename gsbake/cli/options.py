@@ -94,7 +94,9 @@ PosesOption = Annotated[
 ]
 InvertOption = Annotated[bool, typer.Option("--invert-masks", help="Masks are white on the background.")]
 DeviceOption = Annotated[Device, typer.Option("--device", help="Device of the kernels.")]
-ThreadsOption = Annotated[int, typer.Option("--threads", min=0, help="Number of threads; 0 uses the physical cores.", show_default=False)]
+ThreadsOption = Annotated[
+    int, typer.Option("--threads", help="Number of threads, at most 512; 0 uses the physical cores.", show_default=False)
+]
 SeedOption = Annotated[
     int | None, typer.Option("--seed", help="Seed of all random numbers, 0 to 2147483647.  [default: 0]", show_default=False)
 ]

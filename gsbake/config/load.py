@@ -206,6 +206,8 @@ def _validate(values: Mapping[str, Any], origins: Mapping[str, str]) -> Profile:
         if isinstance(value, str) and field is not None:
             near = difflib.get_close_matches(value, [str(c) for c in get_args(field.annotation)], 1)
             text += f" (did you mean '{near[0]}'?)" if near else ""
+        if first["type"] == "value_error":  # from a validator of the schema, in its own words
+            raise BadInputError(f"{origins.get(key, 'profile')}: {key} = {value!r} is invalid: {first['ctx']['error']}.") from error
         fault = "not a number" if first["type"] in _NOT_A_NUMBER else "invalid"
         shown = repr(value) if len(repr(value)) <= MAX_VALUE_LENGTH else repr(value)[:MAX_VALUE_LENGTH] + "…"
         raise BadInputError(f"{origins.get(key, 'profile')}: {key} = {shown} is {fault}: it {text}.") from error
