@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import re
 import shutil
@@ -14,11 +13,8 @@ from pathlib import Path
 
 import psutil
 import typer
-from rich import box
-from rich.console import Console
-from rich.table import Table
-from rich.text import Text
 
+from gsbake.cli.output import cell, print_json, print_table
 from gsbake.pipeline.machine import cpu_name, cuda_devices, default_threads, resolve_device, torch_cuda_build, versions
 from gsbake.python_process import python_command, python_environment
 from gsbake.text import size
@@ -63,14 +59,10 @@ def doctor(as_json: bool, out: Path) -> None:
     findings = [*machine_findings(out), *library_findings()]
     good = all(f.ok for f in findings)
     if as_json:
-        typer.echo(json.dumps({"ok": good, "findings": [asdict(f) for f in findings]}, indent=1, ensure_ascii=False))
+        print_json({"ok": good, "findings": [asdict(f) for f in findings]})
     else:
-        table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
-        for column in ("", "what", "found", "what to do"):
-            table.add_column(column, overflow="fold")
-        for f in findings:
-            table.add_row(Text("✓" if f.ok else "✗", style="green" if f.ok else "red"), f.what, f.found, f.advice)
-        Console(highlight=False).print(table)
+        rows = [(cell("✓" if f.ok else "✗", "green" if f.ok else "red"), f.what, f.found, f.advice) for f in findings]
+        print_table(("", "what", "found", "what to do"), rows)
     if not good:
         raise typer.Exit(1)
 
