@@ -1,4 +1,4 @@
-"""The procedural test models: textures hold the materials that the paint functions define."""
+"""The procedural test models: textures hold the materials that the procedures define."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from gsbake.imaging.srgb import decode
 def test_textures_hold_the_material_of_each_position() -> None:
     """A short cylinder: copper above, rough green below, a lamp at the top."""
 
-    def paint(p: np.ndarray) -> Material:
+    def procedure(p: np.ndarray) -> Material:
         copper = Material.uniform(len(p), (0.9, 0.6, 0.5), 0.3, 1.0)
         green = Material.uniform(len(p), (0.1, 0.4, 0.2), 0.8)
         lamp = Material(np.full((len(p), 3), 0.02), np.full(len(p), 0.5), np.zeros(len(p)), np.tile([0.0, 0.5, 1.0], (len(p), 1)))
         return copper.blend(green, (p[:, 2] < 0.5).astype(float)).blend(lamp, (p[:, 2] > 0.9).astype(float))
 
-    glb = model_glb(trimesh.creation.cylinder(0.5, segment=[[0, 0, 0], [0, 0, 1]], sections=24).subdivide().subdivide(), paint, 256)
+    glb = model_glb(trimesh.creation.cylinder(0.5, segment=[[0, 0, 0], [0, 0, 1]], sections=24).subdivide().subdivide(), procedure, 256)
     mesh = trimesh.load(io.BytesIO(glb), file_type="glb", force="mesh", process=False)
     height = np.asarray(mesh.vertices)[:, 1]  # +Y up
     assert height.min() == pytest.approx(0, abs=1e-6) and height.max() == pytest.approx(1, abs=1e-6)
@@ -41,10 +41,10 @@ def test_textures_hold_the_material_of_each_position() -> None:
 
 @pytest.mark.parametrize("name", MODELS)
 def test_models_have_valid_materials(name: str) -> None:
-    shape, paint = MODELS[name]
+    shape, procedure = MODELS[name]
     mesh = shape()
     points = np.asarray(mesh.vertices)[:: max(1, len(mesh.vertices) // 2000)]
-    material = paint(points)
+    material = procedure(points)
     assert material.base.shape == (len(points), 3) and material.base.min() >= 0 and material.base.max() <= 1
     assert material.roughness.min() >= 0.05 and material.roughness.max() <= 1
     assert material.metallic.min() >= 0 and material.metallic.max() <= 1
