@@ -12,10 +12,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from gsbake.capture.sources import PHOTO_FOLDERS, discover, list_photos
+from gsbake.capture.sources import PHOTO_FOLDERS, discover, list_masks, list_photos
 from gsbake.config.load import DEFAULT, LoadedProfile, load_profile
+from gsbake.config.schema import Profile
 from gsbake.errors import BadInputError, UsageError
-from gsbake.pipeline.digest import list_files
+from gsbake.meshing.decimator_choice import resolve_decimator
 from gsbake.pipeline.engine import Engine, Observer, artifacts_by_stage
 from gsbake.pipeline.files import disk_error
 from gsbake.pipeline.machine import default_threads, resolve_device
@@ -28,6 +29,8 @@ from gsbake.text import number
 
 #: Largest seed that all libraries accept (32-bit signed integer).
 MAX_SEED = 2**31 - 1
+#: Most threads: more than any machine has cores, few enough for every library's pool.
+MAX_THREADS = 512
 
 
 @dataclass(frozen=True)
@@ -123,7 +126,7 @@ def run(
     masks, poses: paths of masks and known poses outside the capture folder.
     target: last stage to run, for example "mesh"; None runs all.
     device: "auto", "cpu" or "cuda".
-    threads: number of threads; 0 uses the physical cores.
+    threads: number of threads, at most 512; 0 uses the physical cores.
     seed: seed of all random numbers, 0 to 2**31 − 1; default 0.
     observer: receives progress, decisions and warnings.
 
@@ -140,7 +143,7 @@ def open_session(options: RunOptions, observer: Observer | None = None) -> Sessi
     """Merge the options with those stored in the output folder; nothing is written.
 
     With `photos` the stored options are discarded; without it they hold and the given ones are added. Raises UsageError when photos are
-    neither given nor stored, and for a seed out of range.
+    neither given nor stored, and for a seed or a number of threads out of range.
     """
     out = options.out or _default_out(options.photos)
     stored = Project.load(out)
@@ -156,19 +159,21 @@ def open_session(options: RunOptions, observer: Observer | None = None) -> Sessi
             found = discover(Path(stored.photos), options.masks or _path(stored.masks), options.poses or _path(stored.poses))
             project = replace(project, masks=_text(found.masks), poses=_text(found.poses))
     last = {text.partition("=")[0].strip(): text for text in [*project.overrides, *options.overrides]}
-    name = options.profile or project.profile or DEFAULT
+    name = next(name for name in (options.profile, project.profile, DEFAULT) if name is not None)
     profile = load_profile(name, list(last.values()))
     if Path(name).is_file():
         name = str(Path(name).resolve())
     seed = project.seed if options.seed is None else options.seed
     if not 0 <= seed <= MAX_SEED:
         raise UsageError(f"The seed must be a whole number from 0 to {number(MAX_SEED)}, not {seed}.")
+    if not 0 <= options.threads <= MAX_THREADS:
+        raise UsageError(f"The number of threads must be from 0 (the physical cores) to {MAX_THREADS}, not {options.threads}.")
     project = replace(project, profile=name, overrides=tuple(last.values()), seed=seed)
     sources = project.sources()
     request = Request(
         out=out,
         sources=sources,
-        profile=profile.profile,
+        profile=_with_resolved_tools(profile.profile),
         seed=project.seed,
         device=resolve_device(options.device),
         threads=options.threads or default_threads(),
@@ -185,11 +190,17 @@ def open_store(out: Path | None) -> tuple[Store, tuple[str, ...]]:
     return Store(out), tuple(REGISTRY.names)
 
 
+def _with_resolved_tools(profile: Profile) -> Profile:
+    """The profile with the library that decimates here instead of "auto": an artifact's key must not hide what is installed."""
+    mesh = profile.mesh.model_copy(update={"decimator": resolve_decimator(profile.mesh.decimator)})
+    return profile.model_copy(update={"mesh": mesh})
+
+
 def _source_names(sources: dict[str, Path]) -> dict[str, list[str]]:
     """Names of the input files in the folders of photos and masks."""
     names = {"photos": [path.relative_to(sources["photos"]).as_posix() for path in list_photos(sources["photos"])]}
     if "masks" in sources and sources["masks"].is_dir():
-        names["masks"] = list_files(sources["masks"])
+        names["masks"] = list_masks(sources["masks"])
     return names
 
 
@@ -211,4 +222,7 @@ def _text(path: Path | None) -> str | None:
 
 
 def _path(text: str | Path | None) -> Path | None:
+    """The path of an argument; an empty one is refused, because `Path("")` is the current folder."""
+    if text == "":
+        raise UsageError("A path is empty; '.' is the current folder.")
     return None if text is None else Path(text)

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from gsbake.text import printable
+
 
 class GsbakeError(Exception):
-    """Base: the message is one sentence that says what is wrong, where, and what to do."""
+    """Base: the message is one printable sentence that says what is wrong, where, and what to do."""
 
     exit_code = 1
+
+    def __init__(self, message: str = "") -> None:
+        super().__init__(printable(message))
 
 
 class UsageError(GsbakeError):

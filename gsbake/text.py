@@ -1,4 +1,4 @@
-"""Formatting of durations, file sizes, numbers, results and lists of names for messages."""
+"""Formatting of durations, file sizes, numbers, results and lists of names for messages; untrusted text made printable."""
 
 from __future__ import annotations
 
@@ -10,6 +10,17 @@ from typing import Any
 MAX_FIGURES = 4
 #: Maximum number of names in a message; the rest are counted.
 MAX_NAMES = 4
+
+
+def printable(text: str) -> str:
+    """`text` on one line, with escapes (\\x1b, \\n, \\u202e, \\udcff) in place of characters that a terminal would not show as themselves.
+
+    Names of files come from strangers: they may hold terminal control sequences, line breaks, marks that reverse the direction of writing,
+    and bytes that are no text. Every message, event and cell of the report passes here; text that is printable is returned as it is.
+    """
+    if text.isprintable():
+        return text
+    return "".join(c if c.isprintable() else c.encode("unicode_escape", "surrogatepass").decode("ascii") for c in text)
 
 
 def duration(seconds: float) -> str:

@@ -21,7 +21,7 @@ def run(ctx: Context) -> dict[str, Any]:
 
 STAGE = Stage(
     name="mesh",
-    version=6,
+    version=7,
     title="Mesh",
     run=run,
     summary="{faces} triangles, {dense_faces} before decimation",

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from gsbake.text import duration, figures, number, shortlist, size
+from gsbake.errors import BadInputError
+from gsbake.text import duration, figures, number, printable, shortlist, size
 
 
 @pytest.mark.parametrize(
@@ -39,3 +40,19 @@ def test_figures_are_the_first_plain_results() -> None:
 def test_shortlist() -> None:
     assert shortlist(["a", "b"]) == "a, b"
     assert shortlist(list("abcdef")) == "a, b, c, d and 2 more"
+
+
+@pytest.mark.parametrize(
+    ("text", "shown"),
+    [
+        ("naïve – 3 × ²", "naïve – 3 × ²"), ("", ""),
+        ("\x1b[31mred\n", "\\x1b[31mred\\n"), ("\x9b2J", "\\x9b2J"), ("a\u202egpj.b", "a\\u202egpj.b"),
+        ("\udcff", "\\udcff"), ("\u2028\U000e0001\x7f\0", "\\u2028\\U000e0001\\x7f\\x00"), ("a\xa0b", "a\\xa0b"),
+    ],
+)  # fmt: skip
+def test_printable(text: str, shown: str) -> None:
+    assert printable(text) == shown and printable(shown) == shown and shown.isprintable()
+
+
+def test_messages_of_errors_are_printable() -> None:
+    assert str(BadInputError("The photo \x1b]0;x\x07\n cannot be read.")) == "The photo \\x1b]0;x\\x07\\n cannot be read."

@@ -134,7 +134,7 @@ def tea_set() -> trimesh.Trimesh:
     return trimesh.util.concatenate(parts)
 
 
-def paint_barrel(p: Array) -> Material:
+def barrel_material(p: Array) -> Material:
     """Oiled wood with dark iron bands."""
     n, angle = len(p), np.arctan2(p[:, 1], p[:, 0])
     stave = np.floor(angle / (2 * np.pi) * 18)
@@ -147,7 +147,7 @@ def paint_barrel(p: Array) -> Material:
     return wood.blend(iron, band.astype(float))
 
 
-def paint_glaze(p: Array) -> Material:
+def glaze_material(p: Array) -> Material:
     """White glaze with blue rings and a brown rim."""
     white, blue = Material.uniform(len(p), (0.80, 0.79, 0.75), 0.14), Material.uniform(len(p), (0.04, 0.09, 0.38), 0.14)
     ring = step(np.sin(22 * p[:, 2]), 0.86, 0.06) * (p[:, 2] > 0.15)
@@ -155,31 +155,31 @@ def paint_glaze(p: Array) -> Material:
     return white.blend(blue, np.maximum(ring, flowers))
 
 
-def paint_iron(p: Array) -> Material:
+def iron_material(p: Array) -> Material:
     """Dark iron with rust."""
     iron = Material.uniform(len(p), IRON, 0.38, 1.0).shaded(1 + 0.1 * noise(p, 9, 2))
     rust = Material.uniform(len(p), RUST, 0.85).shaded(1 + 0.25 * noise(p, 16, 4))
     return iron.blend(rust, step(noise(p, 4.5, 6) + 0.25 * noise(p, 18, 7), 0.75, 0.25))
 
 
-def paint_helmet(p: Array) -> Material:
+def helmet_material(p: Array) -> Material:
     """Glossy red and cream plastic with polished steel and black rubber."""
     n, height = len(p), p[:, 2]
     red, cream = Material.uniform(n, (0.55, 0.03, 0.025), 0.2), Material.uniform(n, (0.68, 0.60, 0.42), 0.25)
-    paint = red.blend(cream, step(np.cos(4 * np.arctan2(p[:, 1], p[:, 0])), 0.55, 0.05))
+    plastic = red.blend(cream, step(np.cos(4 * np.arctan2(p[:, 1], p[:, 0])), 0.55, 0.05))
     steel, rubber = Material.uniform(n, STEEL, 0.22, 1.0), Material.uniform(n, (0.025, 0.025, 0.027), 0.5)
     metal = (height > 1.12) | ((height > 0.4) & (height < 0.55) & (np.hypot(p[:, 0], p[:, 1]) > 0.6))
-    return paint.blend(steel, metal.astype(float)).blend(rubber, (height < 0.1).astype(float))
+    return plastic.blend(steel, metal.astype(float)).blend(rubber, (height < 0.1).astype(float))
 
 
-def paint_copper(p: Array) -> Material:
+def copper_material(p: Array) -> Material:
     """Copper with patina."""
     copper = Material.uniform(len(p), COPPER, 0.3, 1.0).shaded(1 - 0.08 * np.abs(noise(p, 12, 2)))
     patina = Material.uniform(len(p), PATINA, 0.8).shaded(1 + 0.15 * noise(p, 20, 3))
     return copper.blend(patina, step(noise(p, 4.0, 9) - 0.5 * p[:, 2], 0.15, 0.3))
 
 
-def paint_toy(p: Array) -> Material:
+def toy_material(p: Array) -> Material:
     """Woven cloth with plastic eyes and a lamp."""
     n = len(p)
     weave = 1 + 0.2 * np.sin(90 * p[:, 0]) * np.sin(90 * p[:, 2]) + 0.1 * noise(p, 25, 1)
@@ -194,8 +194,8 @@ def paint_toy(p: Array) -> Material:
     return cloth.blend(glowing, lamp.astype(float))
 
 
-def paint_steel(p: Array) -> Material:
-    """Brushed steel with engraved dark lines and one painted side."""
+def steel_material(p: Array) -> Material:
+    """Brushed steel with engraved dark lines and one green side."""
     n = len(p)
     steel = Material.uniform(n, STEEL, 0.3, 1.0).shaded(1 + 0.05 * noise(p * [1, 1, 8], 10, 4))
     dark = Material.uniform(n, (0.03, 0.03, 0.035), 0.6)
@@ -205,24 +205,24 @@ def paint_steel(p: Array) -> Material:
 
 #: Models by name: shape and material.
 MODELS: dict[str, tuple[Callable[[], trimesh.Trimesh], Callable[[Array], Material]]] = {
-    "barrel": (barrel, paint_barrel),
-    "tea_set": (tea_set, paint_glaze),
-    "rusty_iron": (lambda: figurine(1), paint_iron),
-    "helmet": (helmet, paint_helmet),
-    "copper_bottle": (bottle, paint_copper),
-    "toy": (lambda: figurine(5, 0.2), paint_toy),
-    "steel": (lambda: figurine(9, 0.12), paint_steel),
+    "barrel": (barrel, barrel_material),
+    "tea_set": (tea_set, glaze_material),
+    "rusty_iron": (lambda: figurine(1), iron_material),
+    "helmet": (helmet, helmet_material),
+    "copper_bottle": (bottle, copper_material),
+    "toy": (lambda: figurine(5, 0.2), toy_material),
+    "steel": (lambda: figurine(9, 0.12), steel_material),
 }
 
 
-def model_glb(mesh: trimesh.Trimesh, paint: Callable[[Array], Material], size: int = TEXTURE_SIZE) -> bytes:
-    """The GLB (+Y up) of a mesh (Z up) with textures of `size` texels painted by position."""
+def model_glb(mesh: trimesh.Trimesh, procedure: Callable[[Array], Material], size: int = TEXTURE_SIZE) -> bytes:
+    """The GLB (+Y up) of a mesh (Z up) with textures of `size` texels defined by position."""
     vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.uint32)
     mapping, faces, uv = xatlas.parametrize(vertices.astype(np.float32), faces)
     vertices, normals = vertices[mapping], np.asarray(mesh.vertex_normals)[mapping]
     top_left = np.column_stack([uv[:, 0], 1 - uv[:, 1]])
     texels = rasterise(top_left, faces.astype(np.int32), size)
-    material = paint(texels.interpolate(vertices, faces).astype(np.float64))
+    material = procedure(texels.interpolate(vertices, faces).astype(np.float64))
     covered = texels.covered()
     nearest = ndimage.distance_transform_edt(~covered, return_distances=False, return_indices=True)
 
@@ -255,8 +255,8 @@ def main() -> None:
     arguments = parser.parse_args()
     arguments.out.mkdir(parents=True, exist_ok=True)
     for name in arguments.names or MODELS:
-        shape, paint = MODELS[name]
-        (arguments.out / f"{name}.glb").write_bytes(model_glb(shape(), paint))
+        shape, procedure = MODELS[name]
+        (arguments.out / f"{name}.glb").write_bytes(model_glb(shape(), procedure))
         print(arguments.out / f"{name}.glb")
 
 

@@ -53,6 +53,12 @@ def list_photos(folder: Path) -> list[Path]:
     return sorted(found)
 
 
+def list_masks(folder: Path) -> list[str]:
+    """Images of a mask folder as sorted relative POSIX names, those of sub-folders included; links to folders are not followed."""
+    found = (path.relative_to(folder) for path in folder.rglob("*") if path.suffix.lower() in PHOTO_SUFFIXES and path.is_file())
+    return sorted(name.as_posix() for name in found if not any(part.startswith(".") for part in name.parts))
+
+
 def is_colmap_model(folder: Path) -> bool:
     """Whether a folder is a COLMAP sparse model (binary or text)."""
     return any((folder / name).is_file() for name in _MODEL_FILES)
@@ -89,7 +95,7 @@ def discover(photos: Path, masks: Path | None = None, poses: Path | None = None)
 
     `photos` is a capture folder (photos in `images/` or `photos/`, beside them `masks/` and poses) or the photo folder itself. Masks and
     poses are looked for in the photo folder, then in its parent; `masks` and `poses` override what is found. Raises BadInputError when a
-    given path does not exist or there is no photo.
+    given path does not exist, there is no photo, or a mask folder that was found is a link to elsewhere.
     """
     photos, folders = Path(photos), []
     if photos.is_dir():
@@ -101,6 +107,11 @@ def discover(photos: Path, masks: Path | None = None, poses: Path | None = None)
     list_photos(photos)
     if masks is None:
         masks = next((f / "masks" for f in folders if (f / "masks").is_dir()), None)
+        if masks is not None and folders[-1].resolve() not in masks.resolve().parents:
+            raise BadInputError(
+                f"The mask folder {masks} is a link that leads out of the capture, to {masks.resolve()}; if that is meant, name it with "
+                "--masks."
+            )
     elif not Path(masks).is_dir():
         raise BadInputError(f"The mask folder {masks} does not exist.")
     found = next((p for f in folders if (p := find_poses(f)) is not None), None) if poses is None else _given_poses(Path(poses))

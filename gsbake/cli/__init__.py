@@ -5,6 +5,10 @@ from __future__ import annotations
 import signal
 import sys
 from types import FrameType
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from gsbake.errors import GsbakeError
 
 
 def main() -> None:
@@ -19,33 +23,60 @@ def main() -> None:
     try:
         from gsbake.cli.app import app
 
-        app()
+        code = app(standalone_mode=False)
     except GsbakeError as error:
         _exit_with_error(str(error), error.exit_code)
     except BrokenPipeError:
         sys.stderr.close()  # the reader of stdout closed the pipe: suppress Python's own message
         raise SystemExit(1) from None
     except Exception as error:
+        if (usage := _usage_error(error)) is not None:
+            _exit_with_error(usage, 2)
+        if isinstance(error, OSError) and (refusal := _path_error(error)) is not None:
+            _exit_with_error(str(refusal), refusal.exit_code)
         _exit_with_error(_save_traceback(error), 1)
+    else:
+        raise SystemExit(code if isinstance(code, int) else 0)
 
 
 def _exit_with_error(message: str, code: int) -> None:
     """Print the error, with --json as JSON too, and exit."""
-    from rich.console import Console
+    from gsbake.cli.output import print_json, print_text
 
     if "--json" in sys.argv[1:]:
-        import json
-
-        sys.stdout.write(json.dumps({"error": message, "exit_code": code}, ensure_ascii=False) + "\n")
-    Console(stderr=True, highlight=False, soft_wrap=True).print(f"gsbake: {message}", markup=False)
+        print_json({"error": message, "exit_code": code}, indent=None)
+    print_text(f"gsbake: {message}", error=True)
     raise SystemExit(code)
+
+
+def _usage_error(error: Exception) -> str | None:
+    """The sentence of an error that the argument parser found; None for any other. Without arguments the help is printed instead."""
+    from typer import BadParameter
+
+    if not isinstance(error, BadParameter.__mro__[2]):  # ClickException, whose module differs between versions of typer
+        return None
+    found: Any = error
+    if type(error).__name__ == "NoArgsIsHelpError":
+        found.show()
+        raise SystemExit(2)
+    context = getattr(error, "ctx", None)
+    text = found.format_message().strip().rstrip(".?")
+    return f"{text}; see `{context.command_path} --help`." if context is not None else f"{text}."
+
+
+def _path_error(error: OSError) -> GsbakeError | None:
+    from gsbake.pipeline.files import path_error
+
+    return path_error(error)
 
 
 def _save_traceback(error: Exception) -> str:
     import tempfile
     import traceback
 
-    with tempfile.NamedTemporaryFile("w", prefix="gsbake-error-", suffix=".txt", delete=False) as file:
+    with tempfile.NamedTemporaryFile(
+        "w", encoding="utf-8", errors="backslashreplace", prefix="gsbake-error-", suffix=".txt", delete=False
+    ) as file:
         file.write("".join(traceback.format_exception(error)))
     text = " ".join(f"{type(error).__name__}: {error}".split())
     return f"Internal error ({text[:300]}); the traceback is in '{file.name}'."

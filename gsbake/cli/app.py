@@ -28,6 +28,7 @@ from gsbake.cli.options import (
     VerboseOption,
     complete_profile,
     complete_stage,
+    given_path,
 )
 
 app = typer.Typer(
@@ -148,7 +149,9 @@ def explain_command(
 @app.command("replace")
 def replace_command(
     stage: Annotated[str, typer.Argument(help="Stage whose output is replaced.", autocompletion=complete_stage)],
-    files: Annotated[list[Path] | None, typer.Argument(metavar="FILE...", help="Your files, or one folder.", show_default=False)] = None,
+    files: Annotated[
+        list[Path] | None, typer.Argument(parser=given_path, metavar="FILE...", help="Your files, or one folder.", show_default=False)
+    ] = None,
     out: OutOption = None,
     undo: Annotated[bool, typer.Option("--undo", help="Use the stage's own output again.")] = False,
     dry_run: DryRunOption = False,
@@ -214,7 +217,9 @@ def profiles_command(
 
 @app.command("doctor")
 def doctor_command(
-    out: Annotated[Path, typer.Option("--out", "-o", metavar="DIR", help="Folder whose free disk space is checked.")] = Path("out"),
+    out: Annotated[
+        Path, typer.Option("--out", "-o", parser=given_path, metavar="DIR", help="Folder whose free disk space is checked.")
+    ] = Path("out"),
     as_json: JsonOption = False,
 ) -> None:
     """Check the installation: libraries, backend, memory and disk, with advice where something is missing."""
@@ -225,7 +230,7 @@ def doctor_command(
 
 @app.command("synth")
 def synth_command(
-    folder: Annotated[Path, typer.Argument(help="Output folder of the capture.")],
+    folder: Annotated[Path, typer.Argument(parser=given_path, help="Output folder of the capture.")],
     views: Annotated[int, typer.Option(min=1, max=10_000, help="Number of photos.")] = 24,
     size: Annotated[int, typer.Option(min=1, max=16_384, help="Edge of the square photos in pixels.")] = 128,
     seed: Annotated[int, typer.Option(min=0, max=2**31 - 1, help="Seed of the noise.")] = 0,

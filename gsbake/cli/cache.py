@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import json
 import re
 
-import typer
-
 from gsbake.cli.options import Options
+from gsbake.cli.output import print_json, print_text
 from gsbake.errors import BadInputError, UsageError
 from gsbake.text import size
 
@@ -43,9 +41,9 @@ def verify(options: Options) -> None:
         store.digests.save()
     if options.as_json:
         rows = [{"stage": stage, "folder": str(folder), "faults": faults} for stage, folder, faults in checked]
-        typer.echo(json.dumps({"out": str(store.out), "artifacts": rows, "damaged": len(damaged)}, ensure_ascii=True))
+        print_json({"out": str(store.out), "artifacts": rows, "damaged": len(damaged)}, indent=None)
     elif not options.quiet:
-        typer.echo(f"{len(checked)} stored outputs in '{store.out}' checked, {len(damaged)} damaged.")
+        print_text(f"{len(checked)} stored outputs in '{store.out}' checked, {len(damaged)} damaged.")
     if damaged:
         stage, _, faults = damaged[0]
         raise BadInputError(f"Stage '{stage}': {faults[0]}. The next run computes it again; files of your own must be replaced again.")
@@ -64,7 +62,7 @@ def collect_garbage(options: Options, keep: str | None, older: str | None) -> No
     freed, left = sum(e.size for e in done), sum(e.size for e in entries) - sum(e.size for e in done)
     if options.as_json:
         rows = [{"path": str(e.path), "kind": e.kind, "bytes": e.size} for e in done]
-        typer.echo(json.dumps({"out": str(store.out), "deleted": rows, "freed_bytes": freed, "left_bytes": left}, ensure_ascii=True))
+        print_json({"out": str(store.out), "deleted": rows, "freed_bytes": freed, "left_bytes": left}, indent=None)
     elif not options.quiet:
         verb = "would be deleted" if options.dry_run else "deleted"
-        typer.echo(f"{len(done)} of {len(entries)} entries {verb}: {size(freed)} freed, {size(left)} left in '{store.out}'.")
+        print_text(f"{len(done)} of {len(entries)} entries {verb}: {size(freed)} freed, {size(left)} left in '{store.out}'.")

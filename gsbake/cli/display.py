@@ -8,12 +8,14 @@ from typing import Any
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TaskProgressColumn, TextColumn, TimeRemainingColumn
+from rich.text import Text
 
+from gsbake.cli.output import cell
 from gsbake.pipeline.engine import Observer
 from gsbake.pipeline.lease import LeaseHolder
 from gsbake.pipeline.plan import StageState
 from gsbake.pipeline.stage import Stage
-from gsbake.text import duration, figures, number
+from gsbake.text import duration, figures, number, printable
 
 #: Seconds between progress lines without a terminal.
 PROGRESS_INTERVAL = 30.0
@@ -28,7 +30,7 @@ class QuietDisplay(Observer):
 
     def warning(self, name: str, text: str) -> None:
         """Print a warning."""
-        self.errors.print(f"gsbake: warning ({name}): {text}", markup=False)
+        self.errors.print(cell(f"gsbake: warning ({name}): {text}"))
 
 
 class PlainDisplay(QuietDisplay):
@@ -45,7 +47,7 @@ class PlainDisplay(QuietDisplay):
 
     def line(self, text: str) -> None:
         """Print a line with the time since the start of the run."""
-        self.console.print(f"{_clock(time.monotonic() - self._begin)}  {text}", markup=False)
+        self.console.print(cell(f"{_clock(time.monotonic() - self._begin)}  {text}"))
 
     def run_started(self, stages: list[Stage]) -> None:
         """Start the clock."""
@@ -98,17 +100,17 @@ class TerminalDisplay(PlainDisplay):
     def __init__(self, verbose: bool = False) -> None:
         super().__init__(verbose=verbose)
         columns = (TextColumn("{task.description:>8}"), BarColumn(32), TaskProgressColumn(), TimeRemainingColumn())
-        note = TextColumn("{task.fields[note]}")
+        note = TextColumn("{task.fields[note]}", markup=False)  # the name of a photo, for example
         self._bar = Progress(*columns, note, console=self.console, transient=True, refresh_per_second=5)
         self._task: TaskID | None = None
 
     def line(self, text: str) -> None:
         """Print a line above the bar."""
-        self.console.print(text, markup=False)
+        self.console.print(cell(text))
 
     def stage_reused(self, state: StageState) -> None:
         """Print a stage that needs no work."""
-        self.console.print(f"[green]✓[/] {state.name:<7} [dim]{_REUSED[state.status]}[/]")
+        self.console.print(_done(state.name).append(_REUSED[state.status], "dim"))
 
     def stage_started(self, state: StageState) -> None:
         """Open the stage's bar."""
@@ -120,12 +122,12 @@ class TerminalDisplay(PlainDisplay):
         """Update the bar."""
         if self._task is not None:
             note = " ".join(part for part in (text, _live(live)) if part)
-            self._bar.update(self._task, completed=done, total=total or None, note=note)
+            self._bar.update(self._task, completed=done, total=total or None, note=printable(note))
 
     def stage_finished(self, state: StageState) -> None:
         """Replace the bar by the stage's time and results."""
         self.close()
-        self.console.print(f"[green]✓[/] {state.name:<7} {_summary(state)}")
+        self.console.print(_done(state.name).append(printable(_summary(state))))
 
     def close(self) -> None:
         """Remove the bar."""
@@ -146,6 +148,11 @@ def close_display(display: Observer) -> None:
     """Remove the progress bar, if any."""
     if isinstance(display, TerminalDisplay):
         display.close()
+
+
+def _done(name: str) -> Text:
+    """Start of the line of a finished stage."""
+    return Text("✓", "green").append(f" {name:<7} ", "")
 
 
 def _summary(state: StageState) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import re
 import shutil
@@ -14,11 +13,8 @@ from pathlib import Path
 
 import psutil
 import typer
-from rich import box
-from rich.console import Console
-from rich.table import Table
-from rich.text import Text
 
+from gsbake.cli.output import cell, print_json, print_table
 from gsbake.pipeline.machine import cpu_name, cuda_devices, default_threads, resolve_device, torch_cuda_build, versions
 from gsbake.python_process import python_command, python_environment
 from gsbake.text import size
@@ -26,9 +22,12 @@ from gsbake.text import size
 #: {pip package: module that is imported to check it}.
 MODULES = {
     "numpy": "numpy", "scipy": "scipy", "numba": "numba", "torch": "torch", "pycolmap": "pycolmap", "opencv-contrib-python-headless": "cv2",
-    "OpenImageIO": "OpenImageIO", "scikit-image": "skimage.measure", "trimesh": "trimesh", "pymeshlab": "pymeshlab", "xatlas": "xatlas",
-    "embreex": "embreex", "safetensors": "safetensors", "jinja2": "jinja2",
+    "OpenImageIO": "OpenImageIO", "scikit-image": "skimage.measure", "trimesh": "trimesh", "fast-simplification": "fast_simplification",
+    "pymeshlab": "pymeshlab", "xatlas": "xatlas", "embreex": "embreex", "safetensors": "safetensors", "jinja2": "jinja2",
 }  # fmt: skip
+
+#: {pip package that gsbake does without: what it does then}.
+OPTIONAL = {"pymeshlab": "fast-simplification decimates"}
 
 #: {shared library: Debian package that contains it}.
 DEBIAN = {
@@ -60,14 +59,10 @@ def doctor(as_json: bool, out: Path) -> None:
     findings = [*machine_findings(out), *library_findings()]
     good = all(f.ok for f in findings)
     if as_json:
-        typer.echo(json.dumps({"ok": good, "findings": [asdict(f) for f in findings]}, indent=1, ensure_ascii=False))
+        print_json({"ok": good, "findings": [asdict(f) for f in findings]})
     else:
-        table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
-        for column in ("", "what", "found", "what to do"):
-            table.add_column(column, overflow="fold")
-        for f in findings:
-            table.add_row(Text("✓" if f.ok else "✗", style="green" if f.ok else "red"), f.what, f.found, f.advice)
-        Console(highlight=False).print(table)
+        rows = [(cell("✓" if f.ok else "✗", "green" if f.ok else "red"), f.what, f.found, f.advice) for f in findings]
+        print_table(("", "what", "found", "what to do"), rows)
     if not good:
         raise typer.Exit(1)
 
@@ -112,6 +107,8 @@ def library_findings() -> list[Finding]:
     for (library, _), (seconds, error) in zip(MODULES.items(), tried, strict=True):
         if seconds is not None:
             findings.append(Finding(library, f"{known.get(library, '?')}, loads in {seconds:.1f} s", True))
+        elif library in OPTIONAL and library not in known:
+            findings.append(Finding(library, f"not installed: {OPTIONAL[library]}", True))
         else:
             found = f"{known[library]}, does not load: {error}" if library in known else "not installed"
             findings.append(Finding(library, found, False, advice_for(library, error, installed=library in known)))

@@ -5,42 +5,33 @@ from __future__ import annotations
 import json
 from typing import Any
 
-import typer
-from rich import box
 from rich.console import Console
-from rich.table import Table
-from rich.text import Text
 
 from gsbake.api import Session
 from gsbake.cli.options import Options
+from gsbake.cli.output import cell, print_json, print_table, print_text
 from gsbake.config.load import LoadedProfile, bounds, fields, load_profile, shipped
 from gsbake.pipeline.plan import StageState
+from gsbake.pipeline.settings import flatten
 from gsbake.text import duration, figures, size
 
 _WORDS = {"cached": "cached", "replaced": "replaced", "run": "will run", "waits": "will run"}
 _STYLES = {"cached": "green", "replaced": "cyan", "run": "yellow", "waits": "yellow"}
 
 
-def _table(*columns: str) -> Table:
-    table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
-    for column in columns:
-        table.add_column(column, overflow="fold")
-    return table
-
-
 def print_plan(states: list[StageState]) -> None:
     """Print a table of the stages: state, time, memory, and reason or results."""
-    table = _table("stage", "state", "time", "memory", "reason or results")
+    rows = []
     for state in states:
         manifest = state.artifact.manifest if state.artifact is not None else None
-        table.add_row(
+        rows.append((
             state.name,
-            Text(_WORDS[state.status], style=_STYLES[state.status]),
+            cell(_WORDS[state.status], _STYLES[state.status]),
             duration(manifest["seconds"]) if manifest else "",
             size(manifest["peak_bytes"]) if manifest else "",
-            Text(figures(manifest["results"]) if manifest and state.status == "cached" else "; ".join(state.reasons)),
-        )
-    Console(highlight=False).print(table)
+            figures(manifest["results"]) if manifest and state.status == "cached" else "; ".join(state.reasons),
+        ))  # fmt: skip
+    print_table(("stage", "state", "time", "memory", "reason or results"), rows)
 
 
 def plan_document(session: Session, states: list[StageState]) -> dict[str, Any]:
@@ -71,11 +62,11 @@ def status(options: Options) -> None:
     session = options.session()
     states = session.engine.plan()
     if options.as_json:
-        typer.echo(json.dumps(plan_document(session, states), indent=1, ensure_ascii=False))
+        print_json(plan_document(session, states))
         return
     project = session.project
     if not options.quiet:
-        typer.echo(f"{session.out}: photos {project.photos}, profile {project.profile} {' '.join(project.overrides)}".rstrip())
+        print_text(f"{session.out}: photos {project.photos}, profile {project.profile} {' '.join(project.overrides)}".rstrip())
     print_plan(states)
 
 
@@ -85,41 +76,39 @@ def explain(options: Options, stage: str | None) -> None:
     session.engine.registry.up_to(stage)  # raises UsageError for an unknown stage
     states = [s for s in session.engine.plan(stage) if stage is None or s.name == stage]
     if options.as_json:
-        typer.echo(json.dumps(plan_document(session, states), indent=1, ensure_ascii=False))
+        print_json(plan_document(session, states))
         return
     console = Console(highlight=False, soft_wrap=True)
-    origins = session.profile.origins
+    origins, given = session.profile.origins, flatten(session.profile.profile)
     for state in states:
-        console.print(Text(f"{state.name}: {_WORDS[state.status]}", style=f"bold {_STYLES[state.status]}"))
+        console.print(cell(f"{state.name}: {_WORDS[state.status]}", f"bold {_STYLES[state.status]}"))
         for reason in state.reasons:
-            console.print(Text(f"  because {reason}"))
+            console.print(cell(f"  because {reason}"))
         if state.artifact is not None:
-            console.print(Text(f"  in {state.artifact.folder}"))
+            console.print(cell(f"  in {state.artifact.folder}"))
             for d in state.artifact.manifest.get("decisions", ()):
-                console.print(Text(f"  decided {d['what']}: {d['choice']} ({d['evidence']})"))
+                console.print(cell(f"  decided {d['what']}: {d['choice']} ({d['evidence']})"))
         if state.cache_key is not None:
             what = state.cache_key
-            console.print(Text(f"  key {what.digest[:16]} from stage version {what.version}"))
+            console.print(cell(f"  key {what.digest[:16]} from stage version {what.version}"))
             for name, digest in what.inputs.items():
-                console.print(Text(f"    input {name}: content {digest[:16]}"))
+                console.print(cell(f"    input {name}: content {digest[:16]}"))
             if what.backend is not None:
-                console.print(Text(f"    device {what.backend}"))
+                console.print(cell(f"    device {what.backend}"))
             if what.seed is not None:
-                console.print(Text(f"    seed {what.seed}"))
+                console.print(cell(f"    seed {what.seed}"))
         for name, value in state.settings.items():
-            console.print(Text(f"    {name} = {value}  ({origins[name]})"))
+            resolved = "" if given[name] == value else f"{given[name]}, "  # "auto", resolved for this machine
+            console.print(cell(f"    {name} = {value}  ({resolved}{origins[name]})"))
 
 
 def list_profiles(as_json: bool) -> None:
     """Print the shipped profiles."""
     found = {name: load_profile(name).profile.description for name in shipped()}
     if as_json:
-        typer.echo(json.dumps(found, indent=1, ensure_ascii=False))
+        print_json(found)
         return
-    table = _table("profile", "description")
-    for name, description in found.items():
-        table.add_row(name, description)
-    Console(highlight=False).print(table)
+    print_table(("profile", "description"), list(found.items()))
 
 
 def show_profile(name: str, overrides: list[str], as_json: bool) -> None:
@@ -132,14 +121,14 @@ def show_profile(name: str, overrides: list[str], as_json: bool) -> None:
             key: {"value": value, "origin": loaded.origins[key], "allowed": bounds(known[key]), "help": known[key].description}
             for key, value in values.items()
         }
-        typer.echo(json.dumps(document, indent=1, ensure_ascii=False))
+        print_json(document)
         return
-    table = _table("setting", "value", "source", "help")
+    rows = []
     for key, value in values.items():
         allowed = bounds(known[key])
         text = f"{known[key].description}{f' ({allowed})' if allowed else ''}"
-        table.add_row(key, json.dumps(value, ensure_ascii=False), loaded.origins[key], text)
-    Console(highlight=False).print(table)
+        rows.append((key, json.dumps(value, ensure_ascii=False), loaded.origins[key], text))
+    print_table(("setting", "value", "source", "help"), rows)
 
 
 def setting_values(loaded: LoadedProfile) -> dict[str, Any]:

@@ -43,16 +43,27 @@ def complete_stage(incomplete: str) -> list[str]:
     return [name for name in REGISTRY.names if name.startswith(incomplete)]
 
 
+def given_path(text: str) -> Path:
+    """The path that an argument names. An empty one, such as an unset variable of a shell gives, is refused: for Python it is "."."""
+    if not str(text):
+        raise typer.BadParameter("the path is empty; '.' is the current folder")
+    return Path(text)
+
+
 PhotosArgument = Annotated[
     Path | None,
     typer.Argument(
+        parser=given_path,
         metavar="PHOTOS",
         help="Folder of photos, or a capture folder with images/, masks/ and poses. Needed in the first run only.",
         show_default=False,
     ),
 ]
 OutOption = Annotated[
-    Path | None, typer.Option("--out", "-o", metavar="DIR", help="Output folder.  [default: out/<name of PHOTOS>]", show_default=False)
+    Path | None,
+    typer.Option(
+        "--out", "-o", parser=given_path, metavar="DIR", help="Output folder.  [default: out/<name of PHOTOS>]", show_default=False
+    ),
 ]
 ProfileOption = Annotated[
     str | None,
@@ -68,17 +79,24 @@ SetOption = Annotated[
     ),
 ]
 MasksOption = Annotated[
-    Path | None, typer.Option("--masks", metavar="DIR", help="Masks, one per photo, white on the object.", show_default=False)
+    Path | None,
+    typer.Option("--masks", parser=given_path, metavar="DIR", help="Masks, one per photo, white on the object.", show_default=False),
 ]
 PosesOption = Annotated[
     Path | None,
     typer.Option(
-        "--poses", metavar="PATH", help="Known poses: transforms.json, a COLMAP model folder or poses_bounds.npy.", show_default=False
+        "--poses",
+        parser=given_path,
+        metavar="PATH",
+        help="Known poses: transforms.json, a COLMAP model folder or poses_bounds.npy.",
+        show_default=False,
     ),
 ]
 InvertOption = Annotated[bool, typer.Option("--invert-masks", help="Masks are white on the background.")]
 DeviceOption = Annotated[Device, typer.Option("--device", help="Device of the kernels.")]
-ThreadsOption = Annotated[int, typer.Option("--threads", min=0, help="Number of threads; 0 uses the physical cores.", show_default=False)]
+ThreadsOption = Annotated[
+    int, typer.Option("--threads", help="Number of threads, at most 512; 0 uses the physical cores.", show_default=False)
+]
 SeedOption = Annotated[
     int | None, typer.Option("--seed", help="Seed of all random numbers, 0 to 2147483647.  [default: 0]", show_default=False)
 ]

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
-import typer
-
+from gsbake.api import Session
 from gsbake.cli.options import Options
+from gsbake.cli.output import print_json, print_text
 from gsbake.errors import BadInputError, UsageError
+from gsbake.pipeline.files import disk_error, path_error
 from gsbake.pipeline.replace import folder_files, replace_output, undo_replacement
 from gsbake.pipeline.store import Artifact
 
@@ -17,8 +17,19 @@ REPLACED_FILES = {("mesh", ".ply"): ("mesh.ply", "dense.ply")}
 
 
 def replace(options: Options, stage: str, paths: list[Path], undo: bool) -> None:
-    """Register the replacement, or undo it."""
+    """Register the replacement, or undo it. Raises BadInputError for an output folder that cannot be written."""
     session = options.session()
+    try:
+        _replace(options, session, stage, paths, undo)
+    except OSError as error:
+        raise disk_error(error, session.out) or path_error(error) or _unreadable(error, session.out) from error
+
+
+def _unreadable(error: OSError, out: Path) -> BadInputError:
+    return BadInputError(f"The replacement in '{out}' failed: '{error.filename or out}' cannot be read or written ({error.strerror}).")
+
+
+def _replace(options: Options, session: Session, stage: str, paths: list[Path], undo: bool) -> None:
     store = session.engine.store
     session.engine.registry.load(stage)
     if undo == bool(paths):
@@ -28,7 +39,7 @@ def replace(options: Options, stage: str, paths: list[Path], undo: bool) -> None
             undo_replacement(store, stage)
         _print_result(options, {"stage": stage, "undone": True}, f"{stage}: its own output is used again")
         return
-    base = _current_output(options, stage)
+    base = _current_output(session, stage)
     files = _replacement_files(stage, paths, base)
     if options.dry_run:
         _print_result(options, {"stage": stage, "would_replace": sorted(files)}, f"{stage}: would replace {', '.join(sorted(files))}")
@@ -41,9 +52,8 @@ def replace(options: Options, stage: str, paths: list[Path], undo: bool) -> None
     )
 
 
-def _current_output(options: Options, stage: str) -> Artifact | None:
+def _current_output(session: Session, stage: str) -> Artifact | None:
     """The stage's present output: the replacement, else the cached artifact, else the newest one; None without any."""
-    session = options.session()
     replacement = session.engine.store.replacement(stage)
     if replacement is not None:
         return replacement.artifact
@@ -90,6 +100,6 @@ def _check_ply(path: Path) -> None:
 
 def _print_result(options: Options, document: dict[str, object], text: str) -> None:
     if options.as_json:
-        typer.echo(json.dumps(document, ensure_ascii=False))
+        print_json(document, indent=None)
     elif not options.quiet:
-        typer.echo(text)
+        print_text(text)

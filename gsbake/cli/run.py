@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import json
 import time
 from typing import Any
-
-import typer
 
 from gsbake.api import Result
 from gsbake.cli.display import choose_display, close_display
 from gsbake.cli.inspect import plan_document, print_plan
 from gsbake.cli.options import Options
+from gsbake.cli.output import print_json, print_text
 from gsbake.pipeline.plan import StageState
 from gsbake.text import duration, number, size
 
@@ -24,7 +22,7 @@ def run_pipeline(options: Options, target: str | None) -> None:
     if options.dry_run:
         states = session.engine.plan(target)
         if options.as_json:
-            typer.echo(json.dumps(plan_document(session, states), indent=1, ensure_ascii=False))
+            print_json(plan_document(session, states))
         elif not options.quiet:
             print_plan(states)
         return
@@ -34,10 +32,10 @@ def run_pipeline(options: Options, target: str | None) -> None:
         close_display(display)
     seconds = time.perf_counter() - start
     if options.as_json:
-        typer.echo(json.dumps(_document(result, seconds), indent=1, ensure_ascii=False))
+        print_json(_document(result, seconds))
     elif not options.quiet:
         for name, text in summary_lines(result, seconds):
-            typer.echo(f"{name:<9} {text}")
+            print_text(f"{name:<9} {text}")
 
 
 def summary_lines(result: Result, seconds: float) -> list[tuple[str, str]]:

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import json
 import time
 from pathlib import Path
 
-import typer
-
+from gsbake.cli.output import print_json, print_text
 from gsbake.errors import BadInputError
 from gsbake.pipeline.files import disk_error
 from gsbake.text import duration
@@ -26,7 +24,7 @@ def synth(
         except OSError as error:
             raise disk_error(error, folder) or BadInputError(f"The capture cannot be written to '{folder}': {error.strerror}.") from error
     if as_json:
-        typer.echo(json.dumps({"folder": str(folder), "views": views, "size": size, "seed": seed, "written": not dry_run}))
+        print_json({"folder": str(folder), "views": views, "size": size, "seed": seed, "written": not dry_run}, indent=None)
     elif not quiet:
         done = "would be written" if dry_run else f"written in {duration(time.perf_counter() - start)}"
-        typer.echo(f"{folder}: {views} photos of {size} × {size} pixels {done}")
+        print_text(f"{folder}: {views} photos of {size} × {size} pixels {done}")

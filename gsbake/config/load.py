@@ -13,6 +13,7 @@ from __future__ import annotations
 import difflib
 import tomllib
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
@@ -29,6 +30,8 @@ from gsbake.text import number
 DEFAULT = "relight"
 #: Characters of an invalid value that a message shows.
 MAX_VALUE_LENGTH = 60
+#: Pydantic's types of errors for values that are no number at all.
+_NOT_A_NUMBER = frozenset({"int_parsing", "int_type", "float_parsing", "float_type"})
 
 
 @dataclass(frozen=True)
@@ -103,9 +106,10 @@ def _find(name: str, relative_to: Path | None) -> Path:
     if name in known:
         return known[name]
     path = Path(name) if relative_to is None else relative_to.parent / name
-    for candidate in (path, path.with_name(f"{path.name}.toml")):
-        if candidate.is_file():
-            return candidate
+    for candidate in (path, path.with_name(f"{path.name}.toml")) if Path(name).name else ():
+        with suppress(OSError):  # a name that is too long
+            if candidate.is_file():
+                return candidate
     near = difflib.get_close_matches(name, known, 1)
     hint = f"did you mean '{near[0]}'?" if near else f"there are {', '.join(known)}, or give a TOML file."
     if relative_to is None:
@@ -171,6 +175,8 @@ def _parse_override(text: str) -> tuple[str, Any]:
     key, raw = key.strip(), raw.strip()
     if not equals or not key:
         raise UsageError(f"--set takes section.key=value, not '{text}'.")
+    if any("\ud800" <= c <= "\udfff" for c in text):  # bytes of the command line that are no text
+        raise UsageError(f"--set takes text, but '{text}' is not valid UTF-8.")
     field = fields().get(key)
     if field is not None and field.annotation is str:
         return key, raw
@@ -200,5 +206,8 @@ def _validate(values: Mapping[str, Any], origins: Mapping[str, str]) -> Profile:
         if isinstance(value, str) and field is not None:
             near = difflib.get_close_matches(value, [str(c) for c in get_args(field.annotation)], 1)
             text += f" (did you mean '{near[0]}'?)" if near else ""
+        if first["type"] == "value_error":  # from a validator of the schema, in its own words
+            raise BadInputError(f"{origins.get(key, 'profile')}: {key} = {value!r} is invalid: {first['ctx']['error']}.") from error
+        fault = "not a number" if first["type"] in _NOT_A_NUMBER else "invalid"
         shown = repr(value) if len(repr(value)) <= MAX_VALUE_LENGTH else repr(value)[:MAX_VALUE_LENGTH] + "…"
-        raise BadInputError(f"{origins.get(key, 'profile')}: {key} = {shown} is invalid: it {text}.") from error
+        raise BadInputError(f"{origins.get(key, 'profile')}: {key} = {shown} is {fault}: it {text}.") from error

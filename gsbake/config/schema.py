@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
 from gsbake.monitor import Rule
 
@@ -19,6 +19,16 @@ Weight = Annotated[float, Field(ge=0, le=10_000)]
 LearningRate = Annotated[float, Field(gt=0, le=1)]
 #: Longer side of a photo in pixels.
 PhotoSize = Annotated[int, Field(ge=16, le=16_384)]
+
+
+def _not_every_photo(every: int) -> int:
+    if every == 1:
+        raise ValueError("it would hold out every photo; set 0 to hold out none, or 2 and more")
+    return every
+
+
+#: Every n-th photo is held out.
+HeldOut = Annotated[int, Field(ge=0, le=1000), AfterValidator(_not_every_photo)]
 Pruning = Literal["visibility", "sdf", "gsdf", "gaussianroom", "gs-ror2"]
 
 
@@ -94,7 +104,7 @@ class Train(Section):
         "gradient", description="Densification. gradient: surfels with the largest screen-space gradient; sdf: of these, those close to the surface; gsdf, gaussianroom: the rules of those papers. auto: none after stereo initialisation, else gradient."
     )
     prune: Pruning = Field("visibility", description="Pruning during training; the policies of refine.prune.")
-    holdout: int = Field(8, ge=0, le=1000, description="Every n-th photo is held out of training; 0 holds none out.")
+    holdout: HeldOut = Field(8, description="Every n-th photo is held out of training; 0 holds none out, 1 is an error.")
     lr_position: LearningRate = Field(8e-4, description="Learning rate of positions (unit frame); decays to 1/100.")
     lr_scale: LearningRate = Field(0.02, description="Learning rate of log-scales; decays to 1/10.")
     lr_rotation: LearningRate = Field(2e-3, description="Learning rate of quaternions; decays to 1/10.")
@@ -139,6 +149,7 @@ class Mesh(Section):
     faces: int = Field(30_000, ge=100, le=10_000_000, description="Triangles of the low-poly mesh, where mesh.max_error does not require more.")
     max_error: float = Field(0.5, ge=0, le=100, description="Maximum deviation of the low-poly from the dense mesh in voxels (99.9 % quantile of the distances between both surfaces); above it the mesh gets more triangles. 0 is off.")
     max_faces: int = Field(0, ge=0, le=10_000_000, description="Maximum triangles of the low-poly mesh under mesh.max_error; 0 derives 4 × mesh.faces, at most export.max_triangles.")
+    decimator: Literal["auto", "pymeshlab", "fast-simplification"] = Field("auto", description="Library that decimates. auto: pymeshlab (GPL) where it is installed, else fast-simplification (MIT).")
     smoothing_iterations: int = Field(2, ge=0, le=1000, description="Taubin smoothing iterations on the dense mesh.")
     normal_wavelength: float = Field(8.0, ge=0, le=1000, description="Wavelength in voxels below which detail comes from rendered normals instead of depth; 0 is off.")
     silhouette_iterations: int = Field(3, ge=0, le=100, description="Mesh refinement iterations against the masks; 0 is off.")

@@ -65,9 +65,11 @@ def export_asset(
     arrays = _load_mesh_arrays(baked / "mesh.safetensors")
     frame = asset_frame(cameras, arrays["position"])
     mesh = _to_asset_frame(arrays, frame)
+    if not np.isfinite(mesh.position).all():
+        raise BadInputError("export: the object is too large for the asset's single precision; check the scale of the poses.")
     with monitor.part("images"):
-        normal, emissive = (read_exr(path) if path.exists() else None for path in (baked / "normal.exr", baked / "emissive.exr"))
-        maps = quantise(read_exr(baked / "base_color.exr"), read_exr(baked / "orm.exr"), normal, emissive)
+        normal, emissive = (_read_texture(path) if path.exists() else None for path in (baked / "normal.exr", baked / "emissive.exr"))
+        maps = quantise(_read_texture(baked / "base_color.exr"), _read_texture(baked / "orm.exr"), normal, emissive)
         geometry = sum(a.nbytes for a in (mesh.position, mesh.normal, mesh.tangent, mesh.uv, mesh.faces)) + 4096
         images, level = encode_within_budget(maps, int(settings.max_megabytes * 1e6) - geometry)
     monitor.check_stop()
@@ -120,7 +122,33 @@ def _load_mesh_arrays(path: Path) -> dict[str, NDArray[Any]]:
     missing = {"position", "normal", "tangent", "uv", "faces"} - arrays.keys()
     if missing:
         raise BadInputError(f"{path} lacks {', '.join(sorted(missing))}; bake again.")
+    fault = _fault(arrays)
+    if fault:
+        raise BadInputError(f"{path} holds {fault}; bake again.")
     return arrays
+
+
+def _fault(arrays: dict[str, NDArray[Any]]) -> str:
+    """What is wrong with the arrays of a mesh, or nothing."""
+    faces, count = arrays["faces"], len(arrays["position"])
+    for name, width in (("position", 3), ("normal", 3), ("tangent", 4), ("uv", 2)):
+        if arrays[name].shape != (count, width):
+            return f"{name} of shape {arrays[name].shape}"
+        if not np.isfinite(arrays[name]).all():
+            return f"{name} that is not finite"
+    if faces.ndim != 2 or faces.shape[1] != 3 or len(faces) == 0:
+        return "no faces"
+    if faces.min() < 0 or faces.max() >= count:
+        return "faces of vertices that do not exist"
+    return "uv outside the texture" if np.abs(arrays["uv"] - 0.5).max() > 0.5 + 1e-4 else ""
+
+
+def _read_texture(path: Path) -> NDArray[np.float32]:
+    """The pixels of a baked texture, all of them finite."""
+    image = read_exr(path)
+    if not np.isfinite(image).all():
+        raise BadInputError(f"{path} holds values that are not finite; bake again.")
+    return image
 
 
 def _to_asset_frame(arrays: dict[str, NDArray[Any]], frame: Similarity) -> GltfMesh:

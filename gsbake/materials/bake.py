@@ -23,12 +23,12 @@ from gsbake.monitor import SILENT, Monitor, Rule, decide_skip
 from gsbake.surfels.raster.threads import configure
 from gsbake.texturing.atlas import make_atlas
 from gsbake.texturing.inpainting import fill_empty_texels, inpaint_surface
-from gsbake.texturing.needed import normals_agree
 from gsbake.texturing.normal_map import DenseSamples, normal_map, sample_dense_mesh, vertex_normals
 from gsbake.texturing.occlusion_map import bake_occlusion
 from gsbake.texturing.photo_projection import project_photos, project_surfel_materials
 from gsbake.texturing.projection import ProjectedTexture
 from gsbake.texturing.resampling import CoarseTexture
+from gsbake.texturing.skip_rules import normals_agree
 from gsbake.texturing.unwrapped_mesh import UnwrappedMesh
 
 Floats = NDArray[np.float32]
@@ -138,7 +138,7 @@ class _Baking:
             try:
                 atlas = make_atlas(vertices, faces, size)
             except ValueError as error:
-                raise BadInputError(f"bake: {error}; raise bake.size or lower mesh.faces.") from error
+                raise BadInputError(f"bake: {error}.") from error
         with self.monitor.part("texels"):
             surface = UnwrappedMesh.of(vertices, faces, atlas, size, self.threads)
         self.monitor.progress(1, 4, "atlas", charts=atlas.charts, fill=atlas.fill)
@@ -262,7 +262,7 @@ class _Baking:
             "vertices": len(surface.position),
             "faces": len(surface.atlas.faces),
             "texel_edge": surface.texel_size,
-            "unseen_share": unobserved,
+            "unobserved_share": unobserved,
             "median_views": float(np.median(projected.views)),
             "detail_share": float(detail.found.mean()),
             "detail_bound": detail.bound,

@@ -248,7 +248,7 @@ class _Fitting:
             "fit_pixels": sum(map(len, photos)),
             "fit_texels": len(coarse.texels),
             "fit_metal_texels": _metal_count(fitted),
-            "fit_glowing_regions": fitted.emissive_regions,
+            "fit_emissive_regions": fitted.emissive_regions,
         }
         textures = replace(self.projected, values=values, views=np.where(observed, self.projected.views, 0))
         return FittedTextures(textures, replace(self.detail, normal=normal), fitted.light, figures)

@@ -84,7 +84,7 @@ def adjust_radiance(radiance: NDArray[Any], intensity: NDArray[Any], contrast: f
     def mean(light: NDArray[Any]) -> NDArray[Any]:
         return np.asarray((light * area[..., None]).sum((0, 1, 2)) / area.sum())
 
-    average = mean(radiance)
+    average = np.maximum(mean(radiance), 1e-12)
     shape = (np.maximum(radiance, 1e-6) / average) ** contrast
     return np.asarray(intensity * average * shape / mean(shape), np.float32)
 

@@ -1,7 +1,5 @@
-"""Mesh clean-up and decimation; the only module that imports PyMeshLab.
+"""Mesh clean-up: connected components, smoothing and topology, with NumPy and SciPy.
 
-Connected components, smoothing and topology use NumPy and SciPy. Quadric edge collapse (Garland & Heckbert, *Surface simplification using
-quadric error metrics*, SIGGRAPH 1997), hole filling and manifold repair use MeshLab.
 All functions take and return `vertices` (v, 3) float64 and `faces` (f, 3) int32 with outward winding.
 """
 
@@ -11,7 +9,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import pymeshlab
 from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.csgraph import connected_components
@@ -40,7 +37,7 @@ def topology(vertices: Vertices, faces: Faces) -> Topology:
     """Topology of a mesh; vertices at equal positions are not merged."""
     if len(faces) == 0:
         return Topology(0, False, 0, 0)
-    _, counts = np.unique(_edge_keys(vertices, faces), return_counts=True)
+    _, counts = np.unique(edge_keys(vertices, faces), return_counts=True)
     border, non_manifold = int((counts == 1).sum()), int((counts > 2).sum())
     components = len(np.unique(face_components(vertices, faces)))
     return Topology(components, border == 0 and non_manifold == 0, border, non_manifold)
@@ -70,7 +67,7 @@ def remove_small_components(vertices: Vertices, faces: Faces, min_share: float) 
     corners = vertices[faces]
     area = component_areas(vertices, faces, component)
     volume = np.bincount(component, np.einsum("fd,fd->f", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])))
-    _, inverse, counts = np.unique(_edge_keys(vertices, faces), return_inverse=True, return_counts=True)
+    _, inverse, counts = np.unique(edge_keys(vertices, faces), return_inverse=True, return_counts=True)
     open_components = np.zeros(len(area), np.bool_)
     open_components[np.repeat(component, 3)[counts[inverse.ravel()] == 1]] = True
     keep = (area >= min_share * area.max()) & (open_components | (volume > 0) | (area == area.max()))
@@ -105,57 +102,7 @@ def smooth(vertices: Vertices, faces: Faces, steps: int, shrink: float = 0.5, in
     return out
 
 
-def repair(vertices: Vertices, faces: Faces) -> tuple[Vertices, Faces]:
-    """Remove duplicate vertices and faces, degenerate faces, and non-manifold edges and vertices."""
-    meshes = _to_meshlab(vertices, faces)
-    meshes.meshing_remove_duplicate_vertices()
-    meshes.meshing_remove_duplicate_faces()
-    meshes.meshing_remove_null_faces()
-    meshes.meshing_repair_non_manifold_edges(method="Remove Faces")
-    meshes.meshing_repair_non_manifold_vertices(vertdispratio=0)
-    return _from_meshlab(meshes)
-
-
-def close_holes(vertices: Vertices, faces: Faces, max_edges: int) -> tuple[Vertices, Faces]:
-    """Triangulate every hole of at most `max_edges` boundary edges."""
-    if topology(vertices, faces).border_edges == 0:
-        return vertices, faces
-    meshes = _to_meshlab(vertices, faces)
-    meshes.meshing_close_holes(maxholesize=max_edges, selfintersection=False)
-    return _from_meshlab(meshes)
-
-
-def decimate(vertices: Vertices, faces: Faces, target: int) -> tuple[Vertices, Faces]:
-    """Quadric edge collapse to about `target` faces that preserves boundaries, normals and topology."""
-    if len(faces) <= target:
-        return vertices, faces
-    meshes = _to_meshlab(vertices, faces)
-    meshes.meshing_decimation_quadric_edge_collapse(
-        targetfacenum=int(target),
-        qualitythr=0.3,
-        preserveboundary=True,
-        boundaryweight=2.0,
-        preservenormal=True,
-        preservetopology=True,
-        optimalplacement=True,
-        planarquadric=True,  # avoids slivers on flat surfaces
-        autoclean=True,
-    )
-    return _from_meshlab(meshes)
-
-
-def surface_distances(points: Vertices, vertices: Vertices, faces: Faces) -> NDArray[np.float64]:
-    """Distance (n,) from each of `points` (n, 3) to the surface of a mesh with faces."""
-    meshes = pymeshlab.MeshSet(verbose=False)
-    meshes.add_mesh(pymeshlab.Mesh(np.ascontiguousarray(points, np.float64)))
-    meshes.add_mesh(pymeshlab.Mesh(np.ascontiguousarray(vertices, np.float64), np.ascontiguousarray(faces, np.int32)))
-    meshes.compute_scalar_by_distance_from_another_mesh_per_vertex(
-        measuremesh=0, refmesh=1, signeddist=False, maxdist=pymeshlab.PercentageValue(100)
-    )
-    return np.abs(np.asarray(meshes.mesh(0).vertex_scalar_array(), np.float64))
-
-
-def _edge_keys(vertices: Vertices, faces: Faces) -> NDArray[np.int64]:
+def edge_keys(vertices: Vertices, faces: Faces) -> NDArray[np.int64]:
     """One integer (3 f,) per face and edge, equal for edges with equal vertices."""
     edges = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1).astype(np.int64)
     return np.asarray(edges[:, 0] * len(vertices) + edges[:, 1])
@@ -166,14 +113,3 @@ def _vertex_components(count: int, faces: Faces) -> NDArray[Any]:
     start, end = faces[:, [0, 1]].ravel(), faces[:, [1, 2]].ravel()
     adjacency = sparse.coo_matrix((np.ones(len(start), np.int8), (start, end)), shape=(count, count))
     return np.asarray(connected_components(adjacency, directed=False)[1])
-
-
-def _to_meshlab(vertices: Vertices, faces: Faces) -> Any:
-    meshes = pymeshlab.MeshSet(verbose=False)
-    meshes.add_mesh(pymeshlab.Mesh(np.ascontiguousarray(vertices, np.float64), np.ascontiguousarray(faces, np.int32)))
-    return meshes
-
-
-def _from_meshlab(meshes: Any) -> tuple[Vertices, Faces]:
-    mesh = meshes.current_mesh()
-    return remove_unused_vertices(np.asarray(mesh.vertex_matrix(), np.float64), np.asarray(mesh.face_matrix(), np.int32).reshape(-1, 3))

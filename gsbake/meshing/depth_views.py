@@ -77,7 +77,7 @@ class DepthView:
         median = np.asarray(buffers["median_depth"], np.float32).reshape(alpha.shape)
         depth = np.where(np.abs(expected - median) < tolerance / 4, expected, median)
         cosine = _cosine(camera, np.asarray(buffers["normal"], np.float32))
-        valid_depth = (alpha > MIN_ALPHA) & np.isfinite(depth) & (depth > 0) & (cosine > MIN_COSINE)
+        valid_depth = (alpha > MIN_ALPHA) & np.isfinite(alpha) & np.isfinite(depth) & (depth > 0) & (cosine > MIN_COSINE)
         depth = np.where(valid_depth, depth, 0).astype(np.float32)
         consistent = _has_consistent_neighbours(depth, np.maximum(cosine, MIN_COSINE), np.float32(tolerance), np.float32(1 / camera.fx))
         depth = np.where(consistent, depth, 0)
@@ -126,8 +126,9 @@ def _cosine(camera: Camera, normal: Floats) -> Floats:
     """|cos| between the normals (h, w, 3) and the pixels' rays; 0 where the normal is missing."""
     rays = camera.rays()
     length = np.linalg.norm(normal, axis=-1)
-    value = np.abs((normal * rays).sum(-1)) / np.maximum(length * np.linalg.norm(rays, axis=-1), 1e-12)
-    return np.where(length > 0.5, value, 0).astype(np.float32)
+    with np.errstate(invalid="ignore"):
+        value = np.abs((normal * rays).sum(-1)) / np.maximum(length * np.linalg.norm(rays, axis=-1), 1e-12)
+        return np.where((length > 0.5) & np.isfinite(value), value, 0).astype(np.float32)
 
 
 @nb.njit(cache=True)

@@ -18,11 +18,13 @@ from gsbake.geometry.cameras import Camera
 from gsbake.geometry.ply import write_mesh
 from gsbake.meshing import cleanup
 from gsbake.meshing.decimation import decimate_to_error_bound
+from gsbake.meshing.decimator_choice import resolve_decimator
 from gsbake.meshing.depth_cache import DepthViewCache
 from gsbake.meshing.depth_views import DepthView, depth_noise
 from gsbake.meshing.imls import imls_field
 from gsbake.meshing.refinement.normals import NormalAccumulator, integrate_normals
 from gsbake.meshing.refinement.silhouette import refine_silhouettes
+from gsbake.meshing.repair import close_holes, repair
 from gsbake.meshing.resolution import Resolution, choose_resolution, pixel_footprint, surfel_spacing
 from gsbake.meshing.stereo_depth import merge_stereo_depth
 from gsbake.meshing.support_plane import SupportPlane, find_support_plane, remove_background_components
@@ -45,6 +47,8 @@ STEREO_TOLERANCE = 3.0
 PHOTO_CACHE_BYTES = 1 << 29
 #: Minimum opacity of a surfel, as a share of the transfer function's peak.
 MIN_OPACITY = 0.05
+#: Minimum extent of the surfels in the unit frame.
+MIN_EXTENT = 1e-9
 #: Maximum boundary edges of a hole that is filled after meshing; larger ones are openings.
 MAX_HOLE_EDGES = 400
 
@@ -158,14 +162,13 @@ class _Extraction:
         normal = surfels.normal().detach().cpu().numpy().astype(np.float64)
         sdf = surfels.sdf.detach().cpu().numpy().astype(np.float64).reshape(-1, 1)
         points = surfels.position.detach().cpu().numpy().astype(np.float64) - sdf * normal
-        weights = surfels.scale.detach().cpu().numpy().astype(np.float64).prod(1)
         opacity = surfels.opacity().detach().cpu().numpy().astype(np.float64).reshape(-1)
-        keep = (
-            np.isfinite(points).all(1) & (np.linalg.norm(points, axis=1) <= BALL_RADIUS) & (opacity > MIN_OPACITY * surfels.transfer.peak)
-        )
+        weights = surfels.scale.detach().cpu().numpy().astype(np.float64).prod(1) * opacity
+        keep = np.isfinite(points).all(1) & np.isfinite(normal).all(1) & np.isfinite(weights)
+        keep &= (np.linalg.norm(points, axis=1) <= BALL_RADIUS) & (opacity > MIN_OPACITY * surfels.transfer.peak)
         if keep.sum() < 10:
             raise BadInputError("mesh: fewer than ten surfels lie inside the unit sphere; training failed, see its figures in the report.")
-        weights = (weights * opacity)[keep]
+        weights = weights[keep]
         return OrientedPoints(points[keep], normal[keep], weights / max(float(np.median(weights)), 1e-12))
 
     def _choose_resolution(self, points: Doubles) -> tuple[Doubles, Doubles, Resolution]:
@@ -175,6 +178,8 @@ class _Extraction:
         settings = self.options.mesh
         footprint = pixel_footprint(cameras, (lower + upper) / 2)
         longest = float((upper - lower).max())
+        if longest < MIN_EXTENT:
+            raise BadInputError("mesh: all surfels lie in one point; training failed, see its figures in the report.")
         resolution = choose_resolution(longest, surfel_spacing(points), footprint, settings.resolution, settings.max_resolution)
         self.monitor.decide("field resolution", f"{resolution.cells} voxels of {resolution.cell:.4g}", resolution.reason)
         pad = 16 * resolution.cell  # for the truncation distance and the boundary layers of the coarse lattice
@@ -250,9 +255,9 @@ class _Extraction:
             vertices = _integrate_normals(cache, vertices, faces, settings.normal_wavelength, cell)
         vertices = cleanup.smooth(vertices, faces, settings.smoothing_iterations)
         if not cleanup.topology(vertices, faces).watertight:
-            vertices, faces = cleanup.repair(vertices, faces)
+            vertices, faces = repair(vertices, faces)
             if settings.holes == "close":
-                vertices, faces = cleanup.close_holes(vertices, faces, MAX_HOLE_EDGES)
+                vertices, faces = close_holes(vertices, faces, MAX_HOLE_EDGES)
         return vertices, faces, dropped + background
 
     def _refine_silhouettes(self, vertices: Doubles, faces: Faces) -> Doubles:
@@ -318,13 +323,16 @@ class _Extraction:
     def _decimate(self, vertices: Doubles, faces: Faces, cell: float) -> dict[str, Any]:
         """Decimate and write the low-poly mesh; its results for the manifest."""
         settings, monitor = self.options.mesh, self.monitor
+        decimator = resolve_decimator(settings.decimator)
         result = decimate_to_error_bound(
-            vertices, faces, settings.faces, self.options.max_faces, settings.max_error * cell, monitor.check_stop
+            vertices, faces, settings.faces, self.options.max_faces, settings.max_error * cell, decimator, monitor.check_stop
         )
+        if len(result.faces) == 0:
+            raise BadInputError(f"mesh: nothing is left of the surface at {settings.faces} faces; raise mesh.faces or mesh.resolution.")
         write_mesh(self.out / "mesh.ply", result.vertices, result.faces)
         deviation, bound = result.deviation.quantile / cell, f"bound {settings.max_error:g}" if settings.max_error else "no bound"
         choice = f"{len(result.faces)} faces" + (f" instead of {settings.faces}" if result.retries else "")
-        monitor.decide("decimation", choice, f"deviation from the dense mesh {deviation:.2f} voxels ({bound})")
+        monitor.decide("decimation", choice, f"{decimator}; deviation from the dense mesh {deviation:.2f} voxels ({bound})")
         if 0 < settings.max_error < deviation:
             monitor.warn(f"mesh: decimation to {len(result.faces)} faces deviates by {deviation:.2f} voxels; raise mesh.faces.")
         return {
@@ -332,6 +340,7 @@ class _Extraction:
             "faces": len(result.faces),
             "components": result.topology.components,
             "watertight": result.topology.watertight,
+            "decimator": decimator,
             "border_edges": result.topology.border_edges,
             "decimation_deviation_cells": deviation,
             "decimation_error_cells": result.deviation.maximum / cell,

@@ -49,13 +49,16 @@ def imls_field(
     """The field (n, 8, 8, 8) on the lattice's blocks in units of `truncation`, clamped to ±1; NaN where no sample reaches.
 
     `points` (m, 3) lie on the surface; `normals` (m, 3) are unit and outward; `weights` (m,) default to 1; `max_support` is the maximum
-    support radius (default: eight cells). `robust` makes the second pass. Raises ValueError when the row counts differ.
+    support radius (default: eight cells). `robust` makes the second pass. Samples that are not finite are ignored. Raises ValueError when
+    the row counts differ.
     """
     position = np.ascontiguousarray(points, np.float64).reshape(-1, 3)
     normal = np.ascontiguousarray(normals, np.float32).reshape(-1, 3)
     confidence = np.ones(len(position), np.float32) if weights is None else np.ascontiguousarray(weights, np.float32)
     if not (len(normal) == len(confidence) == len(position)):
         raise ValueError("points, normals and weights must have one row per sample")
+    finite = np.isfinite(position).all(1) & np.isfinite(normal).all(1) & np.isfinite(confidence)
+    position, normal, confidence = position[finite], normal[finite], confidence[finite]
     sums = np.zeros((len(lattice), EDGE, EDGE, EDGE), np.float32)
     weight_sum = np.zeros_like(sums)
     if len(position) > 1:

@@ -12,6 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from gsbake.meshing.cleanup import component_areas, face_components, remove_unused_vertices
+
 Floats = NDArray[np.float64]
 
 #: Maximum distance (unit frame) from the plane and minimum cosine (25 degrees) between normals of inliers.
@@ -56,6 +58,8 @@ def find_support_plane(points: Floats, normals: Floats, weights: Floats, centres
     rng = np.random.default_rng(seed)
     subset = rng.choice(len(points), min(RANSAC_SAMPLES, len(points)), replace=False)
     p, n, w = points[subset], normals[subset], weights[subset]
+    if not w.sum() > 0:
+        return None, "there are no surfels"
     best, best_weight = None, 0.0
     for trial in rng.choice(len(p), RANSAC_TRIALS, p=w / w.sum()):
         offset = float(p[trial] @ n[trial])
@@ -113,8 +117,6 @@ def remove_background_components(vertices: Floats, faces: NDArray[np.int32], rad
 
     All are kept when every component above a fifth of the largest one's area does so: the object itself fills the ball.
     """
-    from gsbake.meshing.cleanup import component_areas, face_components, remove_unused_vertices  # loads PyMeshLab
-
     if len(faces) == 0:
         return vertices, faces, 0
     component = face_components(vertices, faces)

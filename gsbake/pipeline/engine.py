@@ -22,7 +22,7 @@ from gsbake.pipeline.stage import Stage
 from gsbake.pipeline.store import Artifact, Store
 from gsbake.pipeline.supervise import Outcome, StageFailed, StopSignals, supervise
 from gsbake.pipeline.worker import Job
-from gsbake.text import shortlist, summarise
+from gsbake.text import printable, shortlist, summarise
 
 
 class Observer:
@@ -103,7 +103,7 @@ class Engine:
         artifacts: dict[str, Artifact] = {}
         for stage in stages:
             stop.check()
-            self._set_aside_unexpected(stage.name)
+            self._set_aside_unexpected(stage, artifacts)
             state = self.planner.assess(stage, artifacts)
             if not states:
                 on_accepted()
@@ -111,7 +111,7 @@ class Engine:
                 state = self._compute(stage, state, artifacts, stop)
             else:
                 self.store.mark_used(state.artifact)
-                self.events.write("stage cached", stage=stage.name, folder=state.artifact.folder, by_hand=state.artifact.by_hand)
+                self.events.write("stage cached", stage=stage.name, folder=state.artifact.folder, replaced=state.artifact.replaced)
                 self.observer.stage_reused(state)
             assert state.artifact is not None
             artifacts[stage.name] = state.artifact
@@ -119,11 +119,12 @@ class Engine:
         self.events.write("run ended", exit_code=0, seconds=round(time.perf_counter() - start, 3))
         return states
 
-    def _set_aside_unexpected(self, name: str) -> None:
-        moved = self.store.set_aside_unexpected(name)
+    def _set_aside_unexpected(self, stage: Stage, artifacts: Mapping[str, Artifact]) -> None:
+        name, known = stage.name, all(need in artifacts for need in stage.needs)
+        moved = self.store.set_aside_unexpected(name, self.planner.cache_key(stage, artifacts) if known else None)
         if moved:
             names, folder = shortlist([path.name for path in moved]), self.request.out / "unexpected"
-            text = f"{names}: not part of the stage's output; moved to '{folder}'."
+            text = printable(f"{names}: not part of the stage's output; moved to '{folder}'.")
             self.events.write("warning", stage=name, text=text)
             self.observer.warning(name, text)
 

@@ -10,12 +10,14 @@ from contextlib import suppress
 from pathlib import Path
 
 from gsbake.atomic import atomic_replacement, sync
-from gsbake.errors import BadInputError, InterruptedRun, UsageError
+from gsbake.errors import BadInputError, GsbakeError, InterruptedRun, UsageError
 
 #: errno values of a full disk or quota.
 DISK_FULL = frozenset({errno.ENOSPC, errno.EDQUOT})
 #: errno values of a location without write access.
 NOT_WRITABLE = frozenset({errno.EROFS, errno.EACCES, errno.EPERM})
+#: errno values of a path that cannot be used as it is.
+_UNUSABLE = NOT_WRITABLE | {errno.ENAMETOOLONG, errno.ELOOP}
 
 
 def sync_tree(folder: Path) -> None:
@@ -72,6 +74,19 @@ def disk_error(error: BaseException, folder: Path) -> BadInputError | Interrupte
         usage = shutil.disk_usage(existing)
         if usage.total and usage.free < 1 << 20:
             return _disk_full(folder)
+    return None
+
+
+def path_error(error: OSError) -> GsbakeError | None:
+    """The user error of a path that the system refuses (no permission, a read-only disk, a name that is too long, a loop of links) or of a
+    full or failing disk; None for any other error, which is a fault of gsbake."""
+    if not isinstance(error.filename, str | bytes):
+        return None
+    path = os.fsdecode(error.filename)
+    if error.errno in DISK_FULL or error.errno == errno.EIO:
+        return disk_error(error, Path(path).parent)
+    if error.errno in _UNUSABLE:
+        return BadInputError(f"'{path}' cannot be used ({error.strerror}); change its permissions or name another.")
     return None
 
 

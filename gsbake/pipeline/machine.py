@@ -23,7 +23,7 @@ from gsbake.errors import UsageError
 #: Libraries whose versions are stored in manifests and shown by `doctor`.
 LIBRARIES = (
     "gsbake", "numpy", "scipy", "numba", "torch", "pycolmap", "opencv-contrib-python-headless", "OpenImageIO", "scikit-image",
-    "trimesh", "pymeshlab", "xatlas", "embreex", "safetensors", "pydantic", "blake3",
+    "trimesh", "pymeshlab", "fast-simplification", "xatlas", "embreex", "safetensors", "pydantic", "blake3",
 )  # fmt: skip
 
 #: Environment variables that set the sizes of the libraries' thread pools; they are read when a library loads.

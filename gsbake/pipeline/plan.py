@@ -71,8 +71,7 @@ class Planner:
 
     def assess(self, stage: Stage, artifacts: Mapping[str, Artifact]) -> StageState:
         """The state of one stage, given the artifacts of earlier stages."""
-        names = expand_patterns(stage.settings, self._settings)
-        settings = {name: self._settings[name] for name in names}
+        settings = self._declared(stage)
         replacement = self.store.replacement(stage.name)
         if replacement is not None:
             if replacement.artifact is None:
@@ -85,20 +84,28 @@ class Planner:
         if missing:
             changes = self._changes(stage, settings, {})
             return StageState(stage.name, stage.title, "waits", (f"{shortlist(missing)} will run first", *changes), settings=settings)
-        files = self.input_files(stage, artifacts)
-        cache_key = CacheKey.for_stage(
-            stage,
-            settings,
-            {name: self._defaults[name] for name in names},
-            {name: tree_digest(entry) for name, entry in files.items()},
-            device=self.request.device,
-            seed=self.request.seed,
-        )
+        cache_key = self.cache_key(stage, artifacts)
         found = self.store.look_up(cache_key)
         if found.artifact is not None:
             return StageState(stage.name, stage.title, "cached", (), cache_key, found.artifact, settings)
-        reasons = found.faults or self._changes(stage, settings, files, cache_key)
+        reasons = found.faults or self._changes(stage, settings, self.input_files(stage, artifacts), cache_key)
         return StageState(stage.name, stage.title, "run", reasons, cache_key, None, settings)
+
+    def cache_key(self, stage: Stage, artifacts: Mapping[str, Artifact]) -> CacheKey:
+        """The key of a stage whose needed stages have `artifacts`. Raises BadInputError for a user's file that cannot be read."""
+        settings = self._declared(stage)
+        return CacheKey.for_stage(
+            stage,
+            settings,
+            {name: self._defaults[name] for name in settings},
+            {name: tree_digest(entry) for name, entry in self.input_files(stage, artifacts).items()},
+            device=self.request.device,
+            seed=self.request.seed,
+        )
+
+    def _declared(self, stage: Stage) -> dict[str, Any]:
+        """{"section.key": value} of the settings that a stage declares."""
+        return {name: self._settings[name] for name in expand_patterns(stage.settings, self._settings)}
 
     def input_files(self, stage: Stage, artifacts: Mapping[str, Artifact]) -> dict[str, Mapping[str, str]]:
         """{input: {file: digest}} of the artifacts and the user's paths that the stage reads."""

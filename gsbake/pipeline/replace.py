@@ -42,7 +42,7 @@ def replace_output(store: Store, stage: str, files: Mapping[str, Path], base: Ar
                 "peak_bytes": 0,
                 "parts": {},
                 "results": {},
-                "decisions": [{"what": "output", "choice": "replaced by hand", "evidence": ", ".join(str(p) for p in files.values())}],
+                "decisions": [{"what": "output", "choice": "replaced by the user", "evidence": ", ".join(str(p) for p in files.values())}],
                 "warnings": [],
             }
             artifact = store.publish(temporary, final, manifest)

@@ -38,12 +38,12 @@ _FILE_MANAGER_FILES = frozenset({".DS_Store", "Thumbs.db", "desktop.ini", ".dire
 
 @dataclass(frozen=True)
 class Artifact:
-    """A published artifact folder: {file: digest} and the manifest; `by_hand` when it holds the user's files."""
+    """A published artifact folder: {file: digest} and the manifest; `replaced` when it holds the user's files."""
 
     folder: Path
     files: Mapping[str, str]
     manifest: Mapping[str, Any]
-    by_hand: bool = False
+    replaced: bool = False
 
     @property
     def digest(self) -> str:
@@ -57,6 +57,10 @@ class Lookup:
 
     artifact: Artifact | None = None
     faults: tuple[str, ...] = field(default=())
+
+
+class _DamagedRecordError(Exception):
+    """The record of a replacement cannot be used; the message says why."""
 
 
 class Store:
@@ -97,20 +101,28 @@ class Store:
             return Lookup(None, tuple(faults))
         return Lookup(self._artifact(folder, manifest))
 
+    def replacement_folder(self, stage: str) -> Path | None:
+        """Folder of the user's replacement of this stage's output; None when there is none. Raises _DamagedRecordError."""
+        try:
+            name = str(json.loads((self.stage_folder(stage) / REPLACEMENT).read_text(encoding="utf-8"))["folder"])
+        except (FileNotFoundError, NotADirectoryError):
+            if any(_REPLACEMENT_FOLDER.fullmatch(path.name) for path in self.stage_folder(stage).glob(f"{REPLACEMENT_PREFIX}-*")):
+                raise _DamagedRecordError(f"{REPLACEMENT} is missing") from None
+            return None
+        except (OSError, ValueError, KeyError, TypeError):
+            raise _DamagedRecordError(f"{REPLACEMENT} cannot be read") from None
+        if not _REPLACEMENT_FOLDER.fullmatch(name):
+            raise _DamagedRecordError(f"{REPLACEMENT} names the folder {name!r}")
+        return self.stage_folder(stage) / name
+
     def replacement(self, stage: str) -> Lookup | None:
         """The user's replacement of this stage's output; None when there is none."""
-        record = self.stage_folder(stage) / REPLACEMENT
         try:
-            body = json.loads(record.read_text(encoding="utf-8"))
-            name = str(body["folder"])
-        except (FileNotFoundError, NotADirectoryError):
-            left = any(_REPLACEMENT_FOLDER.fullmatch(path.name) for path in self.stage_folder(stage).glob(f"{REPLACEMENT_PREFIX}-*"))
-            return Lookup(None, (f"{REPLACEMENT} is missing",)) if left else None
-        except (OSError, ValueError, KeyError, TypeError):
-            return Lookup(None, (f"{REPLACEMENT} cannot be read",))
-        if not _REPLACEMENT_FOLDER.fullmatch(name):
-            return Lookup(None, (f"{REPLACEMENT} names the folder {name!r}",))
-        folder = self.stage_folder(stage) / name
+            folder = self.replacement_folder(stage)
+        except _DamagedRecordError as error:
+            return Lookup(None, (str(error),))
+        if folder is None:
+            return None
         manifest = read_manifest(folder)
         if manifest is None or manifest.get("stage") != stage or not manifest.get("replaced"):
             return Lookup(None, ("its files are missing or its manifest is damaged",))
@@ -184,21 +196,26 @@ class Store:
             return [e for e in entries if e.is_dir() and (ARTIFACT_FOLDER.fullmatch(e.name) or _REPLACEMENT_FOLDER.fullmatch(e.name))]
         return []
 
-    def set_aside_unexpected(self, stage: str) -> list[Path]:
-        """Move files that no manifest lists from the stage's artifacts to OUT/unexpected/; returns where they went.
+    def set_aside_unexpected(self, stage: str, cache_key: CacheKey | None) -> list[Path]:
+        """Move files that the manifest does not list from the artifact that a run uses to OUT/unexpected/; returns where they went.
 
-        Such a file would be read by later stages although no cache key accounts for it.
+        Such a file would be read by later stages although no cache key accounts for it. The artifact is the user's replacement, else that
+        of the key; others are not looked at.
         """
+        folder = None
+        with suppress(_DamagedRecordError):  # reported at the look-up
+            folder = self.replacement_folder(stage) or (self.folder(stage, cache_key.digest) if cache_key is not None else None)
+        manifest = None if folder is None else read_manifest(folder)
+        if folder is None or manifest is None:
+            return []
         moved = []
-        for folder in self.artifact_folders(stage):
-            manifest = read_manifest(folder)
-            for name in [] if manifest is None else _unexpected(folder, manifest):
-                target = self.out / "unexpected" / stage / folder.name / name
-                while target.exists() or target.is_symlink():
-                    target = target.with_name(f"{target.name}~")
-                target.parent.mkdir(parents=True, exist_ok=True)
-                (folder / name).rename(target)
-                moved.append(target)
+        for name in _unexpected(folder, manifest):
+            target = self.out / "unexpected" / stage / folder.name / name
+            while target.exists() or target.is_symlink():
+                target = target.with_name(f"{target.name}~")
+            target.parent.mkdir(parents=True, exist_ok=True)
+            (folder / name).rename(target)
+            moved.append(target)
         return moved
 
     def _file_faults(self, folder: Path, manifest: Mapping[str, Any]) -> list[str]:
@@ -217,7 +234,7 @@ class Store:
     @staticmethod
     def _artifact(folder: Path, manifest: Mapping[str, Any]) -> Artifact:
         files = {name: str(entry["digest"]) for name, entry in manifest.get("files", {}).items()}
-        return Artifact(folder, files, manifest, by_hand=bool(manifest.get("replaced")))
+        return Artifact(folder, files, manifest, replaced=bool(manifest.get("replaced")))
 
 
 def _list_all(folder: Path) -> list[str]:

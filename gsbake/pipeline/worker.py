@@ -30,6 +30,7 @@ from gsbake.pipeline.files import disk_error
 from gsbake.pipeline.machine import peak_memory
 from gsbake.pipeline.registry import load_stage
 from gsbake.pipeline.settings import SettingsView
+from gsbake.text import printable
 
 #: Minimum time between progress messages in seconds.
 PROGRESS_INTERVAL = 0.1
@@ -120,7 +121,7 @@ class WorkerContext:
         now = time.monotonic()
         if now - self._last >= PROGRESS_INTERVAL or done >= total:
             self._last = now
-            self._pipe.send("progress", done=done, total=total, text=text, live=live)
+            self._pipe.send("progress", done=done, total=total, text=printable(text), live=live)
 
     def stop_requested(self) -> bool:
         """Whether to write a checkpoint and stop."""
@@ -138,11 +139,11 @@ class WorkerContext:
     def decide(self, what: str, choice: str, evidence: str, saved: float | None = None) -> None:
         """Report a decision; `saved` is the saved time in seconds."""
         saved_time = {} if saved is None else {"saved_s": round(saved, 1)}
-        self._pipe.send("decision", what=what, choice=choice, evidence=evidence, **saved_time)
+        self._pipe.send("decision", what=printable(what), choice=printable(choice), evidence=printable(evidence), **saved_time)
 
     def warn(self, text: str) -> None:
         """Report a warning for the user."""
-        self._pipe.send("warning", text=text)
+        self._pipe.send("warning", text=printable(text))
 
 
 def to_json(value: Any) -> Any:
@@ -205,8 +206,8 @@ def run_job(job: Job, pipe: MessagePipe) -> None:
 
 
 def one_line(text: str, limit: int = 300) -> str:
-    """`text` without line breaks, truncated to `limit` characters."""
-    joined = " ".join(text.split())
+    """`text` printable and without line breaks, truncated to `limit` characters."""
+    joined = printable(" ".join(text.split()))
     return joined if len(joined) <= limit else f"{joined[: limit - 1]}…"
 
 

@@ -1,11 +1,15 @@
 """HTML page of the report: plain data filled into a Jinja template, as one file that opens offline.
 
-Images, model, style, script and the 3D viewer (vendored, see `vendor/`) are inlined; nothing is fetched. Jinja escapes all text.
+Images, model, style, script and the 3D viewer (vendored, see `vendor/`) are inlined; nothing is fetched. All text is made printable, and
+Jinja escapes it.
 """
 
 from __future__ import annotations
 
 import base64
+import hashlib
+import re
+from collections.abc import Iterable
 from dataclasses import dataclass
 from importlib import resources
 
@@ -14,6 +18,8 @@ import jinja2
 import numpy as np
 from markupsafe import Markup
 from numpy.typing import NDArray
+
+from gsbake.text import printable
 
 
 @dataclass(frozen=True)
@@ -159,6 +165,30 @@ def inline_script(text: str) -> Markup:
     return Markup(text.replace("<!--", "<\\!--").replace("</script", "<\\/script"))
 
 
+def content_security_policy(scripts: Iterable[str], styles: Iterable[str]) -> str:
+    """Policy under which a browser runs only these scripts and styles, and loads nothing but data inside the page (W3C, *Content Security
+    Policy Level 3*): markup that slipped through from a name could neither run nor send anything."""
+
+    def digests(texts: Iterable[str]) -> str:
+        return " ".join(f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'" for text in texts)
+
+    return "; ".join((
+        "default-src 'none'", f"script-src {digests(scripts)} 'wasm-unsafe-eval'", f"style-src {digests(styles)}", "img-src data: blob:",
+        "connect-src data: blob:",  # the viewer reads model and environment maps from URLs of data in the page
+        "base-uri 'none'", "form-action 'none'",
+    ))  # fmt: skip
+
+
+def _viewer_styles(script: str) -> list[str]:
+    """The style sheets that the viewer's script puts into the page."""
+    return re.findall(r"<style>(.*?)</style>", script, re.DOTALL)
+
+
+def _shown(value: object) -> object:
+    """What the template shows of a value: text is made printable, markup and numbers stay."""
+    return printable(value) if isinstance(value, str) and not isinstance(value, Markup) else value
+
+
 def render_page(page: Page) -> str:
     """HTML of the page."""
     here = resources.files("gsbake.report")
@@ -166,13 +196,13 @@ def render_page(page: Page) -> str:
     def text(name: str) -> str:
         return here.joinpath(name).read_text(encoding="utf-8")
 
-    environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    environment = jinja2.Environment(
+        autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True, finalize=_shown
+    )
     template = environment.from_string(text("page.html.j2"))
     charts = {name: Markup(getattr(page, name)) for name in ("time_chart", "memory_chart")}
     filled = {**vars(page), **charts, "curves": tuple(Markup(curve) for curve in page.curves)}
-    return template.render(
-        page=filled,
-        css=Markup(text("page.css")),
-        page_js=inline_script(text("page.js")),
-        viewer_js=inline_script(text("vendor/model-viewer.min.js")) if page.model else "",
-    )
+    css, page_js = text("page.css"), inline_script(text("page.js"))
+    viewer_js = inline_script(text("vendor/model-viewer.min.js") if page.model else "")
+    policy = content_security_policy([page_js, viewer_js], [css, *_viewer_styles(viewer_js)])
+    return template.render(page=filled, css=Markup(css), page_js=page_js, viewer_js=viewer_js, policy=policy)

@@ -78,7 +78,10 @@ class EnvironmentLight(torch.nn.Module):
             radiance = safetensors.torch.load_file(str(path))["radiance"]
         except (OSError, KeyError, safetensors.SafetensorError) as error:
             raise BadInputError(f"{path} is not an environment light ({error}); train again or delete the file.") from error
-        return cls.from_radiance(radiance)
+        try:
+            return cls.from_radiance(radiance)
+        except BadInputError as error:
+            raise BadInputError(f"{path}: {error} Bake again.") from error
 
     @classmethod
     def from_radiance(cls, radiance: torch.Tensor | NDArray[np.floating]) -> EnvironmentLight:

@@ -32,6 +32,10 @@ CLUSTER_FACES = 1000
 NOISY_DIHEDRAL = 0.2
 #: Laplacian steps of that smoothing.
 SMOOTHING_STEPS = 4
+#: Diagonal of the mesh that is charted, to within a factor of √2: about that of the unit frame. xatlas' thresholds are absolute.
+DIAGONAL = 2.0
+#: Advice for a mesh that cannot be unwrapped.
+_REPLACE = "run the mesh stage again or replace the mesh"
 #: Resolution at which charts that overlap themselves are searched for.
 CHECK_SIZE = 2048
 
@@ -66,15 +70,16 @@ def signed_areas(uv: NDArray[Any], faces: NDArray[Any]) -> Floats:
 def make_atlas(vertices: NDArray[Any], faces: NDArray[Any], size: int, padding: int | None = None) -> Atlas:
     """Unwrap a mesh: `vertices` (v, 3) in any unit, `faces` (f, 3), onto a texture of `size` texels.
 
-    `padding` texels are left between charts (default: size / 128). Raises ValueError when the mesh has no faces or its charts cannot fit.
+    `padding` texels are left between charts (default: size / 128). Raises ValueError when the mesh has no area or its charts cannot fit.
     """
-    points, triangles = np.asarray(vertices, np.float64), np.asarray(faces, np.int64)
-    if len(triangles) == 0:
-        raise ValueError("a mesh without faces has no atlas")
+    triangles = np.asarray(faces, np.int64)
+    points = _normalised(np.asarray(vertices, np.float64), triangles)
     gap = max(2, size // 128) if padding is None else padding
     source, uv, corner = _chart(_smoothed_when_noisy(points, triangles), triangles)
     chart = _islands(len(uv), corner)
     uv = _normalise_charts(points, triangles, uv, corner, chart)
+    if not np.abs(signed_areas(uv, corner)).sum() > 0:
+        raise ValueError(f"the triangles of the mesh are too thin to unwrap; {_REPLACE}")
     packed = pack(uv, corner, chart, size, gap)
     for alone in (False, True, True):
         folded = overlapping_faces(packed.uv / size, corner, CHECK_SIZE)
@@ -88,6 +93,20 @@ def make_atlas(vertices: NDArray[Any], faces: NDArray[Any], size: int, padding: 
     final[:, 1] = 1 - final[:, 1]
     coordinates = np.clip(final, 0, 1).astype(np.float32)
     return Atlas(source.astype(np.int32), coordinates, corner.astype(np.int32), chart.astype(np.int32), size, fill)
+
+
+def _normalised(points: Floats, faces: Ints) -> Floats:
+    """The vertices scaled by a power of two to about `DIAGONAL`, about the origin where they are far from it."""
+    if len(faces) == 0 or not np.isfinite(points).all():
+        raise ValueError(f"a mesh without faces or with positions that are not finite has no atlas; {_REPLACE}")
+    used = points[np.unique(faces)]
+    lower, upper = used.min(0), used.max(0)
+    diagonal, centre = float(np.linalg.norm(upper - lower)), (lower + upper) / 2
+    if not diagonal > 0:
+        raise ValueError(f"a mesh without area has no atlas; {_REPLACE}")
+    if np.linalg.norm(centre) > diagonal:
+        points = points - centre
+    return np.asarray(points * 2.0 ** np.round(np.log2(DIAGONAL) - np.log2(diagonal)))
 
 
 def _islands(count: int, corner: Ints) -> Ints:

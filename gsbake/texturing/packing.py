@@ -181,7 +181,9 @@ def _search(
         else:
             scale = scale * step if best is not None else scale / step
             step = min(step**1.3, 2.0)
-    raise ValueError(f"{len(charts)} charts with {padding} texels of padding do not fit a texture of {size} texels")
+    raise ValueError(
+        f"{len(charts)} charts with {padding} texels of padding do not fit a texture of {size} texels; raise bake.size or lower mesh.faces"
+    )
 
 
 def pack(uv: Floats, faces: Ints, chart: Ints, size: int, padding: float) -> Packed:

@@ -12,8 +12,8 @@ from gsbake.imaging.srgb import decode_bytes
 from gsbake.monitor import Monitor, Rule, decide_skip
 from gsbake.surfels.raster.render import SurfelRenderer
 from gsbake.surfels.training.views import held_out
-from gsbake.texturing.needed import constant_exposure
 from gsbake.texturing.projection import ProjectedTexture, ProjectionBlender, mask_weights
+from gsbake.texturing.skip_rules import constant_exposure
 from gsbake.texturing.unwrapped_mesh import UnwrappedMesh
 
 #: Weight of held-out photos: they fill only what no other photo observed, so that validation figures stay unbiased.

@@ -135,10 +135,16 @@ def edge_weights(depth: NDArray[Any], step: float, margin: float) -> Floats:
         edge[before] |= jump
         edge[after] |= jump
     distance = cv2.distanceTransform((~edge).astype(np.uint8), cv2.DIST_L2, 5)
-    return np.asarray(np.clip(distance / max(margin, 1e-6), 0.02, 1) ** 2, np.float32)
+    return _ramp(distance, margin)
 
 
 def mask_weights(mask: NDArray[np.uint8], margin: float) -> Floats:
     """Weights (h, w) from an object mask (255: object): 0 outside, rising to 1 at `margin` pixels inside."""
     distance = cv2.distanceTransform((mask > 127).astype(np.uint8), cv2.DIST_L2, 5)
-    return np.asarray(np.where(distance > 0, np.clip(distance / max(margin, 1e-6), 0.02, 1) ** 2, 0), np.float32)
+    return np.where(distance > 0, _ramp(distance, margin), np.float32(0))
+
+
+def _ramp(distance: NDArray[Any], margin: float) -> Floats:
+    """Weight (h, w) 0..1 that rises to 1 at `margin`; distances may be the largest number, where there is nothing to be distant from."""
+    margin = max(margin, 1e-6)
+    return np.asarray(np.clip(np.minimum(distance, np.float32(margin)) / np.float32(margin), 0.02, 1) ** 2, np.float32)

@@ -43,11 +43,13 @@ class Runner:
         options = IngestOptions(Ingest(**{**(settings or {}), **more}), resolution)
         return ingest(found.photos, done.out, options, masks=found.masks, poses=found.poses, monitor=done), done
 
-    def poses(self, redundant_photos: Rule = "auto", **settings: Any) -> tuple[dict[str, Any], Done]:
-        done, scratch = Done(self.root / "poses"), self.root / "scratch"
+    def poses(
+        self, redundant_photos: Rule = "auto", out: str = "poses", threads: int = 2, **settings: Any
+    ) -> tuple[dict[str, Any], Done]:  # fmt: skip
+        done, scratch = Done(self.root / out), self.root / f"scratch of {out}"
         scratch.mkdir(exist_ok=True)
         options = PoseOptions(Poses(**settings), redundant_photos)
-        return estimate_poses(self.root / "ingest", done.out, options, scratch=scratch, monitor=done), done
+        return estimate_poses(self.root / "ingest", done.out, options, threads=threads, scratch=scratch, monitor=done), done
 
 
 @pytest.fixture

@@ -95,6 +95,20 @@ def test_solved_poses_are_the_true_ones(tmp_path: Path, runner: Runner) -> None:
     assert ups[:, 2].mean() > 0.5
 
 
+@pytest.mark.parametrize("given", [False, True], ids=["solved", "given"])
+def test_the_same_bytes_with_any_number_of_threads(tmp_path: Path, runner: Runner, given: bool) -> None:
+    true = board_capture(tmp_path / "cap")
+    if given:
+        transforms(tmp_path / "cap", true)
+    runner.ingest(tmp_path / "cap")
+    files = []
+    for k, threads in enumerate((2, 3, 1)):
+        _, done = runner.poses(out=f"poses {k}", threads=threads, max_features=1000)
+        files.append({path.relative_to(done.out).as_posix(): path.read_bytes() for path in done.out.rglob("*") if path.is_file()})
+    assert {"points.ply", "cameras.json", "sparse/images.bin", "sparse/points3D.bin"} <= set(files[0])
+    assert files[0] == files[1] and files[0] == files[2]
+
+
 def test_given_poses_keep_their_frame_and_points_are_triangulated(tmp_path: Path, runner: Runner) -> None:
     true = board_capture(tmp_path / "cap")
     transforms(tmp_path / "cap", true)

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from gsbake.capture.sources import Sources, discover, list_photos
+from gsbake.capture.sources import Sources, discover, list_masks, list_photos
 from gsbake.errors import BadInputError
 
 
@@ -68,3 +68,22 @@ def test_bad_overrides(tmp_path: Path) -> None:
             discover(tmp_path, poses=tmp_path / name)
     with pytest.raises(BadInputError, match="is a file"):
         discover(tmp_path / "images/a.jpg")
+
+
+def test_masks_are_images_inside_their_folder(tmp_path: Path) -> None:
+    touch(tmp_path / "masks/left/a.png", tmp_path / "masks/b.jpg.png", tmp_path / "masks/notes.txt", tmp_path / "masks/.c.png")
+    touch(tmp_path / "elsewhere/secret.png", tmp_path / "masks/.hidden/d.png")
+    (tmp_path / "masks" / "etc").symlink_to(tmp_path / "elsewhere")
+    assert list_masks(tmp_path / "masks") == ["b.jpg.png", "left/a.png"]
+
+
+def test_mask_folder_that_leads_out_of_the_capture_must_be_named(tmp_path: Path) -> None:
+    touch(tmp_path / "capture/images/a.jpg", tmp_path / "elsewhere/a.png", tmp_path / "capture/made/a.png")
+    link = tmp_path / "capture" / "masks"
+    link.symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(BadInputError, match=r"is a link that leads out of the capture.*name it with --masks"):
+        discover(tmp_path / "capture")
+    assert discover(tmp_path / "capture", masks=link).masks == link
+    link.unlink()
+    link.symlink_to("made")
+    assert discover(tmp_path / "capture").masks == link

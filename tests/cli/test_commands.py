@@ -3,67 +3,15 @@
 from __future__ import annotations
 
 import json
-import signal
+import os
+import subprocess
 import sys
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import pytest
 
-from gsbake.cli import main
-from tests.cli import toy_bake
-
-
-@dataclass(frozen=True)
-class End:
-    """Exit code and output of a command."""
-
-    code: int
-    out: str
-    err: str
-
-    @property
-    def json(self) -> Any:
-        return json.loads(self.out)
-
-
-Run = Callable[..., End]
-
-
-@pytest.fixture
-def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> Iterator[Run]:
-    """Run a command on the toy stages, in this process and an empty working folder."""
-    import gsbake.api
-
-    monkeypatch.setattr(gsbake.api, "REGISTRY", toy_bake.REGISTRY)
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("COLUMNS", "200")
-    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-
-    def command(*arguments: object) -> End:
-        monkeypatch.setattr(sys, "argv", ["gsbake", *map(str, arguments)])
-        code: Any = 0
-        try:
-            main()
-        except SystemExit as error:
-            code = error.code
-        captured = capsys.readouterr()
-        return End(int(code or 0), captured.out, captured.err)
-
-    yield command
-    for number, handler in handlers.items():
-        signal.signal(number, handler)
-
-
-@pytest.fixture
-def capture(tmp_path: Path) -> Path:
-    folder = tmp_path / "tankard"
-    for name in ("images/a.jpg", "images/b.jpg", "images/c.jpg", "masks/a.png", "gt/secret.jpg"):
-        (folder / name).parent.mkdir(parents=True, exist_ok=True)
-        (folder / name).write_text(name)
-    return folder
+from tests.cli.conftest import Run
 
 
 def test_run_publishes_the_results_and_caches_the_stages(run: Run, capture: Path, tmp_path: Path) -> None:
@@ -151,6 +99,39 @@ def test_replace_and_undo(run: Run, capture: Path, tmp_path: Path) -> None:
     assert wrong.code == 2 and "it has asset.glb, cameras.json, light.hdr" in wrong.err
 
 
+@pytest.fixture
+def read_only(tmp_path: Path) -> Iterator[Callable[[Path], None]]:
+    """Make a folder read-only, also for root (by a mount), until the end of the test."""
+    mounted: list[Path] = []
+
+    def protect(folder: Path) -> None:
+        if os.geteuid() != 0:
+            folder.chmod(0o555)
+            return
+        if subprocess.run(["mount", "--bind", str(folder), str(folder)], check=False, capture_output=True).returncode:
+            pytest.skip("a folder cannot be mounted read-only here")
+        mounted.append(folder)
+        subprocess.run(["mount", "-o", "remount,bind,ro", str(folder)], check=True)
+
+    yield protect
+    for folder in mounted:
+        subprocess.run(["umount", "-l", str(folder)], check=True)
+
+
+@pytest.mark.parametrize("words", [["edited.ply"], ["--undo"]])
+def test_replace_in_a_read_only_folder(
+    run: Run, capture: Path, tmp_path: Path, read_only: Callable[[Path], None], words: list[str]
+) -> None:
+    run("run", capture, "--out", "o")
+    (tmp_path / "edited.ply").write_text("ply mine")
+    run("replace", "mesh", "edited.ply", "--out", "o")
+    (tmp_path / "edited.ply").write_text("ply mine again")
+    folder = tmp_path / "o" / "stages" / "mesh"
+    read_only(folder)
+    end = run("replace", "mesh", *words, "--out", "o")
+    assert end.code == 42 and end.err.count("\n") == 1 and "cannot be written" in end.err, end.err
+
+
 @pytest.mark.parametrize(
     ("arguments", "code", "says"),
     [
@@ -168,6 +149,25 @@ def test_replace_and_undo(run: Run, capture: Path, tmp_path: Path) -> None:
         (["run", "tankard", "--device", "cuda"], 2, "--device cuda is not available"),
         (["run", "tankard", "--seed", "-1"], 2, "The seed must be a whole number from 0 to 2 147 483 647, not -1."),
         (["status", "tankard", "--seed", "2147483648"], 2, "from 0 to 2 147 483 647, not 2147483648"),
+        (["run", ""], 2, "'PHOTOS': the path is empty; '.' is the current folder"),
+        (["run", "tankard", "--out", ""], 2, "the path is empty"),
+        (["run", "tankard", "--masks", ""], 2, "the path is empty"),
+        (["run", "tankard", "--poses", ""], 2, "the path is empty"),
+        (["replace", "mesh", ""], 2, "the path is empty"),
+        (["run", "tankard", "--profile", ""], 2, "There is no profile ''"),
+        (["profiles", ""], 2, "There is no profile ''"),
+        (["profiles", "."], 2, "There is no profile '.'"),
+        (["profiles", "base.toml"], 42, 'base.toml: extends = "" names no profile'),
+        (["run", "n" * 300], 42, "cannot be used (File name too long)"),
+        (["run", "tankard", "--set", "mesh.faces=abc"], 42, "mesh.faces = 'abc' is not a number: it must be a whole number from 100 to 10"),
+        (["run", "tankard", "--threads", "513"], 2, "The number of threads must be from 0 (the physical cores) to 512, not 513."),
+        (["run", "tankard", "--threads", "-1"], 2, "from 0 (the physical cores) to 512, not -1."),
+        (["run", "tankard", "--set", "train.holdout=1"], 42, "--set: train.holdout = 1 is invalid: it would hold out every photo; set 0"),
+        (["run", "tankard", "--set", "loss.mask="], 42, "loss.mask = '' is not a number"),
+        (["run", "tankard", "--set", "export.copyright=\udcff"], 2, "--set takes text, but 'export.copyright=\\udcff' is not valid UTF-8"),
+        (["run", "tankard", "--fast"], 2, "No such option: --fast"),
+        (["run", "tankard", "--seed", "x"], 2, "'--seed'"),
+        (["bakery"], 2, "No such command 'bakery'"),
         (["run", "tankard", "--set", "loss.mask=inf"], 42, "loss.mask = inf is invalid: it must be a number from 0 to 10 000."),
     ],
 )
@@ -178,6 +178,7 @@ def test_each_error_has_one_sentence_and_an_exit_code(
     (tmp_path / "two").mkdir()
     for name in ("a.png", "b.png"):
         (tmp_path / "two" / name).write_text(name)
+    (tmp_path / "base.toml").write_text('extends = ""')
     end = run(*arguments)
     assert end.code == code
     errors = [line for line in end.err.splitlines() if "warning" not in line]
@@ -218,8 +219,6 @@ def test_profiles_are_listed_and_shown(run: Run) -> None:
 
 
 def test_help_imports_no_large_library() -> None:
-    import subprocess
-
     start = "import sys; sys.argv = ['gsbake', '--help']; from gsbake.cli import main"
     code = f"{start}\ntry: main()\nexcept SystemExit: pass\nprint('LOADED', *sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

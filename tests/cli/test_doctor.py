@@ -32,3 +32,10 @@ def test_crashing_and_missing_libraries_are_found(
     assert not found["no-such-library"]["ok"] and found["no-such-library"]["found"] == "not installed"
     assert not found["typer"]["ok"] and "does not load" in found["typer"]["found"]
     assert found["Python"]["ok"] and "cores" in found["processor"]["found"]
+
+
+def test_pymeshlab_is_optional(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(doctor, "MODULES", {"pymeshlab": "no_such_library"})
+    monkeypatch.setattr(doctor, "versions", lambda names: {"python": "3.11"})
+    (finding,) = doctor.library_findings()
+    assert finding.ok and "not installed" in finding.found and "fast-simplification" in finding.found

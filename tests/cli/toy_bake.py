@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from typing import Any
 
@@ -11,11 +12,18 @@ from gsbake.pipeline.stage import Context, Stage
 
 
 def _ingest(ctx: Context) -> dict[str, Any]:
-    names = sorted(p.name for p in ctx.inputs["photos"].iterdir())
+    folder = ctx.inputs["photos"]
+    names = sorted(p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file())
     if len(names) < ctx.settings.ingest.min_photos:
         raise BadInputError(f"There are {len(names)} photos; give more.")
-    (ctx.out / "photos.json").write_text("\n".join(names) + str("masks" in ctx.inputs) + str(ctx.settings.ingest.invert_masks))
+    text = "\n".join(names) + str("masks" in ctx.inputs) + str(ctx.settings.ingest.invert_masks)
+    (ctx.out / "photos.json").write_bytes(os.fsencode(text))
     ctx.warn("photo 3 is blurred")
+    for k, name in enumerate(names):
+        ctx.progress(k + 1, len(names), name)
+        if len(name) > 10:
+            ctx.warn(f"the name {name} is long")
+            ctx.decide("name", name, f"of {name}")
     ctx.decide("skip.redundant_photos", "all used", "none twice")
     return {"photos": len(names)}
 

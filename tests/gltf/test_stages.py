@@ -85,7 +85,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     photos = [{"name": c.name, "source": f"/somewhere/{c.name.upper()}.JPG"} for c in cameras]
     (folder / "ingest/photos.json").write_text(json.dumps({"photos": photos}))
     result = bake(folder, folder / "bake")
-    assert result["unseen_share"] < 0.01 and result["detail_share"] > 0.99
+    assert result["unobserved_share"] < 0.01 and result["detail_share"] > 0.99
     monitor = Recorder()
     result = export(folder, folder / "export", monitor, copyright="me")
     assert monitor.warnings == [] and result["scale"] == "metres" and result["triangles"] == 1280

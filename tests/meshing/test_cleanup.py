@@ -1,4 +1,4 @@
-"""Clean-up and decimation of meshes with known results."""
+"""Clean-up of meshes with known results."""
 
 from __future__ import annotations
 
@@ -58,28 +58,3 @@ def test_smoothing_keeps_boundaries() -> None:
     boundary = np.isclose(vertices[:, 2], 0.5)
     assert boundary.sum() > 4
     np.testing.assert_array_equal(clean.smooth(vertices, faces, 5)[boundary], vertices[boundary])
-
-
-def test_holes_are_closed_up_to_a_maximum_size() -> None:
-    vertices, faces = sphere(3)
-    centre = vertices[faces].mean(1)
-    small = faces[np.linalg.norm(centre - [0, 0, 1], axis=1) > 0.2]
-    closed = clean.close_holes(vertices, small, 60)
-    assert clean.topology(*closed).watertight
-    assert trimesh.Trimesh(*closed, process=False).is_winding_consistent
-    remaining = clean.close_holes(vertices, faces[centre[:, 2] < 0.3], 20)
-    assert clean.topology(*remaining).border_edges > 20
-
-
-def test_repair_removes_non_manifold_faces() -> None:
-    vertices, faces = sphere(2)
-    extra = np.array([[faces[0, 0], faces[0, 1], len(vertices)], [0, 0, 1], faces[3]], np.int32)
-    fixed = clean.repair(np.concatenate([vertices, [[2.0, 0, 0]]]), np.concatenate([faces, extra]))
-    found = clean.topology(*fixed)
-    assert found.non_manifold_edges == 0
-
-
-def test_surface_distances_are_to_the_triangles() -> None:
-    vertices, faces = np.array([[0.0, 0, 0], [4, 0, 0], [0, 4, 0]]), np.array([[0, 1, 2]], np.int32)
-    points = np.array([[1.0, 1, 0.25], [1, 1, 0], [-3, 0, 4], [1, 1, -2]])
-    np.testing.assert_allclose(clean.surface_distances(points, vertices, faces), [0.25, 0, 5, 2], atol=1e-9)

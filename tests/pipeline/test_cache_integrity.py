@@ -12,10 +12,11 @@ import pytest
 
 from gsbake.errors import BadInputError, InterruptedRun
 from gsbake.pipeline import files as disk
+from gsbake.pipeline import store as store_module
 from gsbake.pipeline.digest import list_files
 from gsbake.pipeline.project import Project
 from gsbake.pipeline.replace import replace_output, undo_replacement
-from gsbake.pipeline.store import MANIFEST, REPLACEMENT, Store
+from gsbake.pipeline.store import MANIFEST, REPLACEMENT, Store, read_manifest
 from tests.pipeline.toy import Sum, Toy, artifact, engine
 
 
@@ -33,6 +34,40 @@ def test_planted_file_is_set_aside(tmp_path: Path, photos: Path, name: str) -> N
     assert recorder.cached == ["read", "sum", "tell"]
     moved = [path for path in (out / "unexpected").rglob("*") if path.is_file()]
     assert [path.read_text() for path in moved] == ["stranger"] and not planted.exists()
+
+
+def test_only_the_artifacts_of_the_run_are_looked_at(tmp_path: Path, photos: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A run reads the manifests of what it uses, not those of all settings ever tried; files planted there wait for their turn."""
+    out = tmp_path / "out"
+    for steps in range(1, 5):
+        engine(out, photos, Toy(sum=Sum(steps=steps)))[0].run()
+    old = [folder for stage in ("sum", "tell") for folder in Store(out).artifact_folders(stage)]
+    for folder in old:
+        (folder / "emissive.exr").write_text("stranger")
+    read: list[Path] = []
+
+    def recorded(folder: Path) -> dict[str, object] | None:
+        read.append(folder)
+        return read_manifest(folder)
+
+    monkeypatch.setattr(store_module, "read_manifest", recorded)
+    again, recorder = engine(out, photos, Toy(sum=Sum(steps=2)))
+    used = {state.artifact.folder for state in again.run() if state.artifact is not None}
+    assert recorder.cached == ["read", "sum", "tell"] and set(read) == used and len(used) == 3
+    assert {folder for folder in old if (folder / "emissive.exr").exists()} == set(old) - used
+    engine(out, photos, Toy(sum=Sum(steps=3)))[0].run()
+    assert sum((folder / "emissive.exr").exists() for folder in old) == len(old) - 4
+
+
+def test_planted_file_in_a_replacement_is_set_aside(tmp_path: Path, photos: Path) -> None:
+    out, mine = tmp_path / "out", tmp_path / "mine.txt"
+    engine(out, photos)[0].run()
+    mine.write_text("42")
+    planted = replace_output(Store(out), "sum", {"total.txt": mine}, None).folder / "emissive.exr"
+    planted.write_text("stranger")
+    engine(out, photos)[0].run()
+    assert not planted.exists() and [path.read_text() for path in out.glob("unexpected/sum/*/*")] == ["stranger"]
+    assert (artifact(out, "tell") / "tell.txt").exists()
 
 
 def test_planted_link_to_a_folder_is_set_aside(tmp_path: Path, photos: Path) -> None:

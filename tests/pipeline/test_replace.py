@@ -19,7 +19,8 @@ def test_later_stages_read_the_replaced_output(tmp_path: Path, photos: Path) -> 
     assert own is not None
     artifact = replace_output(first.store, "sum", {"total.txt": mine}, own)
     mine.unlink()  # it was copied
-    assert artifact.by_hand and artifact.manifest["replaced"] == {"total.txt": str(mine)}
+    assert artifact.replaced and artifact.manifest["replaced"] == {"total.txt": str(mine)}
+    assert artifact.manifest["decisions"][0]["choice"] == "replaced by the user"
     second, seen = engine(out, photos)
     assert [s.status for s in second.plan()] == ["cached", "replaced", "run"]
     assert second.plan()[2].reasons == ("sum: total.txt changed",)

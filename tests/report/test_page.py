@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import hashlib
 import re
 import xml.etree.ElementTree as ET
 from dataclasses import replace
@@ -218,3 +219,29 @@ def test_ticks_are_round_and_inside() -> None:
 @pytest.mark.parametrize(("value", "text"), [(0, "0"), (0.25, "0.25"), (12, "12"), (3000, "3k"), (2.5e6, "2.5M"), (1e-4, "1e-4")])
 def test_numbers(value: float, text: str) -> None:
     assert number(value) == text
+
+
+def digest(text: str) -> str:
+    return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"
+
+
+@pytest.mark.parametrize("page", [EMPTY, FULL], ids=["empty", "full"])
+def test_only_the_pages_own_scripts_and_styles_run(page: Page) -> None:
+    html = render_page(page)
+    parsed = outline(html)
+    policy = next(a["content"] or "" for tag, a in parsed.tags if a.get("http-equiv") == "Content-Security-Policy")
+    rules = {rule.split()[0]: rule.split()[1:] for rule in policy.split("; ")}
+    assert (
+        rules["default-src"] == ["'none'"]
+        and rules["base-uri"] == ["'none'"]
+        and not any("unsafe-inline" in rule for rule in rules.values())
+    )
+    assert {source for rule in rules.values() for source in rule if "'" not in source} == {"data:", "blob:"}  # nothing from elsewhere
+    # the policy holds from its place on, so nothing that runs may stand before it
+    assert html.index("Content-Security-Policy") < min(html.index("<style"), html.index("<script"), html.index("<title"))
+    scripts = re.findall(r"<script>(.*?)</script>", html, re.DOTALL)
+    styles = re.findall(r"<style>(.*?)</style>", html, re.DOTALL)  # with those that the viewer puts into the page
+    assert len(scripts) == (2 if page.model else 1) and len(styles) == (2 if page.model else 1)
+    assert {digest(text) for text in scripts} <= set(rules["script-src"]) and {digest(text) for text in styles} == set(rules["style-src"])
+    assert not any(name.startswith("on") or name == "style" for _, attributes in parsed.tags for name in attributes)
+    assert not any(tag == "script" and attributes.get("type") not in (None, "text/plain") for tag, attributes in parsed.tags)

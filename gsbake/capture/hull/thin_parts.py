@@ -55,6 +55,9 @@ def thin_share(posed: PosedPhotos, width: float) -> float:
             continue
         disc = round(width * 0.5 * (camera.fx + camera.fy) / max(float(np.linalg.norm(camera.centre)), 1e-6)) | 1
         solid = (mask > 127).astype(np.uint8)
+        if disc > max(mask.shape):  # a camera at the object: the whole photo is narrower, and the disc may not fit into memory
+            lost, total = lost + int(solid.sum()), total + int(solid.sum())
+            continue
         opened = cv2.morphologyEx(solid, cv2.MORPH_OPEN, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (disc, disc)))
         lost, total = lost + int(solid.sum() - opened.sum()), total + int(solid.sum())
     return lost / max(total, 1)

@@ -166,7 +166,8 @@ class Hull:
 
     def save(self, path: Path) -> None:
         """Write as a NumPy archive, the distances in half precision."""
-        np.savez_compressed(path, field=self.field.astype(np.float16), lower=self.lower, cell=self.cell)
+        largest = float(np.finfo(np.float16).max)
+        np.savez_compressed(path, field=self.field.clip(-largest, largest).astype(np.float16), lower=self.lower, cell=self.cell)
 
     @staticmethod
     def load(path: Path) -> Hull:

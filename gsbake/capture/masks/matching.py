@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from gsbake.capture.photos.decode import MAX_MEGAPIXELS, Bytes, RawPhoto, UnreadablePhotoError, apply_orientation, read_mask
-from gsbake.capture.sources import PHOTO_SUFFIXES
+from gsbake.capture.sources import list_masks
 from gsbake.errors import BadInputError
 
 
@@ -28,11 +28,11 @@ def match_masks(folder: Path, photos: dict[str, Path]) -> dict[str, Path]:
         by_stem[relative.rsplit(".", 1)[0]] = relative
     found: dict[str, Path] = {}
     unmatched = []
-    for path in sorted(p for p in folder.rglob("*") if p.is_file() and p.suffix.lower() in PHOTO_SUFFIXES and not p.name.startswith(".")):
-        stem = path.relative_to(folder).as_posix().rsplit(".", 1)[0]
+    for name in list_masks(folder):
+        path, stem = folder / name, name.rsplit(".", 1)[0]
         photo = by_name.get(stem) or by_stem.get(stem)
         if photo is None:
-            unmatched.append(path.relative_to(folder).as_posix())
+            unmatched.append(name)
         elif photo in found:
             raise BadInputError(f"The photo {photo} has two masks in {folder}, {found[photo].name} and {path.name}; remove one.")
         else:

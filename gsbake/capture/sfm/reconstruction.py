@@ -1,7 +1,8 @@
 """Structure from motion with COLMAP (Schönberger, Frahm, *Structure-from-Motion Revisited*, CVPR 2016) on one database.
 
 Steps: SIFT features, pair selection, matching, mapping in two passes. The first pass uses strict thresholds; photos that it does not
-register are matched with all others and registered to its model under relaxed thresholds. Runs in the process of `sfm.worker`.
+register are matched with all others and registered to its model under relaxed thresholds. Runs in the process of `sfm.worker`. The same
+photos and seed give the same bytes with any number of threads.
 """
 
 from __future__ import annotations
@@ -141,8 +142,12 @@ class SfmPipeline:
         with self._timed("features", len(self.names)):
             self.upsampled = self._needs_fine() if self.options.fine == "auto" else bool(self.options.fine)
             options = self._extraction()
+            pycolmap.Database.open(str(self.database)).close()
+            # Photos get their identifiers in this order; extraction would number them as its threads finish, and everything after it
+            # depends on the numbers.
             for lens in self.lenses:
                 files = [f"{name}.png" for name in lens.names]
+                pycolmap.import_images(str(self.database), str(self.folder), pycolmap.CameraMode.SINGLE, files, self._reader())
                 pycolmap.extract_features(
                     str(self.database), str(self.folder), files, pycolmap.CameraMode.SINGLE, self._reader(), options, pycolmap.Device.cpu
                 )
@@ -201,7 +206,9 @@ class SfmPipeline:
 
     def _mapper(self, relaxed: bool) -> Any:
         options = pycolmap.IncrementalPipelineOptions()
-        options.num_threads = self.threads
+        # Bundle adjustment of more than 50 000 residuals sums them in the order in which its threads finish. One thread costs little:
+        # features and matching, which are most of the time, have all.
+        options.num_threads = options.mapper.num_threads = 1
         options.random_seed = self.seed
         options.mapper.random_seed = self.seed
         options.triangulation.random_seed = self.seed
@@ -251,7 +258,7 @@ class SfmPipeline:
     def _global(self) -> Any | None:
         """The largest model of global mapping."""
         options = pycolmap.GlobalPipelineOptions()
-        options.num_threads = self.threads
+        options.num_threads = 1  # as in _mapper
         options.random_seed = self.seed
         out = self.work / "global"
         shutil.rmtree(out, ignore_errors=True)

@@ -143,7 +143,7 @@ def triangulate(job: Mapping[str, Any]) -> dict[str, Any]:
     out = Path(job["out"])
     (out / "sparse").mkdir(parents=True, exist_ok=True)
     options = pycolmap.IncrementalPipelineOptions()
-    options.num_threads = pipeline.threads
+    options.num_threads = 1  # with more, its sums depend on the order in which threads finish
     options.random_seed = pipeline.seed
     start = time.perf_counter()
     _report_progress("triangulation", 0, 1)

@@ -77,7 +77,7 @@ def integrate_normals(
     Detail below `wavelength` (world units) comes from the normals, above it from the positions. No vertex moves farther than
     `max_displacement`.
     """
-    if len(faces) == 0 or wavelength <= 0:
+    if len(faces) == 0 or wavelength <= 0 or not np.ptp(vertices[np.unique(faces)], axis=0).any():
         return vertices
     current = vertex_normals(vertices, faces)
     alignment = (current * target).sum(1)

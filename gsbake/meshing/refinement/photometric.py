@@ -16,7 +16,7 @@ import scipy.sparse as sparse
 from gsbake.meshing.cleanup import Faces, Vertices
 from gsbake.meshing.refinement.laplacian import solve_screened_laplacian
 from gsbake.meshing.refinement.normals import vertex_normals
-from gsbake.meshing.refinement.photometric_measure import Doubles, MeasurementPlan, Measurements, PhotometricViews, measure
+from gsbake.meshing.refinement.photometric_measure import Doubles, MeasurementPlan, Measurements, PhotometricViews, measure, surface_area
 
 #: Information (per square pixel) of the smoothness term per edge, and of the zero prior per area of a patch.
 SMOOTHNESS_WEIGHT, ZERO_WEIGHT = 0.4, 0.03
@@ -72,6 +72,8 @@ def refine_photometric(vertices: Vertices, faces: Faces, views: PhotometricViews
 
     A round that does not increase the NCC of most measurements is discarded and ends the refinement.
     """
+    if surface_area(vertices, faces) == 0:
+        return PhotometricResult(vertices, 0.0, 0.0, 0.0, 0.0, 0)
     plan = MeasurementPlan.make(vertices, faces, views.cameras)
     initial = measurements = measure(vertices, plan, views, threads)
     displacements: list[float] = []

@@ -78,8 +78,7 @@ class MeasurementPlan:
     @staticmethod
     def make(vertices: Vertices, faces: Faces, cameras: Sequence[Camera]) -> MeasurementPlan:
         """Plan for a mesh (unit frame, outward winding) and its cameras."""
-        corners, count = vertices[faces], len(vertices)
-        area = 0.5 * float(np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum())
+        area, count = surface_area(vertices, faces), len(vertices)
         pixel_size = float(np.median([np.linalg.norm(c.centre - vertices.mean(0)) / (0.5 * (c.fx + c.fy)) for c in cameras]))
         vertex_area = area / count / pixel_size**2
         sample = np.arange(0, count, max(1, count // PAIRING_POINTS))
@@ -113,6 +112,12 @@ class Measurements:
         keys = [s.vertex << 32 | s.photo for s in (self, other)]
         _, rows_self, rows_other = np.intersect1d(keys[0][rows], keys[1], assume_unique=True, return_indices=True)
         return rows[rows_self], rows_other
+
+
+def surface_area(vertices: Vertices, faces: Faces) -> float:
+    """Area of a mesh."""
+    corners = vertices[faces]
+    return 0.5 * float(np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum())
 
 
 def patch_means(vertices: Vertices, edges: Indices, mean_squared_distance: float) -> Vertices:

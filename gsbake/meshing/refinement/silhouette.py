@@ -158,6 +158,8 @@ def refine_silhouettes(
     `views` is called once per round and yields cameras with their masks (h, w), 0..255. With fewer than 100 contour points the mesh is
     unchanged.
     """
+    if len(faces) == 0:
+        return SilhouetteResult(vertices, float("nan"), float("nan"), 0)
     edges = unique_edges(faces)
     size = float(np.ptp(vertices, axis=0).max())
     mean_edge = float(np.linalg.norm(vertices[edges[:, 0]] - vertices[edges[:, 1]], axis=1).mean())

@@ -10,8 +10,8 @@ import trimesh
 
 from gsbake.geometry.raycast import RayCaster
 from gsbake.materials.initialisation import TRIAL_PIXELS, TRIAL_ROUGHNESS, TRIAL_STEPS, trial_cost
-from gsbake.texturing.needed import MAX_GAIN_SPREAD, MAX_TIE_POINT_SPREAD, MIN_EXPLAINED, constant_exposure, normals_agree
 from gsbake.texturing.normal_map import sample_dense_mesh, vertex_normals
+from gsbake.texturing.skip_rules import MAX_GAIN_SPREAD, MAX_TIE_POINT_SPREAD, MIN_EXPLAINED, constant_exposure, normals_agree
 
 
 @pytest.mark.parametrize(
