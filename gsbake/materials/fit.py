@@ -170,7 +170,6 @@ class MaterialFit:
         order: list[int] = []
         self._common, self._residual = np.zeros((0, 4), np.float32), np.zeros(2)
         weight = self._texel_weight(batches)
-        seen = np.flatnonzero((weight > 0.5 * weight.mean()) & (weight > 0))
         for step in range(steps if batches else 0):
             update_common = step % o.sparsity_interval == 0
             if schedule.emission and step == int(o.emission_search_at * steps):
@@ -179,9 +178,7 @@ class MaterialFit:
                 tint = not schedule.diffuse or len(self._adjustments) < o.diffuse_tint_searches
                 self._adjustments.append(self._search_light(batches, generator, tint, rough=not self._adjustments))
                 update_common = True
-            if step in {int(share * steps) for share in o.intensity_searches_at}:
-                self._limit_intensity(seen)
-            if schedule.metallic and not schedule.diffuse and step in {int(share * steps) for share in o.metal_searches_at}:
+            if not schedule.diffuse and step in {int(share * steps) for share in schedule.metal_searches_at}:
                 self._search_metals(batches)
                 update_common = True
             if step % o.visibility_interval == 0:
@@ -337,24 +334,6 @@ class MaterialFit:
         new[:, 3] = found.shifted_roughness(new[:, 3])
         self._reinitialise(at, new)
         return found
-
-    @torch.no_grad()
-    def _limit_intensity(self, seen: NDArray[np.int64]) -> None:
-        """Scale base colours up and the light down where the brightest base colours of the texels `seen` (m,) are darker than those of
-        nearly all objects: photos that are clipped at white, and metals, leave the intensity open."""
-        o = self._options
-        if not len(seen):
-            return
-        brightest = float(np.quantile(self._values[seen, :3].max(1), o.bright_quantile))
-        factor = min(o.min_bright_base_color / max(brightest, o.min_base_color), o.max_intensity_factor)
-        if factor <= 1:
-            return
-        self._light.raw.copy_(EnvironmentLight.from_radiance(self._radiance() / np.float32(factor)).raw)
-        self._adam_light.state.clear()
-        self._transport[:, INDIRECT] /= np.float32(factor)
-        new = self._values[:, :5].copy()
-        new[:, :3] = np.clip(new[:, :3] * np.float32(factor), o.min_base_color, o.base_color_range[1])
-        self._reinitialise(np.arange(len(new)), np.clip(new, 1e-6, 1 - 1e-6))
 
     @cached_property
     def _colour_filter(self) -> EdgeAwareFilter:

@@ -1,6 +1,6 @@
 """Material textures of an unwrapped mesh: read pixels, trace visibility, fit materials and light, select maps, add fine detail.
 
-The fit works on two levels (`levels`): starts are compared on the coarse one, and the fine one continues from the best.
+The fit works on two levels (`levels`): starts are compared and searches made on the coarse one, and the fine one continues from the best.
 """
 
 from __future__ import annotations
@@ -17,13 +17,14 @@ from gsbake.capture.posed_photos import PosedPhotos
 from gsbake.capture.view_dependence import is_diffuse
 from gsbake.config.schema import Bake
 from gsbake.materials.adjacency import neighbours
-from gsbake.materials.fit import FitSurface, Fitted, MaterialFit
-from gsbake.materials.initialisation import ChosenFit, best_fit, trial_fits
+from gsbake.materials.fit import FitSurface, Fitted
+from gsbake.materials.initialisation import ChosenFit
 from gsbake.materials.levels import FitLevel, InterpolatedTransport, coarse_pixels, coarse_surface
 from gsbake.materials.map_selection import drop_unneeded_maps
-from gsbake.materials.options import FitSchedule, Priors
+from gsbake.materials.options import Priors
 from gsbake.materials.pixels import PixelReader, Pixels
 from gsbake.materials.reflections import ReflectionTracer
+from gsbake.materials.two_level_fit import FitPlan, fit_two_levels
 from gsbake.materials.view_dependence import SURFACE_POINTS, MeshBrightness
 from gsbake.materials.visibility import Visibility
 from gsbake.meshing.resolution import pixel_footprint
@@ -43,8 +44,6 @@ RAY_OFFSET = 0.002
 SMOOTHING_RADIUS = 3.0
 #: Largest number of pixels of each photo that materials are fitted to.
 MAX_PIXELS = 60_000
-#: Steps of a trial on the coarse level and of the fit on the fine one, as shares of `bake.fit_iterations`.
-TRIAL_SHARE, FINE_SHARE = 0.25, 1.0
 #: Least weight of a texel, in frontal views at a texel's size, for its normal to be refined and for it to count as observed.
 MIN_OBSERVATIONS = 0.3
 
@@ -188,25 +187,17 @@ class _Fitting:
     def _fit(self, fine: FitLevel, coarse_texels: FitSurface, pixels: _PhotoPixels, diffuse: bool) -> ChosenFit:
         """Compare starts on the coarse level, and fit the `fine` one from the best; `diffuse`: without specular reflection."""
         settings, monitor, light_size = self.settings.bake, self.monitor, self.settings.light_size
-        priors, reduce = Priors.of(settings), partial(coarse_pixels, texture=self.half)
+        reduce = partial(coarse_pixels, texture=self.half)
         coarse = FitLevel(coarse_texels, [*map(reduce, fine.fitted)], [*map(reduce, fine.held_out)])
-        trial_steps, steps = (max(1, round(share * settings.fit_iterations)) for share in (TRIAL_SHARE, FINE_SHARE))
 
-        def each(done: int, total: int) -> None:
+        def each(name: str, done: int, total: int) -> None:
             monitor.check_stop()
-            monitor.progress(done, total, "material fit" if total == steps else "trial fits")
-
-        def make(metallic: float, roughness: float) -> MaterialFit:
-            return MaterialFit(coarse.surface, light_size, priors, roughness, metallic)
+            monitor.progress(done, total, name)
 
         started = time.perf_counter()
-        trials = trial_fits(make, coarse, trial_steps, self.seed, diffuse, each)
+        plan = FitPlan(settings.fit_iterations, light_size, Priors.of(settings), self.seed, diffuse)
+        choice = fit_two_levels(coarse, fine, self.half, plan, each)
         seconds = time.perf_counter() - started
-
-        def refine(trial: MaterialFit) -> MaterialFit:
-            return trial.continued_on(fine.surface, self.half.up)
-
-        choice = best_fit(trials, refine, fine, FitSchedule(steps, self.seed, diffuse=diffuse), each)
         self._report(choice, pixels, 0.0 if diffuse else seconds)
         return choice
 

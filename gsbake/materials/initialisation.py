@@ -4,7 +4,7 @@ Gradient steps find the optimum near their start. A surface that starts too roug
 colour; one that starts dielectric explains a metal's reflections by a diffuse base colour under a light of their colour, and stays there.
 So short fits on the coarse level, from all-dielectric and all-metal starts of several roughnesses, are compared on photos that they were
 not fitted to. On the way `MaterialFit` decides texel by texel between metal and dielectric, so either start can end as any mixture. The
-fine level continues from the best of them, and from the best of the other kind as well where it is close.
+best of them is continued with all searches, and so is the best of the other kind where it is close; all on the coarse level.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from gsbake.materials.options import FitSchedule
 STARTS = ((0.05, 0.2), (0.05, 0.45), (0.05, 0.8), (0.9, 0.2), (0.9, 0.45))
 #: Start of a diffuse object, and without validation photos.
 DIFFUSE_START, DEFAULT_START = (0.05, 0.8), (0.05, 0.45)
-#: The best start of the other kind, dielectric or metal, is fitted in full as well when it is within this many dB of the best.
+#: The best start of the other kind, dielectric or metal, is continued as well when it is within this many dB of the best.
 CANDIDATE_MARGIN = 1.0
 
 #: Initial metallic and roughness.
@@ -33,7 +33,8 @@ Each = Callable[[int, int], None]
 
 @dataclass(frozen=True)
 class ChosenFit:
-    """The chosen `fit` with its result `fitted`, its initial `metallic` and `roughness`, the number of full `fits`, and the `evidence`."""
+    """The chosen `fit` with its result `fitted`, its initial `metallic` and `roughness`, the number of continued `fits`, and the
+    `evidence`."""
 
     fit: MaterialFit
     fitted: Fitted
@@ -57,25 +58,16 @@ def trial_fits(make: MakeFit, level: FitLevel, steps: int, seed: int, diffuse: b
     return found
 
 
-def best_fit(
-    trials: dict[Start, tuple[MaterialFit, Fitted]],
-    refine: Callable[[MaterialFit], MaterialFit],
-    level: FitLevel,
-    plan: FitSchedule,
-    each: Each,
-) -> ChosenFit:
-    """The full fit on the fine `level` with the best validation PSNR, continued by `refine` from the best of the `trials`."""
+def best_fit(trials: dict[Start, tuple[MaterialFit, Fitted]], level: FitLevel, plan: FitSchedule, each: Each) -> ChosenFit:
+    """The fit with the best validation PSNR on `level` of those that continue the best of the `trials` by `plan`."""
     scores = {start: fitted.held_out_psnr or 0.0 for start, (_, fitted) in trials.items()}
     evidence = _scores(scores) if len(scores) > 1 else ("diffuse object" if plan.diffuse else "no validation photos")
-    found: dict[Start, tuple[MaterialFit, Fitted]] = {}
-    for start in candidates(scores):
-        fit = refine(trials[start][0])
-        found[start] = fit, fit.run(level.fitted, level.held_out, plan, each)
-    full = {start: fitted.held_out_psnr or 0.0 for start, (_, fitted) in found.items()}
-    best = max(full, key=lambda start: full[start])
-    if len(full) > 1:
-        evidence += f"; full fits: {_scores(full)}"
-    return ChosenFit(*found[best], *best, len(full), evidence)
+    found = {start: (trials[start][0], trials[start][0].run(level.fitted, level.held_out, plan, each)) for start in candidates(scores)}
+    continued = {start: fitted.held_out_psnr or 0.0 for start, (_, fitted) in found.items()}
+    best = max(continued, key=lambda start: continued[start])
+    if len(continued) > 1:
+        evidence += f"; continued: {_scores(continued)}"
+    return ChosenFit(*found[best], *best, len(continued), evidence)
 
 
 def _scores(scores: dict[Start, float]) -> str:

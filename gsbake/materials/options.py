@@ -27,14 +27,14 @@ class Priors:
 class FitSchedule:
     """What a fit does in `iterations` steps of one photo each, whose order follows from `seed`.
 
-    Without `metallic` no metals are searched for, nor on an object that is `diffuse`. Without `emission` nothing is emissive, without
+    Metals are searched for at the shares `metal_searches_at` of all steps, but not on an object that is `diffuse`. Without `emission` nothing is emissive, without
     `intensity` the light's intensity is left to gradient steps, without `sparsity` the sparsity prior is off. `rate` is a factor on all
     learning rates.
     """
 
     iterations: int
     seed: int = 0
-    metallic: bool = True
+    metal_searches_at: tuple[float, ...] = (0.3, 0.55, 0.8)
     emission: bool = True
     intensity: bool = True
     sparsity: bool = True
@@ -86,8 +86,6 @@ class FitOptions:
     #: When emissive regions are searched for: the light must be known.
     emission_search_at: float = 0.5
 
-    #: When metals are searched for: again as the light gets sharper.
-    metal_searches_at: tuple[float, ...] = (0.3, 0.55, 0.8)
     #: Pixels per texel, of all photos together, that such a search uses: neighbouring texels decide together.
     metal_pixels: int = 3
     #: Metallic of texels detected as metal, from where gradient steps go on.
@@ -100,11 +98,6 @@ class FitOptions:
     #: Pixels that such a search uses at most, and the least share of dielectric texels: reflections of metal do not tell the intensity.
     intensity_pixels: int = 100_000
     min_dielectric_share: float = 0.5
-    #: The strongest channel of base colour at this quantile of the texels is at least so bright: few objects are dark all over; and the
-    #: largest correction at once.
-    bright_quantile: float = 0.95
-    min_bright_base_color: float = 0.45
-    max_intensity_factor: float = 4.0
     #: Texels below this metallic take part as dielectric.
     max_dielectric_metallic: float = 0.3
     #: Searches that include the light's tint on a diffuse object: its reflections hardly determine the tint, which then drifts.

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from gsbake.imaging.srgb import decode
 from gsbake.materials import fit_kernel
-from gsbake.materials.metallic import PhotoSamples
+from gsbake.materials.metallic import NORMAL_ERROR, PhotoSamples, Shader
 from gsbake.materials.pixels import Pixels
 from gsbake.shading import brdf
 from gsbake.shading.light_tables import LightTables
@@ -102,16 +102,21 @@ class PhotoBatch:
 
     def samples(self, normal_offset: Floats, tables: KernelTables, transport: Floats) -> PhotoSamples:
         """The pixels for searches over all photos; each counts for its dominant texel."""
-        texel, outgoing = self.dominant_texel, np.ascontiguousarray(transport[:, OUTGOING])
         normal = self.normal + interpolate(normal_offset, self.texel, self.bilinear)
         local = interpolate(transport[:, : OUTGOING.start], self.texel, self.bilinear)
+        light = tables, local, np.ascontiguousarray(transport[:, OUTGOING])
+        tilted = tuple(self._shader(n, *light) for n in _tilted(normal))
+        return PhotoSamples(self.dominant_texel, decode(self.colour), self.weight, self.block, self._shader(normal, *light), tilted)
+
+    def _shader(self, normal: Floats, tables: KernelTables, local: Floats, outgoing: Floats) -> Shader:
+        """The function that shades the pixels with the `normal` (n, 3) and the light transport `local` (n, 8) and `outgoing` (texels, 3)."""
         last: list[tuple[NDArray[np.float32], tuple[Floats, Floats, Floats]]] = []
 
         def parts(roughness: NDArray[np.float32]) -> tuple[Floats, Floats, Floats]:
             if not last or last[0][0] is not roughness:
                 out = np.empty_like(normal), np.empty_like(normal), np.empty_like(normal)
                 fit_kernel.linear_shading(
-                    texel, normal, self.view, self.reflected, local, outgoing, np.ascontiguousarray(roughness, np.float32),
+                    self.dominant_texel, normal, self.view, self.reflected, local, outgoing, np.ascontiguousarray(roughness, np.float32),
                     *tables.arrays, *out,
                 )  # fmt: skip
                 last[:] = [(roughness, out)]
@@ -123,7 +128,17 @@ class PhotoBatch:
             f0 = np.float32(0.04) * (1 - m) + m * b
             return (1 - m) * b * diffuse + f0 * scaled + constant
 
-        return PhotoSamples(texel, decode(self.colour), self.weight, self.block, shaded)
+        return shaded
+
+
+def _tilted(normal: Floats) -> tuple[Floats, Floats]:
+    """The `normal` (n, 3), of any length, tilted by `NORMAL_ERROR` along two tangents."""
+    unit = normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-20)
+    axis = np.where(np.abs(unit[:, :1]) < 0.7, np.array([[1, 0, 0]]), np.array([[0, 1, 0]])).astype(np.float32)
+    first = np.cross(unit, axis)
+    first /= np.maximum(np.linalg.norm(first, axis=1, keepdims=True), 1e-20)
+    step = np.float32(NORMAL_ERROR)
+    return unit + step * first, unit + step * np.cross(unit, first)
 
 
 def interpolate(values: NDArray[Any], texel: NDArray[Any], bilinear: Floats) -> Floats:

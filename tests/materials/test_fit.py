@@ -159,7 +159,7 @@ def test_base_colour_and_roughness_are_recovered(glossy: Scene) -> None:
 
 
 def test_all_metal_object_has_no_light_adjustment(glossy: Scene) -> None:
-    fitted = glossy.fit(0.2, metallic=0.9).run(glossy.photos, [], FitSchedule(4, metallic=False, emission=False))
+    fitted = glossy.fit(0.2, metallic=0.9).run(glossy.photos, [], FitSchedule(4, metal_searches_at=(), emission=False))
     assert len(fitted.light_adjustments) > 0 and all(adjustment.improvement == 0 for adjustment in fitted.light_adjustments)
 
 
@@ -215,7 +215,7 @@ def test_metal_is_found_from_the_best_start() -> None:
     fitted = scene.fit(roughness, metallic=metallic).run(scene.photos[2:], scene.photos[:2], FitSchedule(200))
     known = fitted.weight > 0.3
     assert (fitted.values[known, 4] > 0.5).mean() > 0.9
-    dielectric = scene.fit(0.2).run(scene.photos[2:], scene.photos[:2], FitSchedule(200, metallic=False))
+    dielectric = scene.fit(0.2).run(scene.photos[2:], scene.photos[:2], FitSchedule(200, metal_searches_at=()))
     assert fitted.held_out_psnr is not None and dielectric.held_out_psnr is not None
     assert fitted.held_out_psnr > dielectric.held_out_psnr + 1
 
@@ -232,7 +232,7 @@ def test_the_fine_level_continues_from_the_coarse_one(glossy: Scene) -> None:
     distance = np.linalg.norm(coarse.position[parent[known]] - fine.position[known], axis=1)
     assert known.mean() > 0.9 and distance.max() < 0.2  # texels are about 0.1 wide
     fit = MaterialFit(coarse, 16, WEAK_PRIORS, 0.2)
-    fitted = fit.run(photos[2:], photos[:2], FitSchedule(150, metallic=False, emission=False, intensity=False))
+    fitted = fit.run(photos[2:], photos[:2], FitSchedule(150, metal_searches_at=(), emission=False, intensity=False))
     continued = fit.continued_on(fine, texture.up).run(glossy.photos[2:], glossy.photos[:2], FitSchedule(1, rate=1e-6, intensity=False))
     np.testing.assert_allclose(np.median(continued.values, 0), np.median(fitted.values, 0), atol=0.03)
     scratch = glossy.fit(0.2).run(glossy.photos[2:], glossy.photos[:2], FitSchedule(1, rate=1e-6, intensity=False))

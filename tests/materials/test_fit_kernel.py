@@ -93,7 +93,7 @@ def test_linear_shading_is_the_shading_at_both_ends() -> None:
     torch_batch = Batch.of(replace(case.pixels, bilinear=batch.bilinear), torch.as_tensor(case.normal))
     rough = np.ascontiguousarray(case.values[:, 3])
     for metallic in (0.0, 1.0):
-        shading = LinearShading.of(samples, rough, metallic)
+        shading = LinearShading.of(samples.shade, rough, metallic)
         values = case.values[:, :5].copy()
         values[:, 4] = metallic
         inputs = torch.as_tensor(values), torch.as_tensor(case.values[:, 5:])

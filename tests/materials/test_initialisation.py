@@ -42,15 +42,17 @@ def nothing(done: int, total: int) -> None:
 
 def chosen(trial_scores: dict[Start, float], full_scores: dict[Start, float]) -> tuple[ChosenFit, list[FitSchedule]]:
     runs: list[FitSchedule] = []
-    trials: Any = {start: (start, SimpleNamespace(held_out_psnr=score)) for start, score in trial_scores.items()}
-    return best_fit(trials, lambda start: Fit(full_scores[start], runs), level(), FitSchedule(10), nothing), runs  # type: ignore[arg-type,return-value]
+    trials: Any = {
+        start: (Fit(full_scores.get(start, 0.0), runs), SimpleNamespace(held_out_psnr=score)) for start, score in trial_scores.items()
+    }
+    return best_fit(trials, level(), FitSchedule(10), nothing), runs
 
 
 def test_all_starts_are_tried_without_searches_for_the_light() -> None:
     runs: list[FitSchedule] = []
     trials = trial_fits(lambda m, r: Fit(10 * m + r, runs), level(), 7, 1, False, nothing)  # type: ignore[arg-type,return-value]
     assert tuple(trials) == STARTS and len(runs) == len(STARTS)
-    assert all(run.iterations == 7 and run.metallic and not run.intensity and not run.emission for run in runs)
+    assert all(run.iterations == 7 and run.metal_searches_at and not run.intensity and not run.emission for run in runs)
     assert {m > 0.5 for m, _ in STARTS} == {True, False}
 
 
@@ -60,14 +62,14 @@ def test_one_start_where_nothing_is_compared(diffuse: bool, held_out: bool, star
     assert tuple(trials) == (start,)
 
 
-def test_close_starts_are_fitted_in_full_and_compared() -> None:
+def test_close_starts_are_continued_and_compared() -> None:
     near = 21.0 - 0.5 * CANDIDATE_MARGIN
     choice, runs = chosen({STARTS[0]: 21.0, STARTS[3]: near, STARTS[1]: 15.0}, {STARTS[0]: 22.0, STARTS[3]: 23.0})
     assert (choice.metallic, choice.roughness) == STARTS[3] and choice.fits == len(runs) == 2
-    assert "full fits: 22.00 dB" in choice.evidence and "21.00 dB from metallic 0.05 roughness 0.2" in choice.evidence
+    assert "continued: 22.00 dB" in choice.evidence and "21.00 dB from metallic 0.05 roughness 0.2" in choice.evidence
 
 
-def test_a_clear_winner_is_the_only_full_fit() -> None:
+def test_only_a_clear_winner_is_continued() -> None:
     choice, runs = chosen({STARTS[0]: 21.0, STARTS[1]: 20.9, STARTS[3]: 21.1 + CANDIDATE_MARGIN}, {STARTS[3]: 20.0})
     assert (choice.metallic, choice.roughness) == STARTS[3] and len(runs) == 1
 
