@@ -298,7 +298,7 @@ class MaterialFit:
         o, values = self._options, self._values
         dielectric = (values[:, 4] < o.max_dielectric_metallic) & self._non_emissive()
         if dielectric.mean() < o.min_dielectric_share:
-            return LightAdjustment(np.ones(3), 1.0, 0.0, 0.0)
+            return self._anchor_metals()
         share = min(1.0, o.intensity_pixels / max(1, sum(map(len, batches))))
         chosen = dielectric & (generator.random(len(dielectric)) < share)
         subset = [part for b in batches if len(part := b.select(chosen))]
@@ -335,21 +335,37 @@ class MaterialFit:
         self._reinitialise(at, new)
         return found
 
+    def _anchor_metals(self) -> LightAdjustment:
+        """Scale the light and base colours so that metals are as bright as metals usually are: their reflections leave the scale open."""
+        o, metal = self._options, self._values[:, 4] > 0.5
+        if not metal.any():
+            return LightAdjustment(np.ones(3), 1.0, 0.0, 0.0)
+        bright = float(np.quantile(self._values[metal, :3].max(1), o.metal_quantile))
+        factor = np.clip(o.metal_base_color / max(bright, o.min_base_color), 1 / o.max_metal_factor, o.max_metal_factor)
+        self._light.raw.copy_(EnvironmentLight.from_radiance(self._radiance() / np.float32(factor)).raw)
+        self._adam_light.state.clear()
+        new = self._values[:, :5].copy()
+        new[:, :3] = np.clip(new[:, :3] * np.float32(factor), o.min_base_color, o.base_color_range[1])
+        self._reinitialise(np.arange(len(new)), np.clip(new, 1e-6, 1 - 1e-6))
+        self._update_transport()
+        return LightAdjustment(np.full(3, 1 / factor), 1.0, 0.0, 0.0)
+
     @cached_property
     def _colour_filter(self) -> EdgeAwareFilter:
         """The edge-aware filter of the initial base colours; built on first use, as trials need none."""
         return EdgeAwareFilter(self._surface.texels, self._surface.pairs, self._surface.base_color)
 
-    def _samples(self, batches: list[PhotoBatch]) -> list[PhotoSamples]:
-        """All pixels under the present light."""
+    def _samples(self, batches: list[PhotoBatch], tilted: bool = False) -> list[PhotoSamples]:
+        """All pixels under the present light, with `tilted` normals as well."""
         tables = self._tables()
-        return [b.samples(self._values[:, 5:], tables, self._transport) for b in batches]
+        return [b.samples(self._values[:, 5:], tables, self._transport, tilted) for b in batches]
 
     def _search_metals(self, batches: list[PhotoBatch]) -> None:
         """Reinitialise texels that are detected as metal, and from a metallic start those that are dielectric."""
         o = self._options
         step = max(1, sum(map(len, batches)) // (o.metal_pixels * len(self._raw)))
-        found = find_metals(self._samples([batch.every(step) for batch in batches]), self._values[:, 3].copy(), self._colour_filter)
+        samples = self._samples([batch.every(step) for batch in batches], tilted=True)
+        found = find_metals(samples, self._values[:, 3].copy(), self._colour_filter)
         kinds = [(found.texel, found.base, found.roughness, o.detected_metallic)]
         if self._metal_start:
             kinds.append((*found.dielectric, o.detected_dielectric))

@@ -18,6 +18,8 @@ from gsbake.materials.options import FitSchedule
 
 #: Compared starts: metallic and roughness.
 STARTS = ((0.05, 0.2), (0.05, 0.45), (0.05, 0.8), (0.9, 0.2), (0.9, 0.45))
+#: When trials search for metals, as shares of their steps.
+METAL_SEARCHES_AT = (0.4, 0.8)
 #: Start of a diffuse object, and without validation photos.
 DIFFUSE_START, DEFAULT_START = (0.05, 0.8), (0.05, 0.45)
 #: The best start of the other kind, dielectric or metal, is continued as well when it is within this many dB of the best.
@@ -50,7 +52,7 @@ def trial_fits(make: MakeFit, level: FitLevel, steps: int, seed: int, diffuse: b
     starts: tuple[Start, ...] = STARTS
     if diffuse or not any(map(len, level.held_out)):
         starts = (DIFFUSE_START if diffuse else DEFAULT_START,)
-    plan = FitSchedule(steps, seed, emission=False, intensity=False, sparsity=False, diffuse=diffuse)
+    plan = FitSchedule(steps, seed, METAL_SEARCHES_AT, emission=False, intensity=False, sparsity=False, diffuse=diffuse)
     found: dict[Start, tuple[MaterialFit, Fitted]] = {}
     for start in starts:
         fit = make(*start)

@@ -98,6 +98,10 @@ class FitOptions:
     #: Pixels that such a search uses at most, and the least share of dielectric texels: reflections of metal do not tell the intensity.
     intensity_pixels: int = 100_000
     min_dielectric_share: float = 0.5
+    #: Else this quantile of the strongest channel of metals' base colours is set to the following value, changed at most by the factor.
+    metal_quantile: float = 0.5
+    metal_base_color: float = 0.4
+    max_metal_factor: float = 4.0
     #: Texels below this metallic take part as dielectric.
     max_dielectric_metallic: float = 0.3
     #: Searches that include the light's tint on a diffuse object: its reflections hardly determine the tint, which then drifts.

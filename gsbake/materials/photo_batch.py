@@ -100,13 +100,13 @@ class PhotoBatch:
             self.normal[keep], self.reflected[keep] if len(self.reflected) else self.reflected,
         )  # fmt: skip
 
-    def samples(self, normal_offset: Floats, tables: KernelTables, transport: Floats) -> PhotoSamples:
-        """The pixels for searches over all photos; each counts for its dominant texel."""
+    def samples(self, normal_offset: Floats, tables: KernelTables, transport: Floats, tilted: bool = False) -> PhotoSamples:
+        """The pixels for searches over all photos, with `tilted` normals as well; each counts for its dominant texel."""
         normal = self.normal + interpolate(normal_offset, self.texel, self.bilinear)
         local = interpolate(transport[:, : OUTGOING.start], self.texel, self.bilinear)
         light = tables, local, np.ascontiguousarray(transport[:, OUTGOING])
-        tilted = tuple(self._shader(n, *light) for n in _tilted(normal))
-        return PhotoSamples(self.dominant_texel, decode(self.colour), self.weight, self.block, self._shader(normal, *light), tilted)
+        others = tuple(self._shader(n, *light) for n in _tilted(normal)) if tilted else ()
+        return PhotoSamples(self.dominant_texel, decode(self.colour), self.weight, self.block, self._shader(normal, *light), others)
 
     def _shader(self, normal: Floats, tables: KernelTables, local: Floats, outgoing: Floats) -> Shader:
         """The function that shades the pixels with the `normal` (n, 3) and the light transport `local` (n, 8) and `outgoing` (texels, 3)."""
