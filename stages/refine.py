@@ -22,7 +22,7 @@ def run(ctx: Context) -> dict[str, Any]:
 
 STAGE = Stage(
     name="refine",
-    version=2,
+    version=3,
     title="Surfel refinement",
     run=run,
     summary="{surfels} surfels, {steps} steps, {psnr:dB} on held-out photos",

@@ -3,7 +3,8 @@
 `shade_and_differentiate` reads the texels of each pixel, shades it (split sum, light transport, reflections of the object), compares it
 with the photo, and writes the gradient with respect to the pixel's material; pixels are independent. Gradients of the light's table are
 summed in a fixed number of chunks. `gather_gradient` adds the pixels' gradients up per texel, from a list of each texel's pixels, and
-`adam_step` adds the priors and updates each texel from its neighbours' old values. Every sum has a fixed order: results do not depend on threads.
+`adam_step` adds the priors and updates each texel from its neighbours' old values. Every sum has a fixed order: results do not depend on
+threads.
 
 All literals are float32: a float64 constant would widen the whole expression. The fast-math flags omit `nnan`, because the index clamps
 must hold for NaN.

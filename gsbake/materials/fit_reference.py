@@ -108,8 +108,8 @@ def prior_loss(
     common_weight: Tensor,
 ) -> Tensor:
     """The priors, summed over texels: |Δ| of material `values` (n, 5) and Δ² of `normal_offset` (n, 3) between neighbouring `pairs` (m, 2)
-    with the weights `smoothness` (8,); `mean_weight` (5,) times the values, of base colour the diffuse part; squared normal offset; squared distance of sRGB base
-    colour and roughness to the `common` materials (n, 4) with half of `common_weight` (4,)."""
+    with the weights `smoothness` (8,); `mean_weight` (5,) times the values, of base colour the diffuse part; squared normal offset; squared
+    distance of sRGB base colour and roughness to the `common` materials (n, 4) with half of `common_weight` (4,)."""
     change = values[pairs[:, 0]] - values[pairs[:, 1]]
     bend = normal_offset[pairs[:, 0]] - normal_offset[pairs[:, 1]]
     distance = torch.cat([linear_to_srgb(values[:, :3]), values[:, 3:4]], 1) - common

@@ -30,7 +30,7 @@ from gsbake.materials.visibility import Visibility
 from gsbake.meshing.resolution import pixel_footprint
 from gsbake.monitor import Monitor, Rule, decide_skip, skips
 from gsbake.shading.environment import EnvironmentLight
-from gsbake.surfels.training.views import held_out
+from gsbake.surfels.training.views import held_out, test_photos, validation_photos
 from gsbake.texturing.normal_map import DenseSamples
 from gsbake.texturing.projection import ProjectedTexture
 from gsbake.texturing.resampling import MIN_SIZE, CoarseTexture
@@ -92,10 +92,12 @@ def fit_materials(
 
 @dataclass(frozen=True)
 class _PhotoPixels:
-    """Pixels of the fitted and of the held-out photos, whether the surface is `diffuse`, and the `evidence`."""
+    """Pixels of the photos to fit, of those that decisions look at and of those that nothing looks at, whether the surface is `diffuse`,
+    and the `evidence`."""
 
     fitted: list[Pixels]
-    held_out: list[Pixels]
+    validation: list[Pixels]
+    test: list[Pixels]
     diffuse: bool
     evidence: str
 
@@ -121,9 +123,9 @@ class _Fitting:
         diffuse = skips(self.settings.specular, pixels.diffuse)
         if fine.transport is not None and self.settings.bake.visibility == "reflections" and not diffuse:
             pixels = self._trace_reflections(pixels, fine)
-        choice = self._fit(FitLevel(fine, pixels.fitted, pixels.held_out), coarse, pixels, diffuse)
+        choice = self._fit(fine, coarse, pixels, diffuse)
         values = self._full_texture(choice, pixels)
-        return self._result(choice.fitted, values, footprint, pixels.fitted)
+        return self._result(choice, values, footprint, pixels)
 
     @property
     def _ray_offset(self) -> float:
@@ -146,24 +148,27 @@ class _Fitting:
         """Read the pixels of all photos, exposure gains divided out, and measure view dependence."""
         surface, settings = self.surface, self.settings
         reader = PixelReader(surface.atlas_caster, surface.atlas.uv, self.coarse.texels, surface.diagonal)
-        held_out_views = set(held_out(len(self.posed), settings.holdout))
+        count = len(self.posed)
+        validation, test = (set(roles(count, settings.holdout)) for roles in (validation_photos, test_photos))
         points = slice(None, None, max(1, len(surface.texel_position) // SURFACE_POINTS))
         brightness = MeshBrightness(surface.texel_position[points], surface.texel_normal[points], surface.caster, surface.diagonal)
-        fitted: list[Pixels] = []
-        validation: list[Pixels] = []
-        for index in range(len(self.posed)):
+        pixels: list[Pixels] = []
+        for index in range(count):
             self.monitor.check_stop()
             view = self.posed.view(index, settings.bake.fit_size)
             brightness.add(view)
-            pixels = reader.read(view.camera, view.rgb, view.mask).subsampled(MAX_PIXELS)
-            (validation if index in held_out_views else fitted).append(pixels.without_gain(self.projected.gains[index]))
-        return _PhotoPixels(fitted, validation, *is_diffuse(*brightness.statistics()))
+            read = reader.read(view.camera, view.rgb, view.mask).subsampled(MAX_PIXELS)
+            pixels.append(read.without_gain(self.projected.gains[index]))
+        fitted = set(range(count)) - validation - test
+        photos, chosen, untouched = ([pixels[i] for i in sorted(role)] for role in (fitted, validation, test))
+        return _PhotoPixels(photos, chosen, untouched, *is_diffuse(*brightness.statistics()))
 
     def _trace_reflections(self, pixels: _PhotoPixels, texels: FitSurface) -> _PhotoPixels:
         """The pixels with the texels that their reflected rays hit."""
         caster, uv = self.surface.atlas_caster, self.surface.atlas.uv
         tracer = ReflectionTracer(caster, uv, texels.texels, texels.position, texels.normal, self._ray_offset)
-        return replace(pixels, fitted=[*map(tracer.trace, pixels.fitted)], held_out=[*map(tracer.trace, pixels.held_out)])
+        fitted, validation, test = ([*map(tracer.trace, photos)] for photos in (pixels.fitted, pixels.validation, pixels.test))
+        return replace(pixels, fitted=fitted, validation=validation, test=test)
 
     def _surfaces(self) -> tuple[FitSurface, FitSurface]:
         """The texels of the fine and of the coarse level: geometry, ambient occlusion, light transport and initial base colour."""
@@ -184,11 +189,18 @@ class _Fitting:
         )  # fmt: skip
         return replace(fine, transport=InterpolatedTransport(transport, self.half)), replace(coarse, transport=transport)
 
-    def _fit(self, fine: FitLevel, coarse_texels: FitSurface, pixels: _PhotoPixels, diffuse: bool) -> ChosenFit:
-        """Compare starts on the coarse level, and fit the `fine` one from the best; `diffuse`: without specular reflection."""
+    def _fit(self, fine_texels: FitSurface, coarse_texels: FitSurface, pixels: _PhotoPixels, diffuse: bool) -> ChosenFit:
+        """Compare starts on the coarse level, and fit the fine one from the best; `diffuse`: without specular reflection.
+
+        Few photos are held out, so the coarse level adds some of those to fit to the validation photos; the fine level fits them.
+        """
         settings, monitor, light_size = self.settings.bake, self.monitor, self.settings.light_size
         reduce = partial(coarse_pixels, texture=self.half)
-        coarse = FitLevel(coarse_texels, [*map(reduce, fine.fitted)], [*map(reduce, fine.held_out)])
+        photos, validation = [*map(reduce, pixels.fitted)], [*map(reduce, pixels.validation)]
+        added = set(held_out(len(photos), self.settings.holdout)) if validation else set()
+        kept = [p for i, p in enumerate(photos) if i not in added]
+        coarse = FitLevel(coarse_texels, kept, validation + [photos[i] for i in sorted(added)])
+        fine = FitLevel(fine_texels, pixels.fitted, pixels.validation)
 
         def each(name: str, done: int, total: int) -> None:
             monitor.check_stop()
@@ -215,7 +227,7 @@ class _Fitting:
         """The fitted values at all texels (n, 5 or 8), without the maps that are not needed, with fine detail."""
         coarse, settings, fit, fitted = self.coarse, self.settings, choice.fit, choice.fitted
         detail = coarse.detail(self.projected.values)
-        validation = pixels.held_out if any(map(len, pixels.held_out)) else pixels.fitted
+        validation = pixels.validation if any(map(len, pixels.validation)) else pixels.fitted
         rules = {"metallic_map": settings.metallic_map, "roughness_map": settings.roughness_map}
 
         def decide(name: str, holds: bool, evidence: str, skipped: str, done: str) -> bool:
@@ -228,15 +240,15 @@ class _Fitting:
             values = np.concatenate([values, coarse.up(fitted.emission) * detail], 1)
         return values
 
-    def _result(self, fitted: Fitted, values: Floats, footprint: float, photos: list[Pixels]) -> FittedTextures:
-        """Textures, refined normals, light and figures."""
-        coarse = self.coarse
+    def _result(self, choice: ChosenFit, values: Floats, footprint: float, pixels: _PhotoPixels) -> FittedTextures:
+        """Textures, refined normals, light and figures; `fit_psnr` is that on test photos."""
+        coarse, fitted = self.coarse, choice.fitted
         observed = coarse.up(fitted.weight[:, None])[:, 0] > MIN_OBSERVATIONS * (coarse.edge / footprint) ** 2
         normal = self.detail.normal + np.where(observed[:, None], coarse.up(fitted.normal_offset), 0)
         normal /= np.linalg.norm(normal, axis=1, keepdims=True)
         figures: dict[str, Any] = {
-            "fit_psnr": fitted.held_out_psnr,
-            "fit_pixels": sum(map(len, photos)),
+            "fit_psnr": choice.fit.psnr(pixels.test),
+            "fit_pixels": sum(map(len, pixels.fitted)),
             "fit_texels": len(coarse.texels),
             "fit_metal_texels": _metal_count(fitted),
             "fit_emissive_regions": fitted.emissive_regions,

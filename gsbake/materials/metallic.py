@@ -15,8 +15,8 @@ outweighing the other pixels. Colours are clipped at white: displays are no brig
 
 A metal must reflect clearly more of every channel than the 4 % of dielectrics, else glossy black would pass for a dark metal: clean metals
 reflect a third or more (gold's blue is .34: Lagarde & de Rousiers, *Moving Frostbite to PBR*, 2014), rusty, anodised and dirty ones go down
-to .1. A texel has too few pixels to decide by itself: likelihoods are averaged over neighbours of similar colour (`bilateral`), and isolated
-texels follow the majority around them.
+to .1. A texel has too few pixels to decide by itself: likelihoods are averaged over neighbours of similar colour (`bilateral`), and
+isolated texels follow the majority around them.
 """
 
 from __future__ import annotations

@@ -27,9 +27,9 @@ class Priors:
 class FitSchedule:
     """What a fit does in `iterations` steps of one photo each, whose order follows from `seed`.
 
-    Metals are searched for at the shares `metal_searches_at` of all steps, but not on an object that is `diffuse`. Without `emission` nothing is emissive, without
-    `intensity` the light's intensity is left to gradient steps, without `sparsity` the sparsity prior is off. `rate` is a factor on all
-    learning rates.
+    Metals are searched for at the shares `metal_searches_at` of all steps, but not on an object that is `diffuse`. Without `emission`
+    nothing is emissive, without `intensity` the light's intensity is left to gradient steps, without `sparsity` the sparsity prior is off.
+    `rate` is a factor on all learning rates.
     """
 
     iterations: int

@@ -109,7 +109,7 @@ class PhotoBatch:
         return PhotoSamples(self.dominant_texel, decode(self.colour), self.weight, self.block, self._shader(normal, *light), others)
 
     def _shader(self, normal: Floats, tables: KernelTables, local: Floats, outgoing: Floats) -> Shader:
-        """The function that shades the pixels with the `normal` (n, 3) and the light transport `local` (n, 8) and `outgoing` (texels, 3)."""
+        """The function that shades the pixels with the `normal` (n, 3) and light transport `local` (n, 8) and `outgoing` (texels, 3)."""
         last: list[tuple[NDArray[np.float32], tuple[Floats, Floats, Floats]]] = []
 
         def parts(roughness: NDArray[np.float32]) -> tuple[Floats, Floats, Floats]:

@@ -99,7 +99,7 @@ class Aligner:
         return align.make_scene(t.surfels, t.light, t.masked, t.background)
 
     def measure(self, what: CorrectionKinds) -> AlignmentResult:
-        """Align held-out photos (training photos where none is held out) on half of their pixels and compare the other half."""
+        """Align validation photos (training photos where there are none) on half of their pixels and compare the other half."""
         t = self.trainer
         pool = t.validation_indices or t.training_indices
         scene, rows = self._scene(), []
