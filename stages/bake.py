@@ -23,7 +23,7 @@ STAGE = Stage(
     version=17,
     title="Textures",
     run=run,
-    summary="{charts} charts, {texels} texels, {fit_psnr:dB} on held-out photos",
+    summary="{charts} charts, {texels} texels, {fit_psnr:dB} on test photos",
     needs=("poses", "refine", "mesh"),
     settings=(
         "bake.*", "light.size", "train.max_size", "train.holdout", "skip.exposure_equalisation", "skip.normal_map", "skip.specular",
