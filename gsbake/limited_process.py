@@ -112,6 +112,7 @@ class ParserProcess:
 
 def serve(answer: Callable[[dict[str, Any]], dict[str, Any]]) -> None:
     """Main of a `ParserProcess` (`… PARENT HANDLE`): answer the requests on stdin until it closes, or until the parent ends."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle; it ends its children
     exit_with_parent(int(sys.argv[1]))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     with os.fdopen(int(sys.argv[2]), "wb") as sink:

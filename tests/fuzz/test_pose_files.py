@@ -68,7 +68,8 @@ def headers() -> st.SearchStrategy[bytes]:
     """Hand-made headers of .npy files, with shapes, types and orders that no array has."""
     fields = st.fixed_dictionaries({
         "descr": st.one_of(st.sampled_from(["<f8", "<f4", "|O", "<U4", "|V8", "<M8[s]", ">i2", "|b1", "<c16"]), json_values),
-        "fortran_order": st.one_of(st.booleans(), json_values), "shape": st.one_of(st.tuples(edges, edges), st.lists(edges, max_size=3), json_values),
+        "fortran_order": st.one_of(st.booleans(), json_values),
+        "shape": st.one_of(st.tuples(edges, edges), st.lists(edges, max_size=3), json_values),
     })  # fmt: skip
     text = st.one_of(fields.map(repr), st.text(max_size=60), st.sampled_from(["(" * 3000, "{" * 200, "1" * 6000, "__import__('os')"]))
 
@@ -87,7 +88,13 @@ def test_llff(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
         return check_poses(outcome(lambda: read_poses(path, list(SIZES), SIZES), BadInputError))
 
     good = [row(), row(1.0, (200.0, 100.0))]
-    seeds = [npy(np.array(good)), npy(np.array(good, np.float32)), npy(np.asfortranarray(good)), npy(np.array(good, np.int64)), b"PK\x03\x04"]
+    seeds = [
+        npy(np.array(good)),
+        npy(np.array(good, np.float32)),
+        npy(np.asfortranarray(good)),
+        npy(np.array(good, np.int64)),
+        b"PK\x03\x04",
+    ]
     numbers = st.lists(st.lists(st.one_of(odd_floats, st.floats()), min_size=17, max_size=17), min_size=2, max_size=2)
     arrays = numbers.map(lambda rows: npy(np.array(rows)))
     fuzz(capsys, "poses_bounds.npy", st.one_of(damaged(seeds), arrays, headers()), check)
@@ -96,7 +103,9 @@ def test_llff(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
 def binary_model() -> dict[str, bytes]:
     """A COLMAP model of two cameras, two images and two points."""
     cameras = struct.pack("<Q", 2)
-    cameras += struct.pack("<IiQQ4d", 1, 1, 200, 100, 150.0, 150.0, 100.0, 50.0) + struct.pack("<IiQQ4d", 2, 2, 100, 200, 90.0, 50.0, 100.0, 0.1)
+    cameras += struct.pack("<IiQQ4d", 1, 1, 200, 100, 150.0, 150.0, 100.0, 50.0) + struct.pack(
+        "<IiQQ4d", 2, 2, 100, 200, 90.0, 50.0, 100.0, 0.1
+    )
     images = struct.pack("<Q", 2)
     for number, name in ((1, b"a.jpg"), (2, b"b.jpg")):
         images += struct.pack("<I7dI", number, 1.0, 0.0, 0.0, 0.0, 0.1, 0.2, 0.3, number) + name + b"\0"
@@ -122,7 +131,12 @@ def reader() -> Iterator[ParserProcess]:
 
 
 def fuzz_models(
-    capsys: pytest.CaptureFixture[str], title: str, folder: Path, reader: ParserProcess, files: dict[str, bytes], inputs: st.SearchStrategy[Any]
+    capsys: pytest.CaptureFixture[str],
+    title: str,
+    folder: Path,
+    reader: ParserProcess,
+    files: dict[str, bytes],
+    inputs: st.SearchStrategy[Any],
 ) -> None:
     """Inputs are {file: its bytes}, laid over the good `files`; None for a missing file."""
     folder.mkdir()
@@ -147,7 +161,9 @@ def test_colmap_binary(tmp_path: Path, reader: ParserProcess, capsys: pytest.Cap
 
 
 def test_colmap_text(tmp_path: Path, reader: ParserProcess, capsys: pytest.CaptureFixture[str]) -> None:
-    words = st.one_of(edges.map(str), odd_floats.map(str), odd_text, st.sampled_from(["OPENCV_FISHEYE", "FULL_OPENCV", "-1", "a.jpg", "\t", "#"]))
+    words = st.one_of(
+        edges.map(str), odd_floats.map(str), odd_text, st.sampled_from(["OPENCV_FISHEYE", "FULL_OPENCV", "-1", "a.jpg", "\t", "#"])
+    )
 
     @st.composite
     def texts(draw: st.DrawFn) -> dict[str, bytes | None]:
