@@ -52,11 +52,16 @@ def audit(data: bytes, name: str, max_megabytes: float, max_triangles: int) -> l
     def check(rule: str, passed: bool, detail: str, severity: Severity = "error") -> None:
         found.append(Finding(rule, bool(passed), detail, severity))
 
-    check("readable GLB", True, f"glTF {asset.document['asset'].get('version')}, {len(data)} bytes")
-    _structure(asset, check)
-    _geometry(asset, check, max_triangles)
-    _uv_layout(asset, check)
-    _images(asset, check)
+    check("readable GLB", True, f"{len(data)} bytes")
+    try:
+        _structure(asset, check)
+        _geometry(asset, check, max_triangles)
+        _uv_layout(asset, check)
+        _images(asset, check)
+    except BadInputError as error:
+        check("readable images", False, str(error))
+    except (KeyError, IndexError, ValueError, TypeError, AttributeError, OverflowError, struct.error) as error:
+        check("well-formed document", False, " ".join(repr(error).split())[:200])
     megabytes = len(data) / 1e6
     check("file size", megabytes <= max_megabytes, f"{megabytes:.2f} MB of {max_megabytes:g} MB", "warning")
     return found
@@ -148,7 +153,7 @@ def _images(asset: GltfAsset, check: Any) -> None:
     surface = asset.document["materials"][0].get("pbrMetallicRoughness", {}) if asset.document.get("materials") else {}
     factors = {"roughnessFactor", "metallicFactor"} <= surface.keys()
     present = "base_color" in asset.roles and ("orm" in asset.roles or factors)
-    check("textures present", present, ", ".join(asset.roles) + (" and factors" if factors else ""))
+    check("textures present", present, (", ".join(asset.roles) or "none") + (" and factors" if factors else ""))
     occlusion_only = "orm" not in asset.roles
     check("occlusion packed with roughness", occlusion_only or asset.roles.get("occlusion") in (None, asset.roles["orm"]), "one image")
     for role in ("base_color", "occlusion" if occlusion_only else "orm", "normal", "emissive"):
