@@ -35,7 +35,7 @@ def read_points(path: Path, record: np.dtype[Any]) -> NDArray[Any]:
     """Read a structured array (n,) written by `write_points`. Raises ValueError for a PLY with other properties."""
     data = path.read_bytes()
     end = data.find(b"end_header\n") + len(b"end_header\n")
-    count = next((int(line.split()[2]) for line in data[:end].splitlines() if line.startswith(b"element vertex")), 0)
+    count = next((int(line[15:]) for line in data[:end].splitlines() if line.startswith(b"element vertex ")), 0)
     if data[:end] != _header(record, count) or len(data) - end != count * record.itemsize:
         raise ValueError(f"{path} does not contain points with {', '.join(record.names or ())}")
     return np.frombuffer(data, record, count, end)

@@ -30,7 +30,7 @@ def headers(data: bytes) -> st.SearchStrategy[bytes]:
     """The PLY with words of its header replaced: other counts, types, formats, elements."""
     head, end, body = data.partition(b"end_header\n")
     words = st.one_of(edges.map(str), odd_floats.map(str), st.sampled_from(
-        ["ascii", "binary_big_endian", "list", "uchar", "double", "int8", "vertex", "face", "x", "vertex_indices", "element", "property", "comment"]
+        ["ascii", "binary_big_endian", "list", "uchar", "double", "int8", "vertex", "face", "x", "vertex_indices", "element", "comment"]
     ))  # fmt: skip
 
     @st.composite
@@ -125,7 +125,7 @@ def glb(tmp_path: Path) -> tuple[dict[str, Any], bytes]:
     surface = {"baseColorTexture": {"index": 0}, "metallicRoughnessTexture": {"index": 0}}
     document = {
         "asset": {"version": "2.0"}, "scene": 0, "scenes": [{"nodes": [0]}], "nodes": [{"mesh": 0}],
-        "meshes": [{"primitives": [{"attributes": {"POSITION": 0, "NORMAL": 1, "TANGENT": 2, "TEXCOORD_0": 3}, "indices": 4, "material": 0}]}],
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0, "NORMAL": 1, "TANGENT": 2, "TEXCOORD_0": 3}, "indices": 4}]}],
         "materials": [{"pbrMetallicRoughness": surface, "normalTexture": {"index": 0}, "occlusionTexture": {"index": 0}}],
         "textures": [{"source": 0}], "images": [{"bufferView": 5, "mimeType": "image/png"}],
         "accessors": accessors, "bufferViews": views, "buffers": [{"byteLength": len(binary)}],

@@ -20,7 +20,7 @@ from tests.fuzz.harness import damaged, edges, fuzz, json_values, odd_floats, od
 #: Documents that exhaust the stack of a parser, and numbers that are too long for Python.
 DEEP = [b"[" * 20_000, b'{"a":' * 9000, b'{"a": ' + b"9" * 5000 + b"}", b'{"a": ' + b"9" * 400 + b"}", b"\xef\xbb\xbf{}", b"\xff\xfe{\0}\0"]
 PROJECT_BODY = {
-    "photos": "/photos", "masks": None, "poses": "/photos/transforms.json", "profile": "preview", "overrides": ["train.iterations=5"], "seed": 7,
+    "photos": "/photos", "masks": None, "poses": "/photos/transforms.json", "profile": "preview", "overrides": ["a.b=5"], "seed": 7,
     "published": {"asset.glb": "0" * 64},
 }  # fmt: skip
 MANIFEST_BODY = {
@@ -131,7 +131,7 @@ def test_profile(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
         return outcome(lambda: load_profile(str(path)), BadInputError)
 
     values = st.one_of(
-        edges.map(str), odd_floats.map(str), odd_text.map(lambda text: json.dumps(text)), st.booleans().map(lambda value: str(value).lower()),
+        edges.map(str), odd_floats.map(str), odd_text.map(lambda text: json.dumps(text)), st.sampled_from(["true", "false"]),
         st.sampled_from(["9" * 5000, "1_0", "0xFFFFFFFFFFFFFFFFFF", "1979-05-27", "[1, 2]", "{a = 1}", "[" * 5000, "{a = " * 3000, "'''"]),
     )  # fmt: skip
     keys = st.sampled_from(
