@@ -62,7 +62,10 @@ def parse_glb(data: bytes, name: str) -> GltfAsset:
         primitive = document["meshes"][0]["primitives"][0]
         attributes = {key: _accessor(document, binary, index) for key, index in primitive["attributes"].items()}
         if "indices" in primitive:
-            faces = _accessor(document, binary, primitive["indices"]).astype(np.int64).reshape(-1, 3)
+            corners = _accessor(document, binary, primitive["indices"])
+            if corners.dtype.kind != "u":
+                raise ValueError(f"its indices are of the type {corners.dtype}")
+            faces = corners.astype(np.int64).reshape(-1, 3)
         else:
             faces = np.arange(len(attributes["POSITION"])).reshape(-1, 3)
         images = tuple(_buffer_view(document, binary, image["bufferView"]) for image in document.get("images", []))

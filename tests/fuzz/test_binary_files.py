@@ -20,6 +20,7 @@ from gsbake.gltf.audit import audit
 from gsbake.gltf.container import pack_glb
 from gsbake.gltf.read import parse_glb
 from gsbake.imaging.png import write_png
+from gsbake.report.asset import from_gltf
 from tests.fuzz.harness import damaged, edges, fuzz, odd_floats, outcome, replaced_values
 
 VERTICES = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], float)
@@ -156,6 +157,8 @@ def test_glb(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: py
         asset = outcome(lambda: parse_glb(data, "a.glb"), BadInputError)
         for role in {} if asset is None else asset.roles:
             outcome(lambda role=role: asset.image(role), BadInputError)  # type: ignore[misc,union-attr]
+        if asset is not None:
+            outcome(lambda: from_gltf(asset, False, "a.glb"), BadInputError)
         return asset
 
     documents = replaced_values(document).map(lambda body: repack(body, binary))

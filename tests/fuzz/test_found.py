@@ -134,6 +134,16 @@ def test_glb_without_what_the_audit_looks_at(tmp_path: Path) -> None:
         assert "well-formed document" in [finding.rule for finding in failed(audit(data, "a.glb", 10, 100))]
 
 
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), -3e38, 3e38, 1e20, -1.0])
+def test_glb_with_uvs_outside_the_square(tmp_path: Path, value: float) -> None:
+    """Compiled code once wrote to the texels that they name."""
+    document, binary = glb(tmp_path)
+    start = document["bufferViews"][3]["byteOffset"]
+    for at in (start, start + 4, start + 12):
+        changed = binary[:at] + struct.pack("<f", value) + binary[at + 4 :]
+        assert "UVs in 0..1" in [finding.rule for finding in failed(audit(repack(document, changed), "a.glb", 10, 100))]
+
+
 def test_glb_whose_image_has_too_many_pixels(tmp_path: Path) -> None:
     document, binary = glb(tmp_path)
     at = binary.index(b"IHDR") + 4
