@@ -22,6 +22,9 @@ SCORE_ARGS ?=
 PARTS ?= table timeline growth
 ARGS ?=
 
+# Damaged files that `make stress` tries per parser.
+FUZZ_INPUTS ?= 10000
+
 .PHONY: help setup node demo docs test check bench stress score lock audit sbom clean
 
 help: ## Show this
@@ -60,7 +63,7 @@ test: check node ## Lint, types and the quick tests, with the share of lines the
 	$(BIN)/pytest -m "not slow and not stress" --cov --cov-report=term:skip-covered
 
 stress: setup node ## The slow tests: hostile input at length, kills at random moments, poses of a development capture where present
-	$(BIN)/pytest -m "slow or stress"
+	GSBAKE_FUZZ_INPUTS=$(FUZZ_INPUTS) $(BIN)/pytest -m "slow or stress"
 
 bench: setup ## Measure kernels, error against time (beside other tools) and growth, about two idle hours: PARTS="table timeline growth" ARGS=…
 	@for part in $(PARTS); do $(BIN)/python -m benchmarks.$$part $(ARGS) || exit 1; done

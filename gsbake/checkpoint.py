@@ -12,6 +12,7 @@ from typing import Any
 
 import torch
 from blake3 import blake3
+from safetensors import SafetensorError
 from safetensors.torch import load, save
 
 from gsbake.atomic import sync, write_atomic
@@ -43,7 +44,7 @@ def load_checkpoint(path: Path) -> Any:
         length = int.from_bytes(body[:8], "little")
         structure = json.loads(json.loads(body[8 : 8 + length])["__metadata__"][_STRUCTURE])
         return _restore(structure, load(body))
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError, SafetensorError) as error:
         raise DamagedCheckpointError(" ".join(str(error).split())[:200]) from error
 
 

@@ -14,11 +14,11 @@ import cv2
 import numpy as np
 from blake3 import blake3
 
-from gsbake.capture.masks.matching import match_masks, read_photo_mask
-from gsbake.capture.photos.decode import RawPhoto, UnreadablePhotoError, read_header, read_photo, to_working_size
-from gsbake.capture.photos.exif import camera_key, focal_pixels
-from gsbake.capture.photos.memory_budget import BYTES_PER_DECODED_BYTE, MemoryBudget
-from gsbake.capture.photos.quality import Quality, find_blurred, find_near_duplicates, measure_quality
+from gsbake.capture.masks.matching import match_masks
+from gsbake.capture.photos.conversion import Conversion, ConvertedPhoto
+from gsbake.capture.photos.decode import RawPhoto, UnreadablePhotoError, to_working_size
+from gsbake.capture.photos.quality import find_blurred, find_near_duplicates
+from gsbake.capture.photos.reader_pool import ReaderPool
 from gsbake.capture.photos.sharpness import detect_oversampling
 from gsbake.capture.poses.frames import GivenPoses, PhotoSize
 from gsbake.capture.poses.given import read_poses
@@ -33,6 +33,8 @@ from gsbake.text import shortlist
 
 #: Longest name of a photo in bytes; file systems allow 255, and suffixes are added.
 MAX_NAME_BYTES = 200
+#: Most processes that read photos.
+MAX_READERS = 8
 
 
 @dataclass(frozen=True)
@@ -41,23 +43,6 @@ class IngestOptions:
 
     ingest: Ingest = Ingest()
     resolution: Rule = "auto"
-
-
-@dataclass(frozen=True)
-class _Photo:
-    """Metadata of a photo whose working files are written."""
-
-    entry: dict[str, Any]
-    size: PhotoSize
-    quality: Quality
-
-
-@dataclass(frozen=True)
-class _MaskSource:
-    """Source of a photo's mask: its mask file, or its alpha channel when there is none."""
-
-    file: Path | None
-    invert: bool
 
 
 def ingest(
@@ -92,7 +77,7 @@ class _Ingestion:
     threads: int
     monitor: Monitor
     skipped: list[dict[str, str]] = field(default_factory=list)
-    read: dict[str, _Photo] = field(default_factory=dict)
+    read: dict[str, ConvertedPhoto] = field(default_factory=dict)
 
     def run(self) -> dict[str, Any]:
         """Execute all steps; returns the figures."""
@@ -153,16 +138,18 @@ class _Ingestion:
                 known[key] = relative
 
     def _read_all(self, paths: dict[str, Path], names: dict[str, str], masks: dict[str, Path]) -> None:
-        """Decode, downsample, measure and write all photos in a thread pool; unreadable ones are skipped with a warning."""
+        """Decode, downsample, measure and write all photos in a pool of processes; unreadable ones are skipped with a warning."""
         for sub in ("photos", "masks"):
             (self.out / sub).mkdir(exist_ok=True)
-        cv2.setNumThreads(1)  # the pool runs in parallel instead
-        settings, budget = self.options.ingest, MemoryBudget()
-        with ThreadPoolExecutor(max(1, min(self.threads, 8))) as pool:
+        settings, count = self.options.ingest, max(1, min(self.threads, MAX_READERS, len(paths)))
+        with ReaderPool(count) as readers, ThreadPoolExecutor(count) as pool:
 
-            def submit(relative: str) -> Future[_Photo]:
-                source = _MaskSource(masks.get(relative), settings.invert_masks) if settings.masks != "ignore" else None
-                return pool.submit(_read_one, paths[relative], relative, names[relative], source, self.out, settings, budget)
+            def submit(relative: str) -> Future[ConvertedPhoto]:
+                what = Conversion(
+                    paths[relative], relative, names[relative], self.out, settings.masks != "ignore", masks.get(relative),
+                    settings.invert_masks, settings.max_size, settings.max_megapixels,
+                )  # fmt: skip
+                return pool.submit(readers.convert, what)
 
             try:
                 for done, (relative, future) in enumerate(_submit_bounded(submit, list(paths), 2 * max(1, self.threads))):
@@ -223,7 +210,7 @@ class _Ingestion:
     def _read_poses(self, path: Path, listing: list[str]) -> dict[str, Any]:
         """Read the given poses, scale them to the working photos and write them."""
         with self.monitor.part("poses"):
-            given: GivenPoses = read_poses(path, listing, {relative: photo.size for relative, photo in self.read.items()})
+            given: GivenPoses = read_poses(path, listing, {relative: _size(photo) for relative, photo in self.read.items()})
             cameras = []
             for relative, photo in self.read.items():
                 if relative in given.cameras:
@@ -241,6 +228,10 @@ class _Ingestion:
             self.monitor.warn(f"{len(given.missing)} frames of {path.name} have no photo ({shortlist(list(given.missing))}).")
         self.monitor.decide("given poses", f"{len(cameras)} of {len(self.read)} photos", path.name)
         return {"poses": path.name, "posed": len(cameras), "frames_without_photo": len(given.missing)}
+
+
+def _size(photo: ConvertedPhoto) -> PhotoSize:
+    return PhotoSize(photo.entry["source_width"], photo.entry["source_height"], photo.orientation)
 
 
 def photo_names(paths: dict[str, Path]) -> dict[str, str]:
@@ -268,46 +259,16 @@ def _file_name(name: str) -> str:
     return f"{safe}_{blake3(data).hexdigest()[:12]}"
 
 
-def _submit_bounded(submit: Callable[[str], Future[_Photo]], items: list[str], limit: int) -> Iterator[tuple[str, Future[_Photo]]]:
+def _submit_bounded(
+    submit: Callable[[str], Future[ConvertedPhoto]], items: list[str], limit: int
+) -> Iterator[tuple[str, Future[ConvertedPhoto]]]:
     """Submit items in order with at most `limit` pending, which bounds memory; yields them in order."""
-    pending: list[tuple[str, Future[_Photo]]] = []
+    pending: list[tuple[str, Future[ConvertedPhoto]]] = []
     for item in items:
         pending.append((item, submit(item)))
         if len(pending) >= limit:
             yield pending.pop(0)
     yield from pending
-
-
-def _read_one(
-    path: Path, relative: str, name: str, source: _MaskSource | None, out: Path, settings: Ingest, budget: MemoryBudget
-) -> _Photo:
-    """Convert one photo and its mask (none without a `source`) to working files; runs in a thread."""
-    with budget.reserve(BYTES_PER_DECODED_BYTE * read_header(path, settings.max_megapixels).decoded_bytes):
-        photo = read_photo(path, settings.max_megapixels)
-        mask = None if source is None else read_photo_mask(photo, relative, source.file, source.invert, settings.max_megapixels)
-        rgb, mask = to_working_size(photo, mask, settings.max_size)
-    height, width = rgb.shape[:2]
-    quality = measure_quality(rgb, mask)
-    write_png(out / "photos" / f"{name}.png", rgb)
-    if mask is not None:
-        write_png(out / "masks" / f"{name}.png", mask)
-    focal = focal_pixels(photo.tags, photo.width, photo.height)
-    entry = {
-        "name": name,
-        "file": f"photos/{name}.png",
-        "mask": None if mask is None else f"masks/{name}.png",
-        "width": width,
-        "height": height,
-        "source": relative,
-        "source_width": photo.width,
-        "source_height": photo.height,
-        "focal_px": None if focal is None else focal * max(width, height) / max(photo.width, photo.height),
-        "camera_model": camera_key(photo.tags),
-        "blur": quality.blur,
-        "exposure": quality.exposure,
-        "duplicate_of": None,
-    }
-    return _Photo(entry, PhotoSize(photo.width, photo.height, photo.orientation), quality)
 
 
 def _halve(out: Path, entry: dict[str, Any]) -> None:

@@ -135,7 +135,7 @@ def _chain(path: Path) -> list[Path]:
 def _toml(path: Path) -> dict[str, Any]:
     try:
         return tomllib.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:  # not TOML, not UTF-8, or an integer too long to convert
+    except (ValueError, RecursionError) as error:  # not TOML, not UTF-8, an integer too long to convert, or nested too deeply
         raise BadInputError(f"{path} is not valid TOML: {error}.") from error
     except OSError as error:
         raise BadInputError(f"{path} cannot be read: {error.strerror}.") from error
@@ -182,8 +182,8 @@ def _parse_override(text: str) -> tuple[str, Any]:
         return key, raw
     try:
         return key, tomllib.loads(f"value = {raw}")["value"]
-    except ValueError:
-        return key, raw  # a bare word, as in --set mesh.holes=leave, or an integer too long to convert
+    except (ValueError, RecursionError):
+        return key, raw  # a bare word, as in --set mesh.holes=leave, or a value that TOML cannot convert
 
 
 def _validate(values: Mapping[str, Any], origins: Mapping[str, str]) -> Profile:

@@ -35,7 +35,7 @@ def read_points(path: Path, record: np.dtype[Any]) -> NDArray[Any]:
     """Read a structured array (n,) written by `write_points`. Raises ValueError for a PLY with other properties."""
     data = path.read_bytes()
     end = data.find(b"end_header\n") + len(b"end_header\n")
-    count = next((int(line.split()[2]) for line in data[:end].splitlines() if line.startswith(b"element vertex")), 0)
+    count = next((int(line[15:]) for line in data[:end].splitlines() if line.startswith(b"element vertex ")), 0)
     if data[:end] != _header(record, count) or len(data) - end != count * record.itemsize:
         raise ValueError(f"{path} does not contain points with {', '.join(record.names or ())}")
     return np.frombuffer(data, record, count, end)
@@ -73,15 +73,20 @@ def write_mesh(path: Path, vertices: ArrayLike, faces: ArrayLike) -> None:
 def read_mesh(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Read vertices (v, 3) and triangles (f, 3) of any PLY mesh.
 
-    Raises ValueError for an unreadable file, no triangles, or non-finite positions.
+    Raises ValueError for an unreadable file, no triangles, corners that are no vertices, or non-finite positions.
     """
     import trimesh
 
     try:
         mesh: Any = trimesh.load(path, process=False)
-        vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
-    except (OSError, ValueError, AttributeError, IndexError, KeyError) as error:
-        raise ValueError(f"{path} is not a readable triangle mesh ({error})") from error
+        vertices = np.asarray(mesh.vertices, np.float64).reshape(-1, 3)
+        faces = np.asarray(mesh.faces, np.int64).reshape(-1, 3)
+    except MemoryError:
+        raise
+    except Exception as error:  # damaged headers cause exceptions of many types in the reader
+        raise ValueError(f"{path} is not a readable triangle mesh ({' '.join(str(error).split())[:200]})") from error
     if len(faces) == 0 or not np.isfinite(vertices).all():
         raise ValueError(f"{path} has no triangles or has non-finite positions")
+    if faces.min() < 0 or faces.max() >= len(vertices):
+        raise ValueError(f"{path} has triangles with corners that are no vertices")
     return vertices, faces

@@ -42,7 +42,7 @@ def unpack_glb(data: bytes, name: str) -> tuple[dict[str, Any], bytes]:
         if kind == JSON_CHUNK and document is None:
             try:
                 document = json.loads(chunk)
-            except ValueError as error:
+            except (ValueError, RecursionError) as error:
                 raise BadInputError(f"{name} holds invalid JSON ({error}); export it again.") from error
         elif kind == BINARY_CHUNK and not binary:
             binary = chunk

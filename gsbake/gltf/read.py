@@ -17,6 +17,7 @@ from gsbake.errors import BadInputError
 from gsbake.gltf.container import unpack_glb
 
 COMPONENT_TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+WIDTHS = {"POSITION": 3, "NORMAL": 3, "TANGENT": 4, "TEXCOORD_0": 2}
 COMPONENT_COUNTS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 
 
@@ -40,7 +41,10 @@ class GltfAsset:
         """Pixels (h, w, 3) 8-bit RGB of a role's image as stored, or None when the material has none."""
         if role not in self.roles:
             return None
-        pixels = cv2.imdecode(np.frombuffer(self.images[self.roles[role]], np.uint8), cv2.IMREAD_COLOR)
+        try:
+            pixels = cv2.imdecode(np.frombuffer(self.images[self.roles[role]], np.uint8), cv2.IMREAD_COLOR)
+        except cv2.error:  # more pixels than OpenCV decodes, or no bytes
+            pixels = None
         if pixels is None:
             raise BadInputError(f"The {role} image of the asset cannot be decoded; export it again.")
         return np.ascontiguousarray(pixels[..., ::-1], np.uint8)
@@ -58,15 +62,33 @@ def parse_glb(data: bytes, name: str) -> GltfAsset:
         primitive = document["meshes"][0]["primitives"][0]
         attributes = {key: _accessor(document, binary, index) for key, index in primitive["attributes"].items()}
         if "indices" in primitive:
-            faces = _accessor(document, binary, primitive["indices"]).astype(np.int64).reshape(-1, 3)
+            corners = _accessor(document, binary, primitive["indices"])
+            if corners.dtype.kind != "u":
+                raise ValueError(f"its indices are of the type {corners.dtype}")
+            faces = corners.astype(np.int64).reshape(-1, 3)
         else:
             faces = np.arange(len(attributes["POSITION"])).reshape(-1, 3)
         images = tuple(_buffer_view(document, binary, image["bufferView"]) for image in document.get("images", []))
         material = document.get("materials", [{}])[primitive.get("material", 0)]
         roles = _roles(document, material)
-    except (KeyError, IndexError, ValueError, TypeError) as error:
-        raise BadInputError(f"{name} holds no readable triangle mesh ({error!r}); export it again.") from error
+        _check_shapes(attributes, roles, len(images))
+    except (KeyError, IndexError, ValueError, TypeError, AttributeError, OverflowError) as error:
+        reason = " ".join(repr(error).split())[:200]
+        raise BadInputError(f"{name} holds no readable triangle mesh ({reason}); export it again.") from error
     return GltfAsset(document, attributes, faces, images, roles, len(data))
+
+
+def _check_shapes(attributes: dict[str, NDArray[Any]], roles: dict[str, int], images: int) -> None:
+    """Raise ValueError unless the attributes have the widths that glTF gives them, one row a vertex, and the roles name images."""
+    for key, values in attributes.items():
+        width = WIDTHS.get(key)
+        if values.shape[:1] != attributes["POSITION"].shape[:1] or (width is not None and values.shape[1:] != (width,)):
+            raise ValueError(f"{key} has the shape {values.shape}")
+    if not len(attributes["POSITION"]):
+        raise ValueError("it has no vertices")
+    for role, index in roles.items():
+        if not isinstance(index, int) or not 0 <= index < images:
+            raise ValueError(f"the image of {role} does not exist")
 
 
 def _buffer_view(document: dict[str, Any], binary: bytes, index: int) -> bytes:
@@ -85,6 +107,8 @@ def _accessor(document: dict[str, Any], binary: bytes, index: int) -> NDArray[An
     content = _buffer_view(document, binary, accessor["bufferView"])
     stride = document["bufferViews"][accessor["bufferView"]].get("byteStride", kind.itemsize * width)
     start = accessor.get("byteOffset", 0)
+    if start < 0 or stride < kind.itemsize * width:  # rows that overlap would let a small file state any count
+        raise ValueError(f"accessor {index} has the offset {start} and the stride {stride}")
     if start + stride * (count - 1) + kind.itemsize * width > len(content):
         raise ValueError(f"accessor {index} exceeds its buffer view")
     values = np.ndarray((count, width), kind, content, start, (stride, kind.itemsize)).copy()

@@ -76,7 +76,7 @@ class DigestCache:
         self._entries: dict[str, list[object]] = {}
         self._changed = False
         if path is not None:
-            with suppress(OSError, ValueError):
+            with suppress(OSError, ValueError, RecursionError):
                 body = json.loads(path.read_text())
                 if isinstance(body, dict):
                     self._entries = body

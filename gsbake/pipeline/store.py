@@ -109,7 +109,7 @@ class Store:
             if any(_REPLACEMENT_FOLDER.fullmatch(path.name) for path in self.stage_folder(stage).glob(f"{REPLACEMENT_PREFIX}-*")):
                 raise _DamagedRecordError(f"{REPLACEMENT} is missing") from None
             return None
-        except (OSError, ValueError, KeyError, TypeError):
+        except (OSError, ValueError, KeyError, TypeError, RecursionError):
             raise _DamagedRecordError(f"{REPLACEMENT} cannot be read") from None
         if not _REPLACEMENT_FOLDER.fullmatch(name):
             raise _DamagedRecordError(f"{REPLACEMENT} names the folder {name!r}")
@@ -224,7 +224,7 @@ class Store:
             path = folder / name
             try:
                 intact = os.path.getsize(path) == entry["bytes"] and self.digests.file(path) == entry["digest"]
-            except OSError:
+            except (OSError, ValueError):  # ValueError: a name that no file can have
                 faults.append(f"{name} is missing in '{folder}'")
                 continue
             if not intact:
@@ -256,9 +256,10 @@ def read_manifest(folder: Path) -> dict[str, Any] | None:
     """The manifest of a folder; None when it is missing, damaged or modified (its `seal` is a digest of the other fields)."""
     try:
         body = json.loads((folder / MANIFEST).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        intact = isinstance(body, dict) and body.get("seal") == _seal(body)
+    except (OSError, ValueError, RecursionError):
         return None
-    return body if isinstance(body, dict) and body.get("seal") == _seal(body) and _well_formed(body.get("files")) else None
+    return body if intact and _well_formed(body.get("files")) and isinstance(body.get("settings", {}), dict) else None
 
 
 def _well_formed(files: object) -> bool:

@@ -21,10 +21,26 @@ def open_asset(path: Path, unlit: bool = False) -> Asset:
 
 
 def from_gltf(file: GltfAsset, unlit: bool, name: str) -> Asset:
-    """Asset of a parsed GLB; ambient occlusion is 1 without an occlusion texture, a missing texture is replaced by its factor."""
+    """Asset of a parsed GLB; ambient occlusion is 1 without an occlusion texture, a missing texture is replaced by its factor.
+
+    Raises BadInputError for a mesh or material that cannot be rendered: the renderer is compiled code that checks no bounds.
+    """
     missing = [k for k in ("POSITION", "NORMAL", "TEXCOORD_0") if k not in file.attributes]
     if missing:
         raise BadInputError(f"{name} lacks the vertex attributes {', '.join(missing)}; export it again.")
+    count = len(file.attributes["POSITION"])
+    if not len(file.faces) or file.faces.min() < 0 or file.faces.max() >= count:
+        raise BadInputError(f"{name} has no triangles, or corners that are no vertices; export it again.")
+    if not all(np.isfinite(values).all() for values in file.attributes.values()):
+        raise BadInputError(f"{name} has vertices that are not finite; export it again.")
+    try:
+        return _rendered(file, unlit)
+    except (KeyError, IndexError, ValueError, TypeError, AttributeError, OverflowError) as error:
+        reason = " ".join(repr(error).split())[:200]
+        raise BadInputError(f"{name} has a material that cannot be read ({reason}); export it again.") from error
+
+
+def _rendered(file: GltfAsset, unlit: bool) -> Asset:
     material = (file.document.get("materials") or [{}])[0]
     surface = material.get("pbrMetallicRoughness", {})
     colour = file.image("base_color")

@@ -111,7 +111,7 @@ def lines(curves: Sequence[Curve], title: str, log: bool = False) -> str:
     out = [f'<svg class="chart lines" viewBox="0 0 {width} {height}" role="img" aria-label="{escape(title)}">']
     out.append(f'<text class="title" x="{left}" y="15">{escape(title)}</text>')
     values = log_ticks(10**y0, 10**y1) if log else ticks(y0, y1)
-    if len(values) < 2:  # a logarithmic axis over a narrow range
+    if log and len(values) < 2:  # a narrow range
         values = ticks(10**y0, 10**y1)
     for value, shown in zip(values, labels(values), strict=True):
         y = py(scale(value))

@@ -34,7 +34,7 @@ def load_manifests(inputs: Mapping[str, Path]) -> dict[str, dict[str, Any]]:
             continue
         try:
             body = json.loads((inputs[stage] / "manifest.json").read_text(encoding="utf-8"))
-        except (OSError, ValueError):
+        except (OSError, ValueError, RecursionError):
             body = {}
         out[stage] = body if isinstance(body, dict) else {}
     return out
@@ -195,5 +195,5 @@ def audit_rows(path: Path) -> tuple[Check, ...]:
         if not isinstance(found, list):
             raise TypeError("no list of findings")
         return tuple(Check(str(f["rule"]), _state(bool(f["passed"]), str(f["severity"])), format_value(f["detail"])) for f in found)
-    except (ValueError, LookupError, TypeError) as error:
+    except (ValueError, LookupError, TypeError, RecursionError) as error:
         raise BadInputError(f"{path} is not an audit ({error}); export the asset again.") from error

@@ -64,7 +64,7 @@ def asset_cameras(path: Path) -> tuple[Camera, ...]:
             rotation, translation = Camera.pose_from_opengl(np.array(frame["transform_matrix"], float))
             fx, fy, cx, cy = (float(merged[k]) for k in ("fl_x", "fl_y", "cx", "cy"))
             out.append(Camera(str(frame["file_path"]), int(merged["w"]), int(merged["h"]), fx, fy, cx, cy, rotation, translation))
-    except (OSError, ValueError, LookupError, TypeError) as error:
+    except (OSError, ValueError, LookupError, TypeError, OverflowError, RecursionError) as error:
         raise BadInputError(f"{path} is not a camera file in nerfstudio's format ({error}); export the asset again.") from error
     return tuple(out)
 

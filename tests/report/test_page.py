@@ -180,6 +180,11 @@ def test_lines_rise_when_values_rise_and_skip_gaps() -> None:
     assert lines([], "t") == ""
 
 
+def test_lines_whose_axis_has_one_tick() -> None:
+    root = ET.fromstring(lines([Curve("surfels", [0, 1, 2], [39054, 39500, 39808])], "t"))
+    assert len(root.findall(".//{*}path")) + len(root.findall(".//{*}polyline")) > 0
+
+
 def test_log_lines_are_straight_for_exponentials() -> None:
     x = list(range(11))
     root = ET.fromstring(lines([Curve("a", x, [10.0**-i for i in x])], "t", log=True))

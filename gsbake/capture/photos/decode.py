@@ -98,7 +98,7 @@ def _failures_as_unreadable() -> Iterator[None]:
     except UnreadablePhotoError:
         raise
     except MemoryError:
-        raise UnreadablePhotoError("decoding it needs more memory than there is") from None
+        raise UnreadablePhotoError("decoding it takes too much memory") from None
     except Exception as error:
         raise UnreadablePhotoError(f"{type(error).__name__}: {' '.join(str(error).split())[:200]}") from error
 

@@ -13,11 +13,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from gsbake.capture.poses.colmap_binary import check_binary_files
 from gsbake.capture.poses.frames import GivenPoses, PhotoSize, checked_rigid, match_cameras
 from gsbake.capture.poses.validation import MAX_COORDINATE
-from gsbake.errors import BadInputError
+from gsbake.errors import BadInputError, InterruptedRun
 from gsbake.geometry.cameras import Camera
-from gsbake.limited_process import Limits, ParserFailedError, run_limited
+from gsbake.limited_process import ParserFailedError, ParserKilledError, ParserProcess
 
 #: Camera model → index of each of fx, fy, cx, cy, k1, k2, p1, p2, k3, k4, k5, k6 in COLMAP's parameters, as far as the model has them.
 _LAYOUT = {
@@ -59,14 +60,30 @@ def read_model(folder: Path, sizes: Mapping[str, PhotoSize]) -> GivenPoses:
 
     Raises BadInputError for damaged files, values that are not finite or out of bounds, and camera models that are not perspective.
     """
+    with model_reader() as reader:
+        return read_model_with(reader, folder, sizes)
+
+
+def model_reader() -> ParserProcess:
+    """The process that reads models."""
+    return ParserProcess("gsbake.capture.poses.colmap_reader")
+
+
+def read_model_with(reader: ParserProcess, folder: Path, sizes: Mapping[str, PhotoSize]) -> GivenPoses:
+    """`read_model` through a running `model_reader`."""
+    check_binary_files(folder)
     total = sum(path.stat().st_size for path in folder.iterdir() if path.is_file())
-    limits = Limits(memory=MIN_READER_MEMORY + READER_MEMORY_FACTOR * total, seconds=READER_SECONDS)
     with tempfile.TemporaryDirectory(prefix="gsbake-colmap-") as scratch:
         target = Path(scratch) / "model.npz"
+        request = {"folder": str(folder), "target": str(target), "memory": MIN_READER_MEMORY + READER_MEMORY_FACTOR * total}
         try:
-            listed = run_limited("gsbake.capture.poses.colmap_reader", [str(folder), str(target)], limits)
-        except ParserFailedError as error:
-            raise BadInputError(f"The COLMAP model {folder} cannot be read ({error}).") from error
+            listed = reader.ask(request, READER_SECONDS)
+        except (ParserFailedError, ParserKilledError) as error:
+            if isinstance(error, ParserKilledError) and not error.timed_out:
+                raise InterruptedRun(f"The process that read the COLMAP model {folder} {error}; run the same command again.") from error
+            raise BadInputError(f"The COLMAP model {folder} cannot be read (its reader {error}).") from error
+        if "error" in listed:
+            raise BadInputError(f"The COLMAP model {folder} cannot be read ({listed['error']}).")
         with np.load(target, allow_pickle=False) as body:
             arrays = {name: body[name] for name in body.files}
     frames = []

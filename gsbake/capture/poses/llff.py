@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from tokenize import TokenError
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +17,11 @@ from gsbake.capture.poses.frames import GivenPoses, PhotoSize, checked_rigid, fi
 from gsbake.capture.poses.validation import check_file_size
 from gsbake.errors import BadInputError
 from gsbake.geometry.cameras import Camera
+
+#: What NumPy raises for headers that it cannot parse; some come from Python's own tokenizer and parser.
+_HEADER_ERRORS = (
+    OSError, ValueError, EOFError, SyntaxError, TokenError, TypeError, KeyError, OverflowError, RecursionError, MemoryError,
+)  # fmt: skip
 
 
 def read_llff(path: Path, listing: Sequence[str], sizes: Mapping[str, PhotoSize]) -> GivenPoses:
@@ -52,5 +58,5 @@ def _load(path: Path, count: int) -> NDArray[np.float64]:
             if shape[0] != count:
                 raise BadInputError(f"{path} has {shape[0]} poses but there are {count} photos; use the photos the poses were made with.")
         return np.asarray(np.load(path, allow_pickle=False), np.float64)
-    except (OSError, ValueError, EOFError, SyntaxError, TypeError, OverflowError, RecursionError, MemoryError) as error:
+    except _HEADER_ERRORS as error:
         raise BadInputError(f"{path} cannot be read as a NumPy array ({' '.join(str(error).split())[:200]}).") from error

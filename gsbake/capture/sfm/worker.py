@@ -6,10 +6,8 @@ COLMAP's long calls cannot be interrupted, but a process can be killed, and its 
 from __future__ import annotations
 
 import json
-import os
 import re
 import sys
-import threading
 import time
 from collections.abc import Mapping
 from contextlib import closing
@@ -27,6 +25,7 @@ from gsbake.capture.sfm.reconstruction import FeatureOptions, Lens, SfmPipeline,
 from gsbake.errors import InterruptedRun
 from gsbake.geometry.cameras import Camera, CameraSet
 from gsbake.geometry.ply import write_cloud
+from gsbake.limited_process import exit_with_parent
 
 #: Errors of COLMAP and SQLite that come from the machine, not from the photos.
 _PASSING_FAULT = re.compile(r"disk|I/O|no space|sqlite|database|bad_alloc|memory|failed to (open|write)|cannot (open|write)", re.IGNORECASE)
@@ -40,17 +39,6 @@ def _report_progress(part: str, done: int, total: int) -> None:
         _LAST_REPORT["time"] = now
         sys.stdout.write(json.dumps({"part": part, "done": done, "total": total}) + "\n")
         sys.stdout.flush()
-
-
-def _exit_with_parent(parent: int) -> None:
-    """End this process when its parent ends, so that a killed run leaves no process behind."""
-
-    def poll() -> None:
-        while os.getppid() == parent:
-            time.sleep(0.5)
-        os._exit(75)
-
-    threading.Thread(target=poll, daemon=True).start()
 
 
 def _pipeline(job: Mapping[str, Any]) -> SfmPipeline:
@@ -155,7 +143,7 @@ def triangulate(job: Mapping[str, Any]) -> dict[str, Any]:
 def main() -> None:
     """Entry point: `python -m gsbake.capture.sfm.worker JOB.json PARENT_PID`."""
     job = json.loads(Path(sys.argv[1]).read_text())
-    _exit_with_parent(int(sys.argv[2]))
+    exit_with_parent(int(sys.argv[2]))
     pycolmap.set_random_seed(job["seed"])
     try:
         result = solve(job) if job["task"] == "solve" else triangulate(job)

@@ -1,0 +1,87 @@
+"""Conversion of one photo and its mask to working files, with quality measures. Imports little: it runs in the reader processes."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from gsbake.capture.masks.matching import read_photo_mask
+from gsbake.capture.photos.decode import UnreadablePhotoError, read_header, read_photo, to_working_size
+from gsbake.capture.photos.exif import camera_key, focal_pixels
+from gsbake.capture.photos.quality import Quality, measure_quality
+from gsbake.imaging.png import write_png
+
+
+@dataclass(frozen=True)
+class Conversion:
+    """What to convert: the photo's file, its path `relative` to the photo folder and its `name`; its mask file (`use_mask` without one: its
+    alpha channel); the folder `out` of the working files."""
+
+    path: Path
+    relative: str
+    name: str
+    out: Path
+    use_mask: bool
+    mask: Path | None
+    invert_mask: bool
+    max_size: int
+    max_megapixels: float
+
+    def to_json(self) -> dict[str, Any]:
+        """The fields in JSON types."""
+        return {key: str(value) if isinstance(value, Path) else value for key, value in asdict(self).items()}
+
+    @staticmethod
+    def from_json(fields: dict[str, Any]) -> Conversion:
+        """What `to_json` made."""
+        mask = None if fields["mask"] is None else Path(fields["mask"])
+        return Conversion(**{**fields, "path": Path(fields["path"]), "out": Path(fields["out"]), "mask": mask})
+
+
+@dataclass(frozen=True)
+class ConvertedPhoto:
+    """A photo whose working files are written: its entry of photos.json, its EXIF orientation and its quality."""
+
+    entry: dict[str, Any]
+    orientation: int
+    quality: Quality
+
+
+def decoded_bytes(what: Conversion) -> int:
+    """Bytes of the decoded photo and mask, from their headers. Raises UnreadablePhotoError for the photo; the mask's turn comes later."""
+    size = read_header(what.path, what.max_megapixels).decoded_bytes
+    if what.mask is not None:
+        with suppress(UnreadablePhotoError):
+            size += read_header(what.mask, what.max_megapixels).decoded_bytes
+    return size
+
+
+def convert(what: Conversion) -> ConvertedPhoto:
+    """Write the working files. Raises UnreadablePhotoError for the photo, BadInputError for its mask."""
+    photo = read_photo(what.path, what.max_megapixels)
+    mask = read_photo_mask(photo, what.relative, what.mask, what.invert_mask, what.max_megapixels) if what.use_mask else None
+    rgb, mask = to_working_size(photo, mask, what.max_size)
+    height, width = rgb.shape[:2]
+    quality = measure_quality(rgb, mask)
+    write_png(what.out / "photos" / f"{what.name}.png", rgb)
+    if mask is not None:
+        write_png(what.out / "masks" / f"{what.name}.png", mask)
+    focal = focal_pixels(photo.tags, photo.width, photo.height)
+    entry = {
+        "name": what.name,
+        "file": f"photos/{what.name}.png",
+        "mask": None if mask is None else f"masks/{what.name}.png",
+        "width": width,
+        "height": height,
+        "source": what.relative,
+        "source_width": photo.width,
+        "source_height": photo.height,
+        "focal_px": None if focal is None else focal * max(width, height) / max(photo.width, photo.height),
+        "camera_model": camera_key(photo.tags),
+        "blur": quality.blur,
+        "exposure": quality.exposure,
+        "duplicate_of": None,
+    }
+    return ConvertedPhoto(entry, photo.orientation, quality)
