@@ -392,6 +392,12 @@ class MaterialFit:
         for moment in self._moments:
             moment[texel, :5] = 0
 
+    def samples_of(self, pixels: Pixels, chosen: NDArray[np.bool_]) -> tuple[NDArray[np.int64], PhotoSamples]:
+        """Which (m,) of the `pixels` have a dominant texel that is `chosen` (n,), and their samples under the fitted light."""
+        batch = PhotoBatch.of(pixels, self._normal)
+        samples = batch.select(chosen).samples(self._values[:, 5:], self._tables(), self._transport)
+        return np.flatnonzero(chosen[batch.dominant_texel]), samples
+
     def psnr(self, photos: list[Pixels], values: Floats | None = None) -> float | None:
         """PSNR in dB over all pixels of `photos` (None without any), with the fitted texels or with `values` (n, 5)."""
         batches = [replace(batch, weight=np.ones_like(batch.weight)) for batch in self._batches(photos)]

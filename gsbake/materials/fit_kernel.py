@@ -44,6 +44,8 @@ _POWER = np.float32(1 / 2.4)
 
 #: Columns of a texel's parameters: base colour (3), roughness, metallic, normal offset (3).
 PARAMETERS = 8
+#: Columns of a pixel's shading parameters: diffuse albedo (3), F0 (3), roughness, normal offset (3).
+SHADING = 10
 #: Columns of a texel's light transport: visibility, ambient occlusion, indirect irradiance / π (3), emission (3), outgoing radiance (3).
 TRANSPORT = 11
 
@@ -74,7 +76,7 @@ def shade_and_differentiate(
 
     `texel`, `bilinear` (n, 4) taps; `normal` (n, 3) of the mesh; `view`, sRGB `colour` (n, 3); `weight` (n,); `reflected` (n,) texel that
     the reflected ray hits, −1: none, or empty: not traced; `values` (texels, PARAMETERS); `transport` (texels, TRANSPORT); `table` … `lut`
-    as in `split_sum_kernel`. `factor` scales the gradients. Written: `gradient` (n, PARAMETERS) of the pixels' interpolated parameters;
+    as in `split_sum_kernel`. `factor` scales the gradients. Written: `gradient` (n, SHADING) of the pixels' interpolated parameters;
     added: `g_table` (CHUNKS, rows, 3); `sums` (CHUNKS, 3) loss, weighted mean squared error and weight.
     """
     n = texel.shape[0]
@@ -87,28 +89,34 @@ def shade_and_differentiate(
         loss_sum = 0.0
         square_sum = 0.0
         weight_sum = 0.0
-        local = np.empty(16, np.float32)
+        shading = np.empty(SHADING, np.float32)
+        local = np.empty(8, np.float32)
         for pixel in range(chunk * n // CHUNKS, (chunk + 1) * n // CHUNKS):
             i = np.uint64(pixel)
-            for c in range(16):
+            for c in range(SHADING):
+                shading[c] = _0
+            for c in range(8):
                 local[c] = _0
             for k in range(4):
                 w = bilinear[i, k]
                 t = np.uint64(texel[i, k])
                 if w > _0:
+                    w_metal = w * values[t, 4]
+                    for c in range(3):
+                        shading[c] += (w - w_metal) * values[t, c]
+                        shading[3 + c] += (w - w_metal) * _F0 + w_metal * values[t, c]
+                        shading[7 + c] += w * values[t, 5 + c]
+                    shading[6] += w * values[t, 3]
                     for c in range(8):
-                        local[c] += w * values[t, c]
-                    for c in range(8):
-                        local[8 + c] += w * transport[t, c]
-            rough = local[3]
-            metal = local[4]
-            visible = local[8]
-            occlusion = local[9]
+                        local[c] += w * transport[t, c]
+            rough = shading[6]
+            visible = local[0]
+            occlusion = local[1]
 
             # Geometry.
-            nx = normal[i, 0] + local[5]
-            ny = normal[i, 1] + local[6]
-            nz = normal[i, 2] + local[7]
+            nx = normal[i, 0] + shading[7]
+            ny = normal[i, 1] + shading[8]
+            nz = normal[i, 2] + shading[9]
             inverse = _1 / math.sqrt(max(nx * nx + ny * ny + nz * nz, MIN_SQUARED_LENGTH))
             nx *= inverse
             ny *= inverse
@@ -147,22 +155,22 @@ def shade_and_differentiate(
 
             # Shade, compare, differentiate; one channel at a time.
             w = weight[i]
-            g_u = g_v = g_un = g_vn = g_t = g_scale = g_bias = g_metal = _0
+            g_u = g_v = g_un = g_vn = g_t = g_scale = g_bias = _0
             half0 = _HALF * np.float32(sizes[level])
             half1 = _HALF * np.float32(sizes[level + 1])
             squares = _0
             loss = _0
             for ch in range(3):
-                base = local[ch]
+                albedo = shading[ch]
+                f0 = shading[3 + ch]
                 lower = _bilinear(table, base0, stride0, fx0, fy0, ch)
                 upper = _bilinear(table, base1, stride1, fx1, fy1, ch)
                 irradiance = _bilinear(table, base2, stride2, fx2, fy2, ch)
-                f0 = _F0 * (_1 - metal) + metal * base
                 light = lower + t_level * (upper - lower)
                 bounced = incident * transport[hit, np.uint64(8 + ch)]
                 reflectance = f0 * scale + bias
-                diffuse = visible * irradiance + local[10 + ch]
-                linear = (_1 - metal) * base * diffuse + (visible_s * light + bounced) * reflectance + local[13 + ch]
+                diffuse = visible * irradiance + local[2 + ch]
+                linear = albedo * diffuse + (visible_s * light + bounced) * reflectance + local[5 + ch]
                 encoded, slope = srgb_and_slope(min(max(linear, _0), _1))
                 error = encoded - colour[i, ch]
                 squares += error * error
@@ -172,9 +180,8 @@ def shade_and_differentiate(
                 if _0 <= linear <= _1:
                     g = third * w * error / length * slope
                 g_s = g * visible_s
-                specular = g_s * light + g * bounced
-                gradient[i, ch] = g * (_1 - metal) * diffuse + specular * scale * metal
-                g_metal += specular * scale * (base - _F0) - g * base * diffuse
+                gradient[i, ch] = g * diffuse
+                gradient[i, 3 + ch] = (g_s * light + g * bounced) * scale
                 g_scale += g_s * light * f0
                 g_bias += g_s * light
                 g_light = g_s * reflectance
@@ -185,13 +192,12 @@ def shade_and_differentiate(
                 du, dv = _bilinear_backward(table, table_grad, base1, stride1, fx1, fy1, ch, g_light * t_level)
                 g_u += du * half1
                 g_v += dv * half1
-                du, dv = _bilinear_backward(table, table_grad, base2, stride2, fx2, fy2, ch, g * visible * (_1 - metal) * base)
+                du, dv = _bilinear_backward(table, table_grad, base2, stride2, fx2, fy2, ch, g * visible * albedo)
                 g_un += du * half2
                 g_vn += dv * half2
             loss_sum += w * residual_weight * loss
             square_sum += w * squares
             weight_sum += w
-            gradient[i, 4] = g_metal
 
             # Split-sum table: derivatives along √(n·v) and roughness. Visibility and reflected radiance count as constants.
             d_root = g_scale * ((_1 - fy) * (a01 - a00) + fy * (a11 - a10)) + g_bias * ((_1 - fy) * (b01 - b00) + fy * (b11 - b10))
@@ -201,36 +207,54 @@ def shade_and_differentiate(
             g_along = gx * nx + gy * ny + gz * nz
             g_c += _2 * mirror * g_along
             g_mirror = (_2 * c - _1) * g_along - (gx * vx + gy * vy + gz * vz)
-            gradient[i, 3] = g_t / (knots[level + 1] - knots[level]) + d_rough * np.float32(lut.shape[0] - 1) + g_mirror * mirror_slope
+            gradient[i, 6] = g_t / (knots[level + 1] - knots[level]) + d_rough * np.float32(lut.shape[0] - 1) + g_mirror * mirror_slope
             hx, hy, hz = _encode_backward(nx, ny, nz, g_un, g_vn)
             hx += coeff * gx + g_c * vx
             hy += coeff * gy + g_c * vy
             hz += coeff * gz + g_c * vz
             radial = hx * nx + hy * ny + hz * nz
             keep = inverse if inverse * inverse * MIN_SQUARED_LENGTH < _1 else _0
-            gradient[i, 5] = keep * (hx - radial * nx)
-            gradient[i, 6] = keep * (hy - radial * ny)
-            gradient[i, 7] = keep * (hz - radial * nz)
+            gradient[i, 7] = keep * (hx - radial * nx)
+            gradient[i, 8] = keep * (hy - radial * ny)
+            gradient[i, 9] = keep * (hz - radial * nz)
         sums[chunk, 0] += loss_sum / 3
         sums[chunk, 1] += square_sum / 3
         sums[chunk, 2] += weight_sum
 
 
 @njit(parallel=True, **_FLAGS)
-def gather_gradient(touched: Any, start: Any, pixel: Any, share: Any, gradient: Any, out: Any) -> None:
-    """Set rows `touched` (m,) of `out` (texels, PARAMETERS) to the sum of `share` (e,) times `gradient` (n, PARAMETERS) of `pixel` (e,).
+def gather_gradient(touched: Any, start: Any, pixel: Any, share: Any, gradient: Any, values: Any, out: Any) -> None:
+    """Set rows `touched` (m,) of `out` (texels, PARAMETERS) to the gradient of the texels' parameters `values` (texels, PARAMETERS).
 
-    The entries of the texel touched[j] are start[j] … start[j + 1].
+    It is the sum of `share` (e,) times `gradient` (n, SHADING) of `pixel` (e,), by the chain rule through diffuse albedo and F0. The
+    entries of the texel touched[j] are start[j] … start[j + 1].
     """
     for j in prange(touched.shape[0]):
         t = np.uint64(touched[j])
-        for c in range(PARAMETERS):
-            out[t, c] = _0
+        a0 = a1 = a2 = f0 = f1 = f2 = rough = x = y = z = _0
         for e in range(start[j], start[j + 1]):
             p = np.uint64(pixel[e])
             w = share[e]
-            for c in range(PARAMETERS):
-                out[t, c] += w * gradient[p, c]
+            a0 += w * gradient[p, 0]
+            a1 += w * gradient[p, 1]
+            a2 += w * gradient[p, 2]
+            f0 += w * gradient[p, 3]
+            f1 += w * gradient[p, 4]
+            f2 += w * gradient[p, 5]
+            rough += w * gradient[p, 6]
+            x += w * gradient[p, 7]
+            y += w * gradient[p, 8]
+            z += w * gradient[p, 9]
+        metal = values[t, 4]
+        out[t, 0] = (_1 - metal) * a0 + metal * f0
+        out[t, 1] = (_1 - metal) * a1 + metal * f1
+        out[t, 2] = (_1 - metal) * a2 + metal * f2
+        out[t, 3] = rough
+        b0, b1, b2 = values[t, 0], values[t, 1], values[t, 2]
+        out[t, 4] = (b0 - _F0) * f0 + (b1 - _F0) * f1 + (b2 - _F0) * f2 - b0 * a0 - b1 * a1 - b2 * a2
+        out[t, 5] = x
+        out[t, 6] = y
+        out[t, 7] = z
 
 
 @njit(inline="always", **_FLAGS)

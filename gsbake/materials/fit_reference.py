@@ -52,8 +52,19 @@ class Batch:
 
     def shade(self, values: Tensor, normal_offset: Tensor, tables: LightTables, transport: Tensor) -> Tensor:
         """Linear colours (n, 3) of the pixels for texels with material `values` (texels, 5) and light `transport` (texels, 11)."""
-        g = _interpolate(values, self.texel, self.bilinear)
-        return self._shade(self._normals(normal_offset), g[:, :3], g[:, 3], g[:, 4], tables, self._transport(transport))
+        metal = values[:, 4:]
+        parameters = torch.cat([(1 - metal) * values[:, :3], 0.04 * (1 - metal) + metal * values[:, :3], values[:, 3:4]], 1)
+        g = _interpolate(parameters, self.texel, self.bilinear)
+        albedo, f0, roughness = g[:, :3], g[:, 3:6], g[:, 6]
+        black, zero = torch.zeros_like(albedo), torch.zeros_like(roughness)
+
+        def shaded(base: Tensor, metallic: Tensor) -> Tensor:
+            return self._shade(self._normals(normal_offset), base, roughness, metallic, tables, self._transport(transport))
+
+        # Shading is linear in diffuse albedo and F0: three materials give its coefficients.
+        dielectric = shaded(black, zero)
+        specular = (shaded(black + 1, zero + 1) - dielectric) / 0.96
+        return dielectric + albedo * (shaded(black + 1, zero) - dielectric) + (f0 - 0.04) * specular
 
     def _normals(self, normal_offset: Tensor) -> Tensor:
         """Shading normals (n, 3) of the pixels, of any length, with the texels' `normal_offset` (texels, 3)."""

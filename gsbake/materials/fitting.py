@@ -16,11 +16,13 @@ from numpy.typing import NDArray
 from gsbake.capture.posed_photos import PosedPhotos
 from gsbake.capture.view_dependence import is_diffuse
 from gsbake.config.schema import Bake
+from gsbake.geometry.cameras import Camera
 from gsbake.materials.adjacency import neighbours
 from gsbake.materials.fit import FitSurface, Fitted
 from gsbake.materials.initialisation import ChosenFit
 from gsbake.materials.levels import FitLevel, InterpolatedTransport, coarse_pixels, coarse_surface
 from gsbake.materials.map_selection import drop_unneeded_maps
+from gsbake.materials.metal_superresolution import superresolve_metals
 from gsbake.materials.options import Priors
 from gsbake.materials.pixels import PixelReader, Pixels
 from gsbake.materials.reflections import ReflectionTracer
@@ -92,10 +94,11 @@ def fit_materials(
 
 @dataclass(frozen=True)
 class _PhotoPixels:
-    """Pixels of the photos to fit, of those that decisions look at and of those that nothing looks at, whether the surface is `diffuse`,
-    and the `evidence`."""
+    """Pixels of the photos to fit with their `cameras`, of those that decisions look at and of those that nothing looks at, whether the
+    surface is `diffuse`, and the `evidence`."""
 
     fitted: list[Pixels]
+    cameras: list[Camera]
     validation: list[Pixels]
     test: list[Pixels]
     diffuse: bool
@@ -153,15 +156,17 @@ class _Fitting:
         points = slice(None, None, max(1, len(surface.texel_position) // SURFACE_POINTS))
         brightness = MeshBrightness(surface.texel_position[points], surface.texel_normal[points], surface.caster, surface.diagonal)
         pixels: list[Pixels] = []
+        cameras: list[Camera] = []
         for index in range(count):
             self.monitor.check_stop()
             view = self.posed.view(index, settings.bake.fit_size)
             brightness.add(view)
             read = reader.read(view.camera, view.rgb, view.mask).subsampled(MAX_PIXELS)
             pixels.append(read.without_gain(self.projected.gains[index]))
-        fitted = set(range(count)) - validation - test
+            cameras.append(view.camera)
+        fitted = sorted(set(range(count)) - validation - test)
         photos, chosen, untouched = ([pixels[i] for i in sorted(role)] for role in (fitted, validation, test))
-        return _PhotoPixels(photos, chosen, untouched, *is_diffuse(*brightness.statistics()))
+        return _PhotoPixels(photos, [cameras[i] for i in fitted], chosen, untouched, *is_diffuse(*brightness.statistics()))
 
     def _trace_reflections(self, pixels: _PhotoPixels, texels: FitSurface) -> _PhotoPixels:
         """The pixels with the texels that their reflected rays hit."""
@@ -233,9 +238,13 @@ class _Fitting:
         def decide(name: str, holds: bool, evidence: str, skipped: str, done: str) -> bool:
             return decide_skip(self.monitor, name, rules[name], holds, evidence, skipped, done)
 
-        selected = drop_unneeded_maps(fitted.values, fitted.weight, _metal_count(fitted), partial(fit.psnr, validation), decide)
+        metal = fitted.values[:, 4] > 0.5
+        selected = drop_unneeded_maps(fitted.values, fitted.weight, int(metal.sum()), partial(fit.psnr, validation), decide)
         values = coarse.up(selected)
         values[:, :3] *= detail
+        if metal.any() and selected[:, 4].any():
+            photos = list(zip(pixels.fitted, pixels.cameras, strict=True))
+            values = superresolve_metals(self.surface, coarse, fit, metal, selected[:, 3], values, photos)
         if fitted.emissive_regions:
             values = np.concatenate([values, coarse.up(fitted.emission) * detail], 1)
         return values

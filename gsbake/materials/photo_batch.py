@@ -153,7 +153,7 @@ class FitStep:
 
     def __init__(self, texels: int) -> None:
         self.gradient = np.zeros((texels, fit_kernel.PARAMETERS), np.float32)
-        self._pixels = np.zeros((0, fit_kernel.PARAMETERS), np.float32)
+        self._pixels = np.zeros((0, fit_kernel.SHADING), np.float32)
         self.table = np.zeros((fit_kernel.CHUNKS, 0, 3), np.float32)
 
     def __call__(
@@ -170,7 +170,7 @@ class FitStep:
         squared error and weight. Gradients are multiplied by `factor`; with 0 they are left out."""
         n = len(batch)
         if len(self._pixels) < n:
-            self._pixels = np.zeros((n, fit_kernel.PARAMETERS), np.float32)
+            self._pixels = np.zeros((n, fit_kernel.SHADING), np.float32)
         if self.table.shape[1] != len(tables.table):
             self.table = np.zeros((fit_kernel.CHUNKS, len(tables.table), 3), np.float32)
         self.table[:] = 0
@@ -180,5 +180,5 @@ class FitStep:
             *tables.arrays, np.float32(residual_weight), np.float32(robust), np.float32(factor), self._pixels, self.table, sums,
         )  # fmt: skip
         if factor:
-            fit_kernel.gather_gradient(*batch.entries, self._pixels, self.gradient)
+            fit_kernel.gather_gradient(*batch.entries, self._pixels, values, self.gradient)
         return np.asarray(sums.sum(0))

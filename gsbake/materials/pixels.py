@@ -1,8 +1,8 @@
 """The pixels of a photo as bilinear reads of the texture: texels, view direction, colour and weight of each pixel.
 
 A ray through each pixel's centre meets the mesh once; from then on a photo is a list of texture reads, and the fit needs no rasteriser.
-Pixels near a mask's boundary, near depth edges and at grazing views weigh less: there a small error of shape shows another part of the
-surface.
+Where a texture is finer than the photos, a pixel is an average of several texels, found by supersampling (`subpixel_texels`). Pixels near
+a mask's boundary, near depth edges and at grazing views weigh less: there a small error of shape shows another part of the surface.
 """
 
 from __future__ import annotations
@@ -30,6 +30,8 @@ MASK_MARGIN = (1.5, 4.0)
 EDGE_STEP, EDGE_MARGIN = 0.015, 3.0
 #: Square blocks across the object in a photo, about.
 BLOCKS_ACROSS = 12
+#: Offsets of supersampling rays from a pixel's centre, in pixels: a rotated grid, no two in one row or column.
+SUBPIXEL_OFFSETS = ((-0.17, -0.5), (0.5, -0.17), (0.17, 0.5), (-0.5, 0.17))
 
 
 @dataclass(frozen=True)
@@ -37,8 +39,8 @@ class Pixels:
     """n pixels of one photo.
 
     `texel` (n, 4) int64 indices of texels and their weights `bilinear` (n, 4); `view` (n, 3) unit vectors from the surface to the camera;
-    `colour` (n, 3) sRGB 0..1; `weight` (n,) 0..1; `block` (n,) index of the square block of the photo;
-    `reflected_texel` (n,) the texel that the reflected ray hits, -1: none, None: not traced.
+    `colour` (n, 3) sRGB 0..1; `weight` (n,) 0..1; `block` (n,) index of the square block of the photo; `pixel` (n,) flat row-major index
+    in the photo; `reflected_texel` (n,) the texel that the reflected ray hits, -1: none, None: not traced.
     """
 
     texel: NDArray[np.int64]
@@ -47,6 +49,7 @@ class Pixels:
     colour: Floats
     weight: Floats
     block: NDArray[np.int32]
+    pixel: NDArray[np.int64]
     reflected_texel: NDArray[np.int64] | None = None
 
     def __len__(self) -> int:
@@ -103,7 +106,21 @@ class PixelReader:
         colour = rgb.reshape(-1, 3)[at].astype(np.float32) / 255
         side = max(1, int(np.sqrt(len(at)) / BLOCKS_ACROSS))
         block = at // width // side * (width // side + 1) + at % width // side
-        return Pixels(texel, bilinear, view[chosen].astype(np.float32), colour, weight.astype(np.float32), block.astype(np.int32))
+        return Pixels(texel, bilinear, view[chosen].astype(np.float32), colour, weight.astype(np.float32), block.astype(np.int32), at)
+
+    def subpixel_texels(self, camera: Camera, pixel: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+        """The texels (n, len(SUBPIXEL_OFFSETS)) hit by supersampling rays of each `pixel` (n,), and which lie at its front depth."""
+        column, row = pixel % camera.width + 0.5 - camera.cx, pixel // camera.width + 0.5 - camera.cy
+        texel = np.zeros((len(pixel), len(SUBPIXEL_OFFSETS)), np.int64)
+        distance = np.full((len(pixel), len(SUBPIXEL_OFFSETS)), np.inf, np.float32)
+        for k, (dx, dy) in enumerate(SUBPIXEL_OFFSETS):
+            rays = np.stack([(column + dx) / camera.fx, (row + dy) / camera.fy, np.ones(len(pixel))], 1) @ camera.R
+            hits = self._caster.first_hit(camera.centre[None], rays)
+            uv = np.einsum("nk,nkd->nd", hits.bary, self._uv[self._caster.faces[np.maximum(hits.face, 0)]])
+            found = self._texels.containing(uv)
+            valid = hits.hit & (found >= 0)
+            texel[:, k], distance[valid, k] = np.maximum(found, 0), hits.distance[valid]
+        return texel, distance < distance.min(1, keepdims=True) + EDGE_STEP * self._diagonal
 
     def _bilinear_taps(self, uv: NDArray[np.float64]) -> tuple[NDArray[np.int64], Floats]:
         """The four texels around each texture coordinate (n, 2) and their weights, 0 for texels outside the charts."""

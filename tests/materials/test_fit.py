@@ -295,7 +295,7 @@ def test_pixels_read_the_texture_at_the_ray_hit() -> None:
 
 def test_gain_is_divided_out_of_linear_colour() -> None:
     pixels = Pixels(np.zeros((1, 4), np.int64), np.full((1, 4), 0.25, np.float32), np.ones((1, 3), np.float32),
-                    encode(np.array([[0.4, 0.2, 0.1]])), np.ones(1, np.float32), np.zeros(1, np.int32))  # fmt: skip
+                    encode(np.array([[0.4, 0.2, 0.1]])), np.ones(1, np.float32), np.zeros(1, np.int32), np.zeros(1, np.int64))  # fmt: skip
     assert decode(pixels.without_gain(np.array([2.0, 1.0, 0.5])).colour) == pytest.approx(np.array([[0.2, 0.2, 0.2]]), abs=1e-5)
 
 

@@ -39,7 +39,7 @@ class Case:
         reflected = np.where(rng.uniform(size=PIXELS) < 0.3, rng.integers(0, TEXELS, PIXELS), -1) if traced else None
         self.pixels = Pixels(
             texel, bilinear, view.astype(np.float32), rng.uniform(0, 1, (PIXELS, 3)).astype(np.float32),
-            rng.uniform(0, 1, PIXELS).astype(np.float32), np.zeros(PIXELS, np.int32), reflected,
+            rng.uniform(0, 1, PIXELS).astype(np.float32), np.zeros(PIXELS, np.int32), np.arange(PIXELS), reflected,
         )  # fmt: skip
         radiance = rng.uniform(0, 1, (6, 8, 8, 3)) ** 3
         self.tables = EnvironmentLight.from_radiance(radiance.astype(np.float32)).prefilter().detach()

@@ -1,0 +1,293 @@
+"""Super-resolution of base colour on perforated metal: a linear inverse problem at the full texture, finer than the photos' pixels.
+
+Grilles, meshes and engravings have patterns of a pixel or two, bright metal beside black holes. A fit with texels of a pixel's width mixes
+both into grey. Shading is linear in base colour, though, so with light and roughness known each pixel says
+
+    colour − offset = slope · mean of b over the texels that the pixel covers,
+
+and the pixels of all photos together determine more than one value per pixel. The weighted squares (perceptual, robust) are reduced by
+simultaneous iterations (SIRT), within [0, 1] and near the initial values where no pixel constrains them.
+
+Holes are at the same places in all photos, unexplained reflections are not. So the problem is solved with all photos and with each half of
+them; where the full solution has holes and both halves show the same pattern, the metal is perforated. Other metal keeps its fitted values,
+which have less noise. So do dielectrics: their photos depend on diffuse shading, which the fit at pixel size determines as well, and
+residual reflections would become stains.
+
+Perforated metal is solved once more with a binary prior: one metal, and holes. From step to step every texel is drawn, finally as strongly
+as by the pixels, to metal or to black: the brightest texels to metal, as many as the local mean brightness implies (a threshold at half the
+metal's brightness would select too many, as blurred thin bars brighten the edges of holes). Meanwhile two constraints are relaxed, as bars
+are curved and the fitted light is blurred: brightness may exceed 1, and shading may be off by a gain that varies slowly over a photo and is
+estimated in each step (`_PhotoSystem.local_gain`). A pixel then constrains brightness relative to its neighbourhood.
+
+Goldlücke & Cremers, *Superresolution texture maps for multiview reconstruction*, ICCV 2009 (a texture finer than the photos, each pixel the
+mean of what it covers); Gilbert, *Iterative methods for the three-dimensional reconstruction of an object from projections*, 1972 (SIRT).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+import scipy.sparse
+from numpy.typing import NDArray
+
+from gsbake.geometry.cameras import Camera
+from gsbake.imaging.srgb import encode
+from gsbake.materials.fit import MaterialFit
+from gsbake.materials.metallic import MIN_METAL_ALBEDO, LinearShading, PhotoSamples, unclipped_weights
+from gsbake.materials.pixels import PixelReader, Pixels
+from gsbake.texturing.resampling import CoarseTexture
+from gsbake.texturing.texels import Texels
+from gsbake.texturing.unwrapped_mesh import UnwrappedMesh
+
+Floats = NDArray[np.float32]
+
+#: Iterations of the solver.
+SOLVER_STEPS = 15
+#: Weight of the initial values, as a share of the median weight of the pixels.
+INITIAL_WEIGHT = 0.001
+#: A photo's gain is averaged over about this many pixels, lies within this factor of 1, and tends to 1 where expected colours are below
+#: this share of their mean.
+GAIN_RADIUS, MAX_GAIN, GAIN_REGULARISATION = 4.0, 8.0, 0.003
+#: A texel lies in a metal region where this share of texels around it, within about so many texels, is metal: holes belong to the region.
+REGION_RADIUS, MIN_METAL_SHARE = 2.0, 0.35
+#: Hue is averaged over about this many texels: patterns differ in brightness, while a misplaced reflection has a hue.
+HUE_RADIUS = 4.0
+#: Metal is perforated where the share of holes is between these bounds: others were fitted as well and have less noise.
+HOLE_SHARE = (0.1, 0.6)
+#: Radius in texels of local statistics, and of the smoothing below which detail begins.
+LOCAL_RADIUS, DETAIL_RADIUS = 12.0, 3.0
+#: Least correlation of the detail in the two halves of the photos.
+MIN_CORRELATION = 0.25
+#: Steps before the binary prior starts, the largest brightness while it acts, and the power of relative brightness that weighs texels in
+#: the metal's colour (photos blur bars as well).
+UNCONSTRAINED_STEPS, MAX_BRIGHTNESS, BRIGHTNESS_POWER = 3, 1.5, 4
+#: Thresholds between hole and bar that are interpolated, and the final one; shares of the metal's brightness.
+BAR_THRESHOLDS, HOLE_THRESHOLD = (0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8), 0.25
+#: sRGB errors beyond this count linearly.
+ROBUST_SCALE = 0.1
+#: Reflectance of dielectrics at normal incidence.
+DIELECTRIC_F0 = 0.04
+
+
+@dataclass(frozen=True)
+class MetalPixels:
+    """m pixels of one photo: their `column` (m,) and `row` (m,), the texels (m, k) each averages and which of them `counts` (m, k), their
+    `samples`, and their `shading` in a metal's base colour."""
+
+    column: NDArray[np.int64]
+    row: NDArray[np.int64]
+    texel: NDArray[np.int64]
+    counts: NDArray[np.bool_]
+    samples: PhotoSamples
+    shading: LinearShading
+
+
+def superresolve_metals(
+    surface: UnwrappedMesh,
+    coarse: CoarseTexture,
+    fit: MaterialFit,
+    metal: NDArray[np.bool_],
+    roughness: Floats,
+    values: Floats,
+    photos: Sequence[tuple[Pixels, Camera]],
+) -> Floats:
+    """`values` (n, 5) of the surface's texels, with the base colour of perforated metal solved at full resolution.
+
+    `metal` (m,) and `roughness` (m,) belong to the `coarse` texels of the `fit`; `photos` are the fitted pixels with their cameras.
+    """
+    region = metal_regions(coarse.texels, metal)
+    reader = PixelReader(surface.atlas_caster, surface.atlas.uv, surface.texels, surface.diagonal)
+    metal_pixels = []
+    for pixels, camera in photos:
+        rows, samples = fit.samples_of(pixels, region)
+        pixel = pixels.pixel[rows]
+        row, column = np.divmod(pixel, camera.width)
+        shading = LinearShading.of(samples.shade, roughness, 1.0)
+        metal_pixels.append(MetalPixels(column, row, *reader.subpixel_texels(camera, pixel), samples, shading))
+    return superresolved(values, surface.texels, coarse.up(region[:, None].astype(np.float32))[:, 0] > 0.5, metal_pixels)
+
+
+def metal_regions(texels: Texels, metal: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Mask (n,) of the texels in a neighbourhood of mostly `metal` (n,)."""
+    return np.asarray(_blur(texels, metal[:, None], REGION_RADIUS)[:, 0] > MIN_METAL_SHARE)
+
+
+def superresolved(values: Floats, texels: Texels, region: NDArray[np.bool_], photos: Sequence[MetalPixels]) -> Floats:
+    """`values` (n, 5) of `texels` (linear base colour, roughness, metallic) with perforated metal in `region` (n,) solved.
+
+    Results darker than any metal, or much darker than the metal around, are holes: dielectric and rough, without a specular reflection of
+    the room. The rest of the perforated metal has metallic 1.
+    """
+    systems, initial = _photo_systems(photos, region), values[region, :3]
+    everything, half, other_half = (
+        _with_local_hue(_solve(some, initial), texels, region).mean(1) for some in (systems, systems[::2], systems[1::2])
+    )
+    perforated = region.copy()
+    perforated[region] = _has_holes(texels, region, everything < MIN_METAL_ALBEDO) & _correlated(texels, region, half, other_half)
+    if not perforated.any():
+        return values
+
+    def prior(base: Floats) -> Floats:
+        return _metal_or_black(base, texels, perforated)
+
+    base = _with_local_hue(_solve(_photo_systems(photos, perforated), values[perforated, :3], prior), texels, perforated)
+    metal = _metal_colour(base, texels, perforated).mean(1)
+    hole = base.mean(1) < np.maximum(HOLE_THRESHOLD * metal, MIN_METAL_ALBEDO)
+    out = values.copy()
+    out[perforated, :3] = np.where(hole[:, None], np.maximum(base - DIELECTRIC_F0, 0), np.minimum(base, 1))
+    if np.ptp(values[:, 3]) > 0:  # a constant roughness stays constant
+        out[perforated, 3] = np.where(hole, 1, out[perforated, 3])
+    out[perforated, 4] = ~hole
+    return out
+
+
+def _blur(texels: Texels, values: NDArray[Any], radius: float) -> Floats:
+    """`values` (n, c) blurred in the texture with a Gaussian of `radius` texels; 0 outside the charts."""
+    image = cv2.GaussianBlur(texels.image(values), (0, 0), radius)
+    return np.asarray(image.reshape(texels.size**2, -1)[texels.index])
+
+
+def _has_holes(texels: Texels, region: NDArray[np.bool_], hole: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Which of the t texels in `region` (n,) have both metal and holes (t,) around them."""
+    share = _local_mean(hole[:, None], texels, region, LOCAL_RADIUS)[:, 0]
+    return np.asarray((share > HOLE_SHARE[0]) & (share < HOLE_SHARE[1]))
+
+
+def _correlated(texels: Texels, region: NDArray[np.bool_], first: Floats, second: Floats) -> NDArray[np.bool_]:
+    """Where (t,) in `region` (n,) the detail of two brightnesses (t,) is locally correlated."""
+    both = np.stack([first, second], 1)
+    a, b = (both - _local_mean(both, texels, region, DETAIL_RADIUS)).T
+    covariance, variance_a, variance_b = _local_mean(np.stack([a * b, a * a, b * b], 1), texels, region, LOCAL_RADIUS).T
+    return np.asarray(covariance > MIN_CORRELATION * np.sqrt(variance_a * variance_b))
+
+
+def _local_mean(
+    values: NDArray[Any], texels: Texels, region: NDArray[np.bool_], radius: float, weight: NDArray[Any] | None = None
+) -> Floats:
+    """Gaussian mean over about `radius` texels of `values` (t, c) in `region` (n,), weighted by `weight` (t,)."""
+    w = np.ones(len(values), np.float32) if weight is None else weight
+    weighted = np.zeros((len(region), values.shape[1] + 1), np.float32)
+    weighted[region, :-1], weighted[region, -1] = values * w[:, None], w
+    blurred = _blur(texels, weighted, radius)[region]
+    return np.asarray(blurred[:, :-1] / np.maximum(blurred[:, -1:], 1e-6))
+
+
+def _with_local_hue(base: Floats, texels: Texels, region: NDArray[np.bool_]) -> Floats:
+    """`base` (t, 3) in `region` (n,) with its own brightness and the mean hue around."""
+    around = _local_mean(base, texels, region, HUE_RADIUS)
+    return np.asarray(around * (base.mean(1) / np.maximum(around.mean(1), 1e-6))[:, None])
+
+
+def _metal_colour(base: Floats, texels: Texels, region: NDArray[np.bool_]) -> Floats:
+    """Colour (t, 3) of the metal around each texel of `base` (t, 3) in `region` (n,): the mean of the brighter ones."""
+    brightness = base.mean(1)
+    ratio = brightness / np.maximum(_local_mean(base, texels, region, LOCAL_RADIUS).mean(1), 1e-6)
+    return _local_mean(base, texels, region, LOCAL_RADIUS, (ratio > 1) * ratio**BRIGHTNESS_POWER)
+
+
+def _metal_or_black(base: Floats, texels: Texels, region: NDArray[np.bool_]) -> Floats:
+    """For each texel of `base` (t, 3) in `region` (n,) the colour (t, 3) of the metal around it, or black.
+
+    The brightest texels are metal. The threshold, a share of the metal's brightness, is interpolated between `BAR_THRESHOLDS` such that the
+    local mean of the binary image is that of `base`.
+    """
+    metal = _metal_colour(base, texels, region)
+    share = base.mean(1) / np.maximum(metal.mean(1), 1e-6)
+    above = _local_mean(np.column_stack([share[:, None] > np.asarray(BAR_THRESHOLDS), share]), texels, region, DETAIL_RADIUS)
+    wanted = above[:, -1]
+    threshold = np.full(len(base), BAR_THRESHOLDS[0])
+    for k in range(1, len(BAR_THRESHOLDS)):
+        more, fewer = above[:, k - 1], above[:, k]
+        part = np.clip((more - wanted) / np.maximum(more - fewer, 1e-6), 0, 1)
+        interpolated = BAR_THRESHOLDS[k - 1] + part * (BAR_THRESHOLDS[k] - BAR_THRESHOLDS[k - 1])
+        threshold = np.where(more > wanted, interpolated, threshold)
+    return np.where((share > threshold)[:, None], metal, np.float32(0))
+
+
+@dataclass(frozen=True)
+class _PhotoSystem:
+    """One photo's part of the linear system: the matrix `mean` (m, t) that averages t texels for its m pixels, their `column` and `row`
+    (m,), linear `colour` (m, 3), `weight` (m, 3) and `shading`."""
+
+    mean: Any
+    column: NDArray[np.int64]
+    row: NDArray[np.int64]
+    colour: Floats
+    weight: Floats
+    shading: LinearShading
+
+    def local_gain(self, base: Floats, previous: Floats) -> Floats:
+        """Ratio (m, 1) of photo to shading around each pixel of base colour `base` (m, 3); `previous` (m, 1) is the last estimate."""
+        weight = self._robust_weights(base, self._gained(previous))
+        shaded = self.shading.slope * base + self.shading.offset
+        sums = np.stack([(weight * shaded * self.colour).sum(1), (weight * shaded**2).sum(1)], 1)
+        column, row = self.column - self.column.min(), self.row - self.row.min()
+        image = np.zeros((row.max() + 1, column.max() + 1, 2), np.float32)
+        image[row, column] = sums
+        observed, expected = cv2.GaussianBlur(image, (0, 0), GAIN_RADIUS)[row, column].T
+        prior = GAIN_REGULARISATION * expected.mean()
+        ratio = (observed + prior) / np.maximum(expected + prior, 1e-12)
+        return np.asarray(np.clip(ratio, 1 / MAX_GAIN, MAX_GAIN)[:, None], np.float32)
+
+    def normal_equations(self, base: Floats, gain: Floats) -> tuple[Floats, Floats]:
+        """Gradient (t, 3) and weight (t, 3) for the texels where pixels have base colour `base` (m, 3) and `gain` (m, 1)."""
+        shading = self._gained(gain)
+        weight = self._robust_weights(base, shading)
+        rest = self.colour - shading.offset - shading.slope * base
+        return self.mean.T @ (weight * shading.slope * rest), self.mean.T @ (weight * shading.slope**2)
+
+    def _gained(self, gain: Floats) -> LinearShading:
+        """The shading times `gain` (m, 1)."""
+        return LinearShading(gain * self.shading.slope, gain * self.shading.offset)
+
+    def _robust_weights(self, base: Floats, shading: LinearShading) -> Floats:
+        """The weights (m, 3), reduced for pixels with large errors of `shading` at `base` (m, 3)."""
+        error = np.abs(shading.srgb(base) - encode(self.colour))
+        return np.asarray(self.weight / np.maximum(error / ROBUST_SCALE, 1), np.float32)
+
+
+def _photo_systems(photos: Sequence[MetalPixels], region: NDArray[np.bool_]) -> list[_PhotoSystem]:
+    """The linear systems of the texels in `region` (n,), from pixels most of which lies there."""
+    index = np.cumsum(region) - 1
+    systems: list[_PhotoSystem] = []
+    for photo in photos:
+        counts = photo.counts & region[photo.texel]
+        used = 2 * counts.sum(1) > counts.shape[1]
+        if not used.any():
+            continue
+        row, k = np.nonzero(counts[used])
+        share = (1 / counts.sum(1)[used][row]).astype(np.float32)
+        mean = scipy.sparse.csr_matrix((share, (row, index[photo.texel[used][row, k]])), shape=(int(used.sum()), int(region.sum())))
+        shading = LinearShading(photo.shading.slope[used], photo.shading.offset[used])
+        weight = unclipped_weights(photo.samples)[used]
+        systems.append(_PhotoSystem(mean, photo.column[used], photo.row[used], photo.samples.colour[used], weight, shading))
+    return systems
+
+
+def _solve(systems: Sequence[_PhotoSystem], initial: Floats, prior: Callable[[Floats], Floats] | None = None) -> Floats:
+    """Base colours (t, 3) in [0, 1] that reproduce the photos, near `initial` (t, 3).
+
+    With `prior` they are drawn increasingly to its value for the present ones, up to `MAX_BRIGHTNESS`, and photos have local gains.
+    """
+    base = initial.copy()
+    gains = [np.ones((len(system.row), 1), np.float32) for system in systems]
+    for step in range(SOLVER_STEPS):
+        gradient, weight = np.zeros_like(initial), np.zeros_like(initial)
+        for k, system in enumerate(systems):
+            pixel_base = np.asarray(system.mean @ base)
+            if prior is not None:
+                gains[k] = system.local_gain(pixel_base, gains[k])
+            photo_gradient, photo_weight = system.normal_equations(pixel_base, gains[k])
+            gradient += photo_gradient
+            weight += photo_weight
+        median = np.median(weight[weight > 0]) if (weight > 0).any() else 1.0
+        gradient, weight = gradient + INITIAL_WEIGHT * median * (initial - base), weight + INITIAL_WEIGHT * median
+        if prior is not None and step >= UNCONSTRAINED_STEPS:
+            strength = median * (step + 1 - UNCONSTRAINED_STEPS) / (SOLVER_STEPS - UNCONSTRAINED_STEPS)
+            gradient, weight = gradient + strength * (prior(base) - base), weight + strength
+        base = np.asarray(np.clip(base + gradient / weight, 0, 1 if prior is None else MAX_BRIGHTNESS), np.float32)
+    return base
