@@ -49,7 +49,7 @@ class FitOptions:
     #: Adam's learning rate of the texels' logits, per step.
     texel_rate: float = 0.15
     #: Adam's learning rate of the environment map's raw values, per step.
-    light_rate: float = 0.15
+    light_rate: float = 0.3
     #: Adam's learning rate of the normal offsets, per step; small, as the mesh's normals are nearly right.
     normal_rate: float = 0.01
     #: Factor on all learning rates at the last step; the decay is exponential.
