@@ -43,7 +43,7 @@ MAJORITY = 0.5
 #: Linear values above this are taken as clipped.
 CLIPPED = 0.95
 #: Noise of sRGB values (0..1), and degrees of freedom of Student's t distribution of their errors.
-NOISE, DEGREES_OF_FREEDOM = 0.0025, 3.0
+NOISE, DEGREES_OF_FREEDOM = 0.01, 3.0
 #: Standard deviation of normals, as a length added to the unit normal along each tangent.
 NORMAL_ERROR = 0.035
 #: Lowest linear colour at which the slope of the sRGB curve is taken.
