@@ -7,4 +7,5 @@ import os
 # Before any library with a thread pool is imported: the tests' own pools stay small, so that runs side by side do not fight.
 for _pool in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OPENCV_FOR_THREADS_NUM"):
     os.environ.setdefault(_pool, "2")
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # spinning threads make each of two processes on two cores several times slower
 os.environ.setdefault("NUMBA_THREADING_LAYER_PRIORITY", "omp workqueue tbb")  # an old TBB on the machine would only warn

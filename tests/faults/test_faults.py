@@ -166,10 +166,6 @@ def failed_writes(reference: Reference, folder: Path, library: Path, count: int,
     return outcomes
 
 
-def test_a_few_failing_writes(reference: Reference, tmp_path: Path, failing_writes: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    tell(capsys, "failing writes", failed_writes(reference, tmp_path, failing_writes, 1, 3))
-
-
 @pytest.mark.slow
 @pytest.mark.timeout(5400)
 @pytest.mark.parametrize("seed", range(5))

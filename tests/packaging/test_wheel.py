@@ -8,7 +8,7 @@ import subprocess
 import sys
 import venv
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import pytest
@@ -42,8 +42,12 @@ def test_one_top_level_package(wheel: Path) -> None:
     assert not [name for name in names if "test" in name or name.endswith((".nbi", ".nbc", ".pyc"))]
 
 
-def test_it_bakes_from_an_empty_folder(wheel: Path, tmp_path: Path) -> None:
-    """In an environment of its own that has the dependencies, from this one, but no checkout."""
+Run = Callable[..., str]
+
+
+@pytest.fixture
+def installed(wheel: Path, tmp_path: Path) -> Run:
+    """Runs a command in an empty folder, in an environment of its own that has the dependencies, from this one, but no checkout."""
     home, work = tmp_path / "environment", tmp_path / "work"
     venv.create(home, with_pip=False)
     work.mkdir()
@@ -52,10 +56,20 @@ def test_it_bakes_from_an_empty_folder(wheel: Path, tmp_path: Path) -> None:
     (packages / "dependencies.pth").write_text("\n".join(site.getsitepackages()))
     run(sys.executable, "-m", "pip", "install", "--no-deps", "--quiet", "--target", packages, wheel, cwd=work)
     clean = {key: value for key, value in os.environ.items() if not key.startswith(("PYTHON", "COV_", "COVERAGE"))}
-    command = [home / "bin" / "python", "-m", "gsbake"]
     where = run(home / "bin" / "python", "-c", "import gsbake; print(gsbake.__file__)", cwd=work, environment=clean).strip()
     assert Path(where).is_relative_to(packages)
-    run(*command, "synth", "capture", "--views", 8, "--size", 64, cwd=work, environment=clean)
-    settings = [word for pair in TINY for word in ("--set", pair)]
-    text = run(*command, "run", "capture", "--profile", "smoke", "--out", "out", *settings, cwd=work, environment=clean)
-    assert (work / "out" / "asset.glb").stat().st_size > 10_000 and "Asset" in text
+    return lambda *command: run(home / "bin" / "python", "-m", "gsbake", *command, cwd=work, environment=clean)
+
+
+def test_first_stages_from_an_empty_folder(installed: Run, tmp_path: Path) -> None:
+    installed("synth", "capture", "--views", 8, "--size", 64)
+    assert "relight" in installed("profiles")
+    installed("poses", "capture", "--profile", "smoke", "--out", "out")
+    assert list((tmp_path / "work" / "out" / "stages" / "poses").glob("*/cameras.json"))
+
+
+@pytest.mark.slow
+def test_it_bakes_from_an_empty_folder(installed: Run, tmp_path: Path) -> None:
+    installed("synth", "capture", "--views", 8, "--size", 64)
+    text = installed("run", "capture", "--profile", "smoke", "--out", "out", *(word for pair in TINY for word in ("--set", pair)))
+    assert (tmp_path / "work" / "out" / "asset.glb").stat().st_size > 10_000 and "Asset" in text

@@ -71,6 +71,7 @@ def test_the_asset_is_valid(baked: tuple[Path, Path]) -> None:
     assert gltf_issues(baked[1] / "asset.glb") == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "missing", [("train.iterations=0", "refine.iterations=0"), ("stereo.enabled=never",)], ids=["no training", "no stereo"]
 )
