@@ -122,11 +122,11 @@ def prior_loss(
     with the weights `smoothness` (8,); `mean_weight` (5,) times the values, of base colour the diffuse part; squared normal offset; squared
     distance of sRGB base colour and roughness to the `common` materials (n, 4) with half of `common_weight` (4,)."""
     change = values[pairs[:, 0]] - values[pairs[:, 1]]
-    bend = normal_offset[pairs[:, 0]] - normal_offset[pairs[:, 1]]
+    difference = normal_offset[pairs[:, 0]] - normal_offset[pairs[:, 1]]
     distance = torch.cat([linear_to_srgb(values[:, :3]), values[:, 3:4]], 1) - common
     return (
         (change.abs() @ smoothness[:5]).sum()
-        + (bend.square() @ smoothness[5:]).sum()
+        + (difference.square() @ smoothness[5:]).sum()
         + (values[:, :3] * (1 - values[:, 4:].detach()) @ mean_weight[:3] + values[:, 3:] @ mean_weight[3:]).sum()
         + offset_weight * normal_offset.square().sum()
         + 0.5 * (distance.square() @ common_weight).sum()
