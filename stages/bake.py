@@ -20,10 +20,10 @@ def run(ctx: Context) -> dict[str, Any]:
 
 STAGE = Stage(
     name="bake",
-    version=16,
+    version=18,
     title="Textures",
     run=run,
-    summary="{charts} charts, {texels} texels, {fit_psnr:dB} on held-out photos",
+    summary="{charts} charts, {texels} texels, {fit_psnr:dB} on test photos",
     needs=("poses", "refine", "mesh"),
     settings=(
         "bake.*", "light.size", "train.max_size", "train.holdout", "skip.exposure_equalisation", "skip.normal_map", "skip.specular",

@@ -22,10 +22,10 @@ def run(ctx: Context) -> dict[str, Any]:
 
 STAGE = Stage(
     name="refine",
-    version=2,
+    version=3,
     title="Surfel refinement",
     run=run,
-    summary="{surfels} surfels, {steps} steps, {psnr:dB} on held-out photos",
+    summary="{surfels} surfels, {steps} steps, {psnr:dB} on validation photos",
     needs=("poses", "train"),
     settings=("refine.*", "train.max_size", "train.holdout", "train.lr_*", "surfels.*", "loss.*", "skip.converged_steps"),
     uses_device=True,

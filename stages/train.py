@@ -23,10 +23,10 @@ def run(ctx: Context) -> dict[str, Any]:
 
 STAGE = Stage(
     name="train",
-    version=3,
+    version=4,
     title="Surfel training",
     run=run,
-    summary="{surfels} surfels, {steps} steps, {psnr:dB} on held-out photos",
+    summary="{surfels} surfels, {steps} steps, {psnr:dB} on validation photos",
     needs=("poses", "stereo"),
     settings=("train.*", "surfels.*", "light.*", "loss.*", "skip.converged_steps", "skip.confirmed_steps", "skip.*_refinement"),
     uses_device=True,

@@ -50,7 +50,7 @@ def summary_lines(result: Result, seconds: float) -> list[tuple[str, str]]:
     elif result.stages and result.stages[-1].artifact is not None:
         lines.append(("Output", str(result.stages[-1].artifact.folder)))
     if report.get("psnr") is not None:
-        photos = "held-out photos" if report.get("held_out") else "training photos"
+        photos = "test photos" if report.get("held_out") else "training photos"
         lines.append(("Quality", f"{report['psnr']:.1f} dB PSNR, SSIM {report['ssim']:.3f} on {report['compared']} {photos}"))
     if result.warnings:
         lines.append(("Warnings", f"{len(result.warnings)}, listed above and in the report"))

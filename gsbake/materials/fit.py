@@ -3,7 +3,7 @@
 Inverse rendering in texture space: with mesh, atlas and cameras fixed, each step shades the pixels of one photo (split sum, METHOD §6) and
 takes an Adam step on texels, normal offsets and light. The loss is
 
-    Σ w ρ(sRGB(shade) − photo) + smoothness · |∇ texture| + base_color_l1 · mean base colour + metallic_l1 · mean metallic
+    Σ w ρ(sRGB(shade) − photo) + smoothness · |∇ texture| + base_color_l1 · mean (1 − metallic) base colour + metallic_l1 · mean metallic
     + neutral_light · colourfulness of the light + sparsity · residual · |texture − common materials|²
 
 ρ is pseudo-Huber, so that a misplaced reflection has little influence; a plain L1 error ignores reflections that are slightly off and makes
@@ -22,30 +22,30 @@ together in this way; visibility per texel and weights per view are added by the
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from gsbake.imaging.metrics import decibels
-from gsbake.imaging.srgb_torch import linear_to_srgb
+from gsbake.materials import fit_kernel
 from gsbake.materials.bilateral import EdgeAwareFilter
 from gsbake.materials.emission import find_emission
 from gsbake.materials.light_intensity import LightAdjustment, adjust_radiance, search_light
 from gsbake.materials.metallic import PhotoSamples, find_metals
 from gsbake.materials.options import FitOptions, FitSchedule, Priors
-from gsbake.materials.pixel_shading import EMISSION, INDIRECT, OUTGOING, TRANSPORT_CHANNELS, VISIBILITY, Batch
+from gsbake.materials.photo_batch import EMISSION, INDIRECT, OUTGOING, VISIBILITY, FitStep, KernelTables, PhotoBatch
 from gsbake.materials.pixels import Pixels
 from gsbake.materials.sparsity_prior import KERNEL_WIDTHS, common_materials
-from gsbake.materials.visibility import Visibility
 from gsbake.shading.cubemap import solid_angles
 from gsbake.shading.environment import EnvironmentLight
+from gsbake.shading.light_tables import prefilter_cube_map
 from gsbake.shading.neutral_light import neutral_light_loss
+from gsbake.texturing.resampling import DETAIL_OFFSET, MAX_DETAIL_RATIO
 from gsbake.texturing.texels import Texels
 
 Floats = NDArray[np.float32]
@@ -57,8 +57,8 @@ class Fitted:
 
     `values` (n, 5): linear base colour, roughness, metallic of each texel; `normal_offset` (n, 3) to be added to its unit normal; `weight`
     (n,) of all pixels that show it; `emission` (n, 3) its emitted radiance; the `light` in the mesh's frame; `held_out_psnr` in dB over the
-    pixels of held-out photos (None without any); `metal` (n,) the texels last detected as metal and still metallic; the number of
-    `emissive_regions`; `light_adjustments`, one per search for the light's intensity.
+    pixels of held-out photos (None without any); the number of `emissive_regions`; `light_adjustments`, one per search for the light's
+    intensity.
     """
 
     values: Floats
@@ -67,9 +67,18 @@ class Fitted:
     emission: Floats
     light: EnvironmentLight
     held_out_psnr: float | None
-    metal: NDArray[np.bool_]
     emissive_regions: int
     light_adjustments: tuple[LightAdjustment, ...]
+
+
+class Transport(Protocol):
+    """Visibility and indirect light of the texels; see `gsbake.materials.visibility.Visibility`."""
+
+    def visible_share(self, radiance: NDArray[Any]) -> Floats:
+        """Unoccluded share (n,) of the irradiance by luminance under the cube map `radiance`."""
+
+    def indirect_irradiance(self, irradiance: NDArray[Any], reflectance: NDArray[Any]) -> Floats:
+        """Indirect irradiance / π (n, 3) of texels with `reflectance` (n, 3) under direct `irradiance` / π (n, 3)."""
 
 
 @dataclass(frozen=True)
@@ -77,7 +86,7 @@ class FitSurface:
     """The n texels of a texture with their geometry.
 
     `position`, unit `normal` (n, 3) in the mesh's frame; `pairs` (m, 2) neighbouring texels, shuffled as `gsbake.materials.adjacency` does;
-    `occlusion` (n,) ambient occlusion, 1 = open; `base_color` (n, 3) the initial linear base colour. With `visibility` shadows follow the
+    `occlusion` (n,) ambient occlusion, 1 = open; `base_color` (n, 3) the initial linear base colour. With `transport` shadows follow the
     light, with `indirect` texels light each other as well.
     """
 
@@ -87,36 +96,66 @@ class FitSurface:
     normal: NDArray[Any]
     occlusion: NDArray[Any]
     base_color: NDArray[Any]
-    visibility: Visibility | None = None
+    transport: Transport | None = None
     indirect: bool = True
 
 
 class MaterialFit:
     """Texels and light while they are optimised."""
 
-    def __init__(self, surface: FitSurface, light_size: int, priors: Priors, roughness: float, options: FitOptions | None = None) -> None:
-        """`light_size` is the edge of the environment map's faces in texels, `roughness` the initial value of all texels."""
+    def __init__(
+        self,
+        surface: FitSurface,
+        light_size: int,
+        priors: Priors,
+        roughness: float,
+        metallic: float = 0.05,
+        options: FitOptions | None = None,
+    ) -> None:
+        """`light_size` is the edge of the environment map's faces in texels; `roughness`, `metallic` the initial values of all texels."""
         self._surface, self._priors, self._options = surface, priors, options or FitOptions()
         o, n = self._options, len(surface.texels)
-        logits = torch.zeros(n, 5)
-        logits[:, :3] = torch.logit(torch.as_tensor(np.clip(surface.base_color, *o.base_color_range), dtype=torch.float32))
-        logits[:, 3] = math.log(roughness / (1 - roughness))
-        logits[:, 4] = math.log(o.initial_metallic / (1 - o.initial_metallic))
-        self._logits = logits
-        self._normal = torch.as_tensor(np.ascontiguousarray(surface.normal, np.float32))
-        self._normal_offset = torch.zeros(n, 3, requires_grad=True)
-        # The change of normals per texel grows with the size of texels.
-        self._normal_smoothness = o.normal_smoothness * (surface.texels.size / 512) ** 2
-        occlusion = torch.as_tensor(np.ascontiguousarray(surface.occlusion, np.float32))[:, None]
-        self._transport = torch.cat([occlusion, occlusion, torch.zeros(n, TRANSPORT_CHANNELS - 2)], 1)
+        values = np.zeros((n, fit_kernel.PARAMETERS), np.float32)
+        values[:, :3] = np.clip(surface.base_color, *o.base_color_range)
+        values[:, 3], values[:, 4] = roughness, metallic
+        self._set(values)
+        self._metal_start, self.emissive_regions = metallic > o.max_dielectric_metallic, 0
+        self._adjustments: list[LightAdjustment] = []
+        self._moments = np.zeros_like(values), np.zeros_like(values)
+        self._steps = 0
+        self._step_buffers = FitStep(n)
+        self._normal = np.ascontiguousarray(surface.normal, np.float32)
+        self._transport = np.zeros((n, fit_kernel.TRANSPORT), np.float32)
+        self._transport[:, :2] = surface.occlusion[:, None]
         self._light = EnvironmentLight(light_size)
-        self._common: torch.Tensor | None = None
-        self._residual = torch.zeros(2)  # sums of weighted squared errors and of weights
-        self._channels, self._kernel_widths = torch.tensor(o.smoothness_channels), torch.tensor(KERNEL_WIDTHS)
-        self._pairs = torch.as_tensor(surface.pairs)
-        self._adam = torch.optim.Adam([self._logits.requires_grad_()], lr=o.texel_rate, betas=o.betas, eps=o.epsilon)
-        self._adam_normal = torch.optim.Adam([self._normal_offset], lr=o.normal_rate, betas=o.betas, eps=o.epsilon)
+        self._common = np.zeros((0, 4), np.float32)
+        self._residual = np.zeros(2)  # sums of weighted squared errors and of weights
         self._adam_light = torch.optim.Adam([self._light.raw], lr=o.light_rate, betas=o.betas)
+
+    def _set(self, values: Floats) -> None:
+        """Start from texel `values` (n, PARAMETERS)."""
+        self._values, self._spare = values, np.empty_like(values)
+        self._raw = values.copy()
+        self._raw[:, :5] = _logit(values[:, :5])
+
+    def continued_on(self, surface: FitSurface, up: Callable[[NDArray[Any]], Floats]) -> MaterialFit:
+        """A fit on the finer texels of `surface` that starts from this one; `up` interpolates values (n, c) at the finer texels.
+
+        Base colour takes its detail from the surface's initial one.
+        """
+        o = self._options
+        fit = MaterialFit(surface, self._light.size, self._priors, 0.5, options=o)
+        values = up(self._values)
+        detail = (surface.base_color + DETAIL_OFFSET) / (up(self._surface.base_color) + DETAIL_OFFSET)
+        values[:, :3] = np.clip(values[:, :3] * np.clip(detail, 1 / MAX_DETAIL_RATIO, MAX_DETAIL_RATIO), *o.base_color_range)
+        values[:, 3:5] = np.clip(values[:, 3:5], o.min_base_color, 1 - o.min_base_color)
+        fit._set(np.ascontiguousarray(values, np.float32))
+        with torch.no_grad():
+            fit._light.raw.copy_(self._light.raw)
+        if self.emissive_regions:
+            fit._transport[:, EMISSION] = up(self._transport[:, EMISSION])
+        fit._metal_start, fit.emissive_regions, fit._adjustments = self._metal_start, self.emissive_regions, self._adjustments
+        return fit
 
     def run(
         self,
@@ -126,204 +165,251 @@ class MaterialFit:
         each: Callable[[int, int], None] | None = None,
     ) -> Fitted:
         """Fit to `photos`; `held_out` are only used to evaluate the result. `each(done, total)` is called after every step."""
-        o, steps, generator = self._options, schedule.iterations, torch.Generator().manual_seed(schedule.seed)
-        batches = [Batch.of(p, self._normal) for p in photos if len(p)]
+        o, steps, generator = self._options, schedule.iterations, np.random.default_rng(schedule.seed)
+        batches = self._batches(photos)
         order: list[int] = []
-        metal, emissive_regions = np.zeros(len(self._logits), bool), 0
-        adjustments: list[LightAdjustment] = []
-        self._common, self._residual = None, torch.zeros(2)
+        self._common, self._residual = np.zeros((0, 4), np.float32), np.zeros(2)
+        weight = self._texel_weight(batches)
         for step in range(steps if batches else 0):
             update_common = step % o.sparsity_interval == 0
             if schedule.emission and step == int(o.emission_search_at * steps):
-                emissive_regions = self._search_emission(batches)
+                self.emissive_regions = self._search_emission(batches)
             if schedule.intensity and step in {int(share * steps) for share in o.intensity_searches_at}:
-                tint = not schedule.diffuse or len(adjustments) < o.diffuse_tint_searches
-                adjustments.append(self._search_light(batches, generator, tint, rough=not adjustments))
+                tint = not schedule.diffuse or len(self._adjustments) < o.diffuse_tint_searches
+                self._adjustments.append(self._search_light(batches, generator, tint, rough=not self._adjustments))
                 update_common = True
-            if schedule.metallic and not schedule.diffuse and step in {int(share * steps) for share in o.metal_searches_at}:
-                metal = self._search_metals(batches)
+            if not schedule.diffuse and step in {int(share * steps) for share in schedule.metal_searches_at}:
+                self._search_metals(batches)
                 update_common = True
             if step % o.visibility_interval == 0:
                 self._update_transport()
                 self._residual *= o.residual_decay
             if schedule.sparsity and self._priors.sparsity and update_common and step >= o.sparsity_from * steps:
                 self._common = self._find_common_materials()
-            order = order or torch.randperm(len(batches), generator=generator).tolist()
-            self._step(batches[order.pop()], o.final_rate ** (step / steps), generator)
+            order = order or generator.permutation(len(batches)).tolist()
+            self._step(batches[order.pop()], schedule.rate * o.final_rate ** (step / steps))
             if each is not None:
                 each(step + 1, steps)
-        with torch.no_grad():
-            values = torch.sigmoid(self._logits).numpy()
-        normal_offset, emission = self._normal_offset.detach().numpy(), self._transport[:, EMISSION].numpy()
-        metal &= values[:, 4] > o.min_metallic
-        weight, psnr = self._texel_weight(batches), self.psnr(held_out)
-        return Fitted(values, normal_offset, weight, emission, self._light, psnr, metal, emissive_regions, tuple(adjustments))
+        values, emission = self._values[:, :5].copy(), self._transport[:, EMISSION].copy()
+        psnr = self.psnr(held_out)
+        offset = self._values[:, 5:].copy()
+        return Fitted(values, offset, weight, emission, self._light, psnr, self.emissive_regions, tuple(self._adjustments))
 
-    def _texel_weight(self, batches: list[Batch]) -> Floats:
+    def _batches(self, photos: list[Pixels]) -> list[PhotoBatch]:
+        return [PhotoBatch.of(p, self._normal) for p in photos if len(p)]
+
+    def _texel_weight(self, batches: list[PhotoBatch]) -> Floats:
         """Total weight (n,) of the pixels that show each texel."""
-        weight = torch.zeros(len(self._logits))
+        weight = np.zeros(len(self._raw))
         for batch in batches:
-            for k in range(4):
-                weight.index_add_(0, batch.texel[:, k], batch.bilinear[:, k] * batch.weight)
-        return np.asarray(weight.numpy())
+            touched, start, pixel, share = batch.entries
+            weight[touched] += np.add.reduceat(share * batch.weight[pixel], start[:-1])
+        return weight.astype(np.float32)
 
-    def _step(self, batch: Batch, decay: float, generator: torch.Generator) -> None:
+    def _step(self, batch: PhotoBatch, decay: float) -> None:
         """One Adam step on the pixels of one photo, with learning rates times `decay`."""
-        o = self._options
-        loss = self._loss(batch, generator)
-        optimisers = (self._adam, o.texel_rate), (self._adam_normal, o.normal_rate), (self._adam_light, o.light_rate)
-        for adam, rate in optimisers:
-            adam.zero_grad()
-            adam.param_groups[0]["lr"] = rate * decay
-        (loss * len(self._logits)).backward()
-        for adam, _ in optimisers:
-            adam.step()
+        o, n = self._options, len(self._raw)
+        radiance = self._light.radiance()
+        tables = prefilter_cube_map(radiance)
+        sums = self._step_buffers(
+            batch, self._values, KernelTables.of(tables), self._transport, o.residual_weight, o.robust_scale, n / len(batch)
+        )
+        self._residual += sums[1:]
+        self._adam_light.zero_grad()
+        self._adam_light.param_groups[0]["lr"] = o.light_rate * decay
+        loss = (tables.table * torch.from_numpy(self._step_buffers.table.sum(0))).sum()
+        if self._priors.neutral_light:
+            loss = loss + n * self._priors.neutral_light * neutral_light_loss(radiance)
+        loss.backward()
+        self._adam_light.step()
+        self._update_texels(decay)
 
-    def _loss(self, batch: Batch, generator: torch.Generator) -> torch.Tensor:
-        """The loss in the module's docstring on one photo, per texel."""
-        o, priors, values = self._options, self._priors, torch.sigmoid(self._logits)
-        shaded = batch.shade(values, self._normal_offset, self._light.prefilter(), self._transport)
-        # Clamped: a reflection brighter than white that the photo does not show has no gradient; it is misplaced rather than too bright.
-        error = linear_to_srgb(shaded.clamp(0, 1)) - batch.colour
-        squares = error.square()
-        self._residual += torch.stack([(squares.detach().mean(1) * batch.weight).sum(), batch.weight.sum()])
-        error = o.residual_weight * ((squares + o.robust_scale**2).sqrt() - o.robust_scale).mean(1)
-        loss = (error * batch.weight).mean()
-        loss = loss + priors.base_color_l1 * values[:, :3].mean() + priors.metallic_l1 * values[:, 4].mean()
-        if priors.neutral_light:
-            loss = loss + priors.neutral_light * neutral_light_loss(self._light.radiance())
-        if priors.smoothness and len(self._pairs):
-            count = max(1, int(o.compared_pairs * len(self._pairs)))
-            start = int(torch.randint(len(self._pairs) - count + 1, (1,), generator=generator))
-            pair = self._pairs[start : start + count]
-            loss = loss + priors.smoothness * ((values[pair[:, 0]] - values[pair[:, 1]]).abs() @ self._channels).mean()
-            change = self._normal_offset[pair[:, 0]] - self._normal_offset[pair[:, 1]]
-            loss = loss + self._normal_smoothness * (change**2).sum(1).mean()
-        if self._common is not None:
-            residual = self._residual[0] / self._residual[1].clamp_min(1e-6) / o.robust_scale**2
-            distance = (torch.cat([linear_to_srgb(values[:, :3]), values[:, 3:4]], 1) - self._common) / self._kernel_widths
-            loss = loss + priors.sparsity * residual * 0.5 * distance.square().sum(1).mean()
-        return loss + o.normal_offset_weight * (self._normal_offset**2).sum(1).mean()
+    def _update_texels(self, decay: float) -> None:
+        """One Adam step on all texels, from the gradient of the photo and those of the priors."""
+        o, priors, f = self._options, self._priors, np.float32
+        self._steps += 1
+        start, neighbour = self._adjacency
+        pair_weight = len(self._raw) / max(1, len(self._surface.pairs))
+        normal_smoothness = o.normal_smoothness * (self._surface.texels.size / 512) ** 2  # the change per texel grows with their size
+        smoothness = np.array([*(priors.smoothness * np.array(o.smoothness_channels)), *[normal_smoothness] * 3], f) * f(pair_weight)
+        mean_weight = np.array([*[priors.base_color_l1 / 3] * 3, 0, priors.metallic_l1, 0, 0, 0], f)
+        common_weight = np.zeros(4, f)
+        if len(self._common):
+            residual = self._residual[0] / max(self._residual[1], 1e-6) / o.robust_scale**2
+            common_weight = (priors.sparsity * residual / np.square(KERNEL_WIDTHS)).astype(f)
+        rate = np.array([o.texel_rate] * 5 + [o.normal_rate] * 3, f) * f(decay)
+        beta1, beta2 = o.betas
+        fit_kernel.adam_step(
+            self._raw, self._values, self._spare, self._step_buffers.gradient, *self._moments, start, neighbour, smoothness, mean_weight,
+            f(o.normal_offset_weight), self._common, common_weight, rate, f(beta1), f(beta2), f(1 / (1 - beta1**self._steps)),
+            f(1 / (1 - beta2**self._steps)), f(o.epsilon),
+        )  # fmt: skip
+        self._values, self._spare = self._spare, self._values
 
-    @torch.no_grad()
+    @cached_property
+    def _adjacency(self) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
+        """The neighbours of each texel: `start` (n + 1,) and the list they lie in."""
+        pairs = self._surface.pairs
+        both = np.concatenate([pairs, pairs[:, ::-1]])
+        order = np.argsort(both[:, 0], kind="stable")
+        start = np.searchsorted(both[order, 0], np.arange(len(self._raw) + 1))
+        return start, both[order, 1].astype(np.int32)
+
     def _update_transport(self) -> None:
         """Visibility, indirect light and outgoing radiance under the present light and materials."""
-        visibility = self._surface.visibility
-        if visibility is None:
+        transport = self._surface.transport
+        if transport is None:
             return
-        visible = torch.as_tensor(visibility.visible_share(self._light.radiance().numpy()))
+        visible = transport.visible_share(self._radiance())
         self._transport[:, VISIBILITY] = visible
         if self._surface.indirect:
-            values = torch.sigmoid(self._logits)
             # Albedo of both lobes together, (1 − m) base colour + F0: indirect light is not sharp enough to depend on roughness.
-            reflectance = values[:, :3] + 0.04 * (1 - values[:, 4:])
-            irradiance = self._light.prefilter().diffuse(self._normal) * visible[:, None]
-            indirect = torch.as_tensor(visibility.indirect_irradiance(irradiance.numpy(), reflectance.numpy()))
+            reflectance = self._values[:, :3] + np.float32(0.04) * (1 - self._values[:, 4:5])
+            irradiance = self._irradiance() * visible[:, None]
+            indirect = transport.indirect_irradiance(irradiance, reflectance)
             self._transport[:, INDIRECT] = indirect
             self._transport[:, OUTGOING] = reflectance * (irradiance + indirect) + self._transport[:, EMISSION]
 
+    def _radiance(self) -> Floats:
+        """The environment map (6, size, size, 3)."""
+        return np.asarray(self._light.radiance().detach().numpy())
+
     @torch.no_grad()
-    def _find_common_materials(self) -> torch.Tensor:
+    def _irradiance(self) -> Floats:
+        """Irradiance / π (n, 3) of unoccluded texels."""
+        return np.asarray(self._light.prefilter().diffuse(torch.from_numpy(self._normal)).numpy())
+
+    @torch.no_grad()
+    def _tables(self) -> KernelTables:
+        return KernelTables.of(self._light.prefilter())
+
+    def _find_common_materials(self) -> Floats:
         """The common material (n, 4) that the sparsity prior draws each texel to; emissive texels, whose base colour hardly shows, keep
         their own."""
-        return torch.as_tensor(common_materials(torch.sigmoid(self._logits).numpy(), self._non_emissive().numpy()))
+        return common_materials(self._values[:, :5], self._non_emissive())
 
-    def _non_emissive(self) -> torch.Tensor:
+    def _non_emissive(self) -> NDArray[np.bool_]:
         """Which texels (n,) do not emit."""
-        return self._transport[:, EMISSION].sum(1) == 0
+        return np.asarray(self._transport[:, EMISSION].sum(1) == 0)
 
     @torch.no_grad()
-    def _search_light(self, batches: list[Batch], generator: torch.Generator, tint: bool, rough: bool) -> LightAdjustment:
+    def _search_light(self, batches: list[PhotoBatch], generator: np.random.Generator, tint: bool, rough: bool) -> LightAdjustment:
         """Search for the light's intensity and contrast and for a roughness shift, apply them, and adapt base colours."""
-        o, values = self._options, torch.sigmoid(self._logits)
+        o, values = self._options, self._values
         dielectric = (values[:, 4] < o.max_dielectric_metallic) & self._non_emissive()
-        share = min(1.0, o.intensity_pixels / max(1, sum(len(b.weight) for b in batches)))
-        chosen = dielectric & (torch.rand(len(dielectric), generator=generator) < share)
-        subset = [part for b in batches if len((part := b.select(chosen)).weight)]
+        if dielectric.mean() < o.min_dielectric_share:
+            return self._anchor_metals()
+        share = min(1.0, o.intensity_pixels / max(1, sum(map(len, batches))))
+        chosen = dielectric & (generator.random(len(dielectric)) < share)
+        subset = [part for b in batches if len(part := b.select(chosen))]
         if not subset:
             return LightAdjustment(np.ones(3), 1.0, 0.0, 0.0)
-        radiance, area = self._light.radiance().numpy(), solid_angles(self._light.size)
+        radiance, area = self._radiance(), solid_angles(self._light.size)
+        visible: dict[float, Floats] = {}  # the share does not depend on the intensity, and hardly on the tint
 
         def adjusted(intensity: NDArray[np.float64], contrast: float) -> EnvironmentLight:
             return EnvironmentLight.from_radiance(adjust_radiance(radiance, intensity, contrast, area))
 
         def samples_under(intensity: NDArray[np.float64], contrast: float) -> list[PhotoSamples]:
             light = adjusted(intensity, contrast)
-            transport = self._transport.clone()
-            if self._surface.visibility is not None:
-                transport[:, VISIBILITY] = torch.as_tensor(self._surface.visibility.visible_share(light.radiance().numpy()))
-            tables = light.prefilter()
-            return [b.samples(self._normal_offset, tables, transport) for b in subset]
+            transport = self._transport.copy()
+            if self._surface.transport is not None:
+                if contrast not in visible:
+                    visible[contrast] = self._surface.transport.visible_share(light.radiance().numpy())
+                transport[:, VISIBILITY] = visible[contrast]
+            tables = KernelTables.of(light.prefilter())
+            return [b.samples(values[:, 5:], tables, transport) for b in subset]
 
-        found = search_light(samples_under, values[:, 3].numpy(), tint, rough)
+        found = search_light(samples_under, values[:, 3].copy(), tint, rough)
         if found.improvement <= 0:
             return found
-        before = self._light.prefilter().diffuse(self._normal) * self._transport[:, :1]
+        before = self._irradiance() * self._transport[:, :1]
         self._light.raw.copy_(adjusted(found.intensity, found.contrast).raw)
         self._adam_light.state.clear()
         self._update_transport()
-        after = self._light.prefilter().diffuse(self._normal) * self._transport[:, :1]
-        at = torch.nonzero(dielectric)[:, 0]
-        new = values[at].numpy()
-        new[:, :3] = np.clip(new[:, :3] * (before[at] / after[at].clamp_min(1e-6)).numpy(), o.min_base_color, o.base_color_range[1])
+        after = self._irradiance() * self._transport[:, :1]
+        at = np.flatnonzero(dielectric)
+        new = values[at, :5]
+        new[:, :3] = np.clip(new[:, :3] * before[at] / np.maximum(after[at], 1e-6), o.min_base_color, o.base_color_range[1])
         new[:, 3] = found.shifted_roughness(new[:, 3])
-        self._reinitialise(at.numpy(), new)
+        self._reinitialise(at, new)
         return found
+
+    def _anchor_metals(self) -> LightAdjustment:
+        """Scale the light and base colours so that metals are as bright as metals usually are: their reflections leave the scale open."""
+        o, metal = self._options, self._values[:, 4] > 0.5
+        if not metal.any():
+            return LightAdjustment(np.ones(3), 1.0, 0.0, 0.0)
+        bright = float(np.quantile(self._values[metal, :3].max(1), o.metal_quantile))
+        factor = np.clip(o.metal_base_color / max(bright, o.min_base_color), 1 / o.max_metal_factor, o.max_metal_factor)
+        self._light.raw.copy_(EnvironmentLight.from_radiance(self._radiance() / np.float32(factor)).raw)
+        self._adam_light.state.clear()
+        new = self._values[:, :5].copy()
+        new[:, :3] = np.clip(new[:, :3] * np.float32(factor), o.min_base_color, o.base_color_range[1])
+        self._reinitialise(np.arange(len(new)), np.clip(new, 1e-6, 1 - 1e-6))
+        self._update_transport()
+        return LightAdjustment(np.full(3, 1 / factor), 1.0, 0.0, 0.0)
 
     @cached_property
     def _colour_filter(self) -> EdgeAwareFilter:
         """The edge-aware filter of the initial base colours; built on first use, as trials need none."""
-        return EdgeAwareFilter(self._surface.texels, self._pairs.numpy(), self._surface.base_color)
+        return EdgeAwareFilter(self._surface.texels, self._surface.pairs, self._surface.base_color)
 
-    def _samples(self, batches: list[Batch]) -> list[PhotoSamples]:
-        """All pixels under the present light."""
-        tables = self._light.prefilter()
-        return [b.samples(self._normal_offset, tables, self._transport) for b in batches]
+    def _samples(self, batches: list[PhotoBatch], tilted: bool = False) -> list[PhotoSamples]:
+        """All pixels under the present light, with `tilted` normals as well."""
+        tables = self._tables()
+        return [b.samples(self._values[:, 5:], tables, self._transport, tilted) for b in batches]
 
-    @torch.no_grad()
-    def _search_metals(self, batches: list[Batch]) -> NDArray[np.bool_]:
-        """Reinitialise texels that are detected as metal; which (n,) these are."""
-        o, samples = self._options, self._samples(batches)
-        found = find_metals(samples, torch.sigmoid(self._logits[:, 3]).numpy(), self._colour_filter)
-        metallic = np.full(len(found.texel), o.detected_metallic)
-        self._reinitialise(found.texel, np.column_stack([np.clip(found.base, *o.base_color_range), found.roughness, metallic]))
-        return np.isin(np.arange(len(self._logits)), found.texel)
+    def _search_metals(self, batches: list[PhotoBatch]) -> None:
+        """Reinitialise texels that are detected as metal, and from a metallic start those that are dielectric."""
+        o = self._options
+        step = max(1, sum(map(len, batches)) // (o.metal_pixels * len(self._raw)))
+        samples = self._samples([batch.every(step) for batch in batches], tilted=True)
+        found = find_metals(samples, self._values[:, 3].copy(), self._colour_filter)
+        kinds = [(found.texel, found.base, found.roughness, o.detected_metallic)]
+        if self._metal_start:
+            kinds.append((*found.dielectric, o.detected_dielectric))
+        for texel, base, roughness, metallic in kinds:
+            # A texel that already is of its kind keeps its values.
+            other = (self._values[texel, 4] > 0.5) != (metallic > 0.5) if self._metal_start else np.ones(len(texel), bool)
+            values = np.column_stack([np.clip(base, *o.base_color_range), roughness, np.full(len(texel), metallic)])
+            self._reinitialise(texel[other], values[other])
 
-    @torch.no_grad()
-    def _search_emission(self, batches: list[Batch]) -> int:
+    def _search_emission(self, batches: list[PhotoBatch]) -> int:
         """Set the radiance of emissive regions and reinitialise their base colour to black; the number of regions."""
-        o, samples = self._options, self._samples(batches)
-        values = torch.sigmoid(self._logits).numpy()
-        position = np.asarray(self._surface.position, np.float64)
-        found = find_emission(samples, values[:, 3], self._pairs.numpy(), position)
-        self._transport[torch.as_tensor(found.texel), EMISSION] = torch.as_tensor(found.radiance, dtype=torch.float32)
-        black = values[found.texel]
-        black[:, :3], black[:, 4] = o.base_color_range[0], o.initial_metallic
+        o, position = self._options, np.asarray(self._surface.position, np.float64)
+        found = find_emission(self._samples(batches), self._values[:, 3].copy(), self._surface.pairs, position)
+        self._transport[found.texel, EMISSION] = found.radiance
+        black = self._values[found.texel, :5]
+        black[:, :3], black[:, 4] = o.base_color_range[0], o.detected_dielectric
         self._reinitialise(found.texel, black)
         return found.regions
 
     def _reinitialise(self, texel: NDArray[np.int64], values: NDArray[Any]) -> None:
         """Set texels (m,) to `values` (m, 5) and reset the optimiser's moments there."""
-        at = torch.as_tensor(texel)
-        self._logits[at] = torch.logit(torch.as_tensor(values, dtype=torch.float32))
-        for moment in self._adam.state[self._logits].values():
-            if moment.shape == self._logits.shape:
-                moment[at] = 0
+        self._values[texel, :5] = values
+        self._raw[texel, :5] = _logit(self._values[texel, :5])
+        for moment in self._moments:
+            moment[texel, :5] = 0
 
-    @torch.no_grad()
     def samples_of(self, pixels: Pixels, chosen: NDArray[np.bool_]) -> tuple[NDArray[np.int64], PhotoSamples]:
         """Which (m,) of the `pixels` have a dominant texel that is `chosen` (n,), and their samples under the fitted light."""
-        batch, texels = Batch.of(pixels, self._normal), torch.as_tensor(chosen)
-        rows = torch.nonzero(texels[batch.dominant_texel])[:, 0]
-        return rows.numpy(), batch.select(texels).samples(self._normal_offset, self._light.prefilter(), self._transport)
+        batch = PhotoBatch.of(pixels, self._normal)
+        samples = batch.select(chosen).samples(self._values[:, 5:], self._tables(), self._transport)
+        return np.flatnonzero(chosen[batch.dominant_texel]), samples
 
-    @torch.no_grad()
     def psnr(self, photos: list[Pixels], values: Floats | None = None) -> float | None:
         """PSNR in dB over all pixels of `photos` (None without any), with the fitted texels or with `values` (n, 5)."""
-        batches = [Batch.of(p, self._normal) for p in photos if len(p)]
+        batches = [replace(batch, weight=np.ones_like(batch.weight)) for batch in self._batches(photos)]
         if not batches:
             return None
-        materials, tables = torch.sigmoid(self._logits) if values is None else torch.as_tensor(values), self._light.prefilter()
-        shaded = (b.shade(materials, self._normal_offset, tables, self._transport).clamp_min(0) for b in batches)
-        squares = torch.cat([((linear_to_srgb(s) - b.colour) ** 2).mean(1) for s, b in zip(shaded, batches, strict=True)])
-        return decibels(float(squares.mean()))
+        materials = self._values if values is None else np.column_stack([values[:, :5], self._values[:, 5:]]).astype(np.float32)
+        tables, o = self._tables(), self._options
+        sums = np.sum([self._step_buffers(b, materials, tables, self._transport, 1.0, o.robust_scale, 0.0) for b in batches], axis=0)
+        return decibels(float(sums[1] / sums[2]))
+
+
+def _logit(values: NDArray[Any]) -> Floats:
+    """log(v / (1 − v)) of values in (0, 1)."""
+    v = np.asarray(values, np.float64)
+    return np.asarray(np.log(v / (1 - v)), np.float32)

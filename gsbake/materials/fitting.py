@@ -1,4 +1,7 @@
-"""Material textures of an unwrapped mesh: read pixels, trace visibility, fit materials and light, select maps, add fine detail."""
+"""Material textures of an unwrapped mesh: read pixels, trace visibility, fit materials and light, select maps, add fine detail.
+
+The fit works on two levels (`levels`): starts are compared and searches made on the coarse one, and the fine one continues from the best.
+"""
 
 from __future__ import annotations
 
@@ -15,22 +18,24 @@ from gsbake.capture.view_dependence import is_diffuse
 from gsbake.config.schema import Bake
 from gsbake.geometry.cameras import Camera
 from gsbake.materials.adjacency import neighbours
-from gsbake.materials.fit import FitSurface, MaterialFit
-from gsbake.materials.initialisation import ChosenFit, best_fit, trial_cost, trial_roughness
+from gsbake.materials.fit import FitSurface, Fitted
+from gsbake.materials.initialisation import ChosenFit
+from gsbake.materials.levels import FitLevel, InterpolatedTransport, coarse_pixels, coarse_surface
 from gsbake.materials.map_selection import drop_unneeded_maps
 from gsbake.materials.metal_superresolution import superresolve_metals
 from gsbake.materials.options import Priors
 from gsbake.materials.pixels import PixelReader, Pixels
 from gsbake.materials.reflections import ReflectionTracer
+from gsbake.materials.two_level_fit import FitPlan, fit_two_levels
 from gsbake.materials.view_dependence import SURFACE_POINTS, MeshBrightness
 from gsbake.materials.visibility import Visibility
 from gsbake.meshing.resolution import pixel_footprint
 from gsbake.monitor import Monitor, Rule, decide_skip, skips
 from gsbake.shading.environment import EnvironmentLight
-from gsbake.surfels.training.views import held_out
+from gsbake.surfels.training.views import held_out, test_photos, validation_photos
 from gsbake.texturing.normal_map import DenseSamples
 from gsbake.texturing.projection import ProjectedTexture
-from gsbake.texturing.resampling import CoarseTexture
+from gsbake.texturing.resampling import MIN_SIZE, CoarseTexture
 from gsbake.texturing.unwrapped_mesh import UnwrappedMesh
 
 Floats = NDArray[np.float32]
@@ -89,11 +94,13 @@ def fit_materials(
 
 @dataclass(frozen=True)
 class _PhotoPixels:
-    """Pixels of the fitted and of the held-out photos, cameras of the fitted ones, whether the surface is `diffuse`, and the `evidence`."""
+    """Pixels of the photos to fit with their `cameras`, of those that decisions look at and of those that nothing looks at, whether the
+    surface is `diffuse`, and the `evidence`."""
 
     fitted: list[Pixels]
-    held_out: list[Pixels]
     cameras: list[Camera]
+    validation: list[Pixels]
+    test: list[Pixels]
     diffuse: bool
     evidence: str
 
@@ -115,13 +122,13 @@ class _Fitting:
         """Choose the texture size, read the photos' pixels, trace visibility, fit, and resample to the full texture."""
         footprint = self._choose_texture()
         pixels = self._read_pixels()
-        texels = self._fit_surface()
+        fine, coarse = self._surfaces()
         diffuse = skips(self.settings.specular, pixels.diffuse)
-        if texels.visibility is not None and self.settings.bake.visibility == "reflections" and not diffuse:
-            pixels = self._trace_reflections(pixels, texels)
-        choice = self._fit(texels, pixels, diffuse)
+        if fine.transport is not None and self.settings.bake.visibility == "reflections" and not diffuse:
+            pixels = self._trace_reflections(pixels, fine)
+        choice = self._fit(fine, coarse, pixels, diffuse)
         values = self._full_texture(choice, pixels)
-        return self._result(choice, values, footprint, pixels.fitted)
+        return self._result(choice, values, footprint, pixels)
 
     @property
     def _ray_offset(self) -> float:
@@ -135,6 +142,8 @@ class _Fitting:
         footprint = pixel_footprint(cameras, surface.position.mean(0))
         self.coarse = CoarseTexture.of(surface.atlas.uv, surface.atlas.faces, surface.texels, surface.texel_size, footprint)
         size = self.coarse.texels.size
+        half = max(MIN_SIZE, size // 2)
+        self.half = CoarseTexture.sized(surface.atlas.uv, surface.atlas.faces, self.coarse.texels, self.coarse.edge, half)
         self.monitor.decide("fit texture", f"{size}² texels", f"texel width {self.coarse.edge / footprint:.2f} pixels")
         return footprint
 
@@ -142,71 +151,77 @@ class _Fitting:
         """Read the pixels of all photos, exposure gains divided out, and measure view dependence."""
         surface, settings = self.surface, self.settings
         reader = PixelReader(surface.atlas_caster, surface.atlas.uv, self.coarse.texels, surface.diagonal)
-        held_out_views = set(held_out(len(self.posed), settings.holdout))
+        count = len(self.posed)
+        validation, test = (set(roles(count, settings.holdout)) for roles in (validation_photos, test_photos))
         points = slice(None, None, max(1, len(surface.texel_position) // SURFACE_POINTS))
         brightness = MeshBrightness(surface.texel_position[points], surface.texel_normal[points], surface.caster, surface.diagonal)
-        fitted: list[Pixels] = []
-        validation: list[Pixels] = []
+        pixels: list[Pixels] = []
         cameras: list[Camera] = []
-        for index in range(len(self.posed)):
+        for index in range(count):
             self.monitor.check_stop()
             view = self.posed.view(index, settings.bake.fit_size)
             brightness.add(view)
-            pixels = reader.read(view.camera, view.rgb, view.mask).subsampled(MAX_PIXELS)
-            (validation if index in held_out_views else fitted).append(pixels.without_gain(self.projected.gains[index]))
-            cameras += [] if index in held_out_views else [view.camera]
-        return _PhotoPixels(fitted, validation, cameras, *is_diffuse(*brightness.statistics()))
+            read = reader.read(view.camera, view.rgb, view.mask).subsampled(MAX_PIXELS)
+            pixels.append(read.without_gain(self.projected.gains[index]))
+            cameras.append(view.camera)
+        fitted = sorted(set(range(count)) - validation - test)
+        photos, chosen, untouched = ([pixels[i] for i in sorted(role)] for role in (fitted, validation, test))
+        return _PhotoPixels(photos, [cameras[i] for i in fitted], chosen, untouched, *is_diffuse(*brightness.statistics()))
 
     def _trace_reflections(self, pixels: _PhotoPixels, texels: FitSurface) -> _PhotoPixels:
         """The pixels with the texels that their reflected rays hit."""
         caster, uv = self.surface.atlas_caster, self.surface.atlas.uv
         tracer = ReflectionTracer(caster, uv, texels.texels, texels.position, texels.normal, self._ray_offset)
-        return replace(pixels, fitted=[*map(tracer.trace, pixels.fitted)], held_out=[*map(tracer.trace, pixels.held_out)])
+        fitted, validation, test = ([*map(tracer.trace, photos)] for photos in (pixels.fitted, pixels.validation, pixels.test))
+        return replace(pixels, fitted=fitted, validation=validation, test=test)
 
-    def _fit_surface(self) -> FitSurface:
-        """The coarse texels with their geometry, ambient occlusion, visibility and initial base colour."""
-        surface, coarse, settings = self.surface, self.coarse, self.settings.bake
-        normal, occlusion, base = (coarse.down(x) for x in (self.detail.normal, self.occlusion[:, None], self.projected.values))
-        position = coarse.texels.interpolate(surface.position, surface.atlas.faces)
-        visibility = None
-        if settings.visibility in ("directional", "bounce", "reflections") and settings.occlusion_rays:
-            radius, rays = SMOOTHING_RADIUS * coarse.edge, 2 * settings.occlusion_rays  # over the whole sphere
-            visibility = Visibility.trace(
-                coarse.texels, surface.atlas.uv, surface.atlas_caster, normal, rays, self._ray_offset, radius,
-                lambda *_: self.monitor.check_stop(),
-            )  # fmt: skip
+    def _surfaces(self) -> tuple[FitSurface, FitSurface]:
+        """The texels of the fine and of the coarse level: geometry, ambient occlusion, light transport and initial base colour."""
+        surface, texture, settings = self.surface, self.coarse, self.settings.bake
+        normal, occlusion, base = (texture.down(x) for x in (self.detail.normal, self.occlusion[:, None], self.projected.values))
+        position = texture.texels.interpolate(surface.position, surface.atlas.faces)
         if settings.visibility == "none":
             occlusion = np.ones_like(occlusion)
-        pairs = neighbours(coarse.texels, position, normal)
-        indirect = settings.visibility in ("bounce", "reflections")
-        return FitSurface(coarse.texels, position, pairs, normal, occlusion[:, 0], base, visibility, indirect)
+        pairs, indirect = neighbours(texture.texels, position, normal), settings.visibility in ("bounce", "reflections")
+        fine = FitSurface(texture.texels, position, pairs, normal, occlusion[:, 0], base, None, indirect)
+        coarse = coarse_surface(fine, self.half)
+        if settings.visibility == "none" or not settings.occlusion_rays:
+            return fine, coarse
+        radius, rays = SMOOTHING_RADIUS * self.half.edge, 2 * settings.occlusion_rays  # over the whole sphere
+        transport = Visibility.trace(
+            coarse.texels, surface.atlas.uv, surface.atlas_caster, coarse.normal, rays, self._ray_offset, radius,
+            lambda *_: self.monitor.check_stop(),
+        )  # fmt: skip
+        return replace(fine, transport=InterpolatedTransport(transport, self.half)), replace(coarse, transport=transport)
 
-    def _fit(self, texels: FitSurface, pixels: _PhotoPixels, diffuse: bool) -> ChosenFit:
-        """Fit from each candidate of the initial roughness, and report the decisions; `diffuse`: without specular reflection."""
-        settings, monitor = self.settings.bake, self.monitor
-        priors = Priors.of(settings)
+    def _fit(self, fine_texels: FitSurface, coarse_texels: FitSurface, pixels: _PhotoPixels, diffuse: bool) -> ChosenFit:
+        """Compare starts on the coarse level, and fit the fine one from the best; `diffuse`: without specular reflection.
 
-        def each(done: int, total: int) -> None:
+        Few photos are held out, so the coarse level adds some of those to fit to the validation photos; the fine level fits them.
+        """
+        settings, monitor, light_size = self.settings.bake, self.monitor, self.settings.light_size
+        reduce = partial(coarse_pixels, texture=self.half)
+        photos, validation = [*map(reduce, pixels.fitted)], [*map(reduce, pixels.validation)]
+        added = set(held_out(len(photos), self.settings.holdout)) if validation else set()
+        kept = [p for i, p in enumerate(photos) if i not in added]
+        coarse = FitLevel(coarse_texels, kept, validation + [photos[i] for i in sorted(added)])
+        fine = FitLevel(fine_texels, pixels.fitted, pixels.validation)
+
+        def each(name: str, done: int, total: int) -> None:
             monitor.check_stop()
-            monitor.progress(done, total, "material fit")
+            monitor.progress(done, total, name)
 
-        def make(roughness: float) -> MaterialFit:
-            return MaterialFit(texels, self.settings.light_size, priors, roughness)
-
-        trials = {} if diffuse else trial_roughness(make, pixels.fitted, self.seed, lambda done, total: monitor.check_stop())
         started = time.perf_counter()
-        choice = best_fit(make, pixels.fitted, pixels.held_out, settings.fit_iterations, self.seed, trials, diffuse, each)
-        step_seconds = (time.perf_counter() - started) / (settings.fit_iterations * choice.fits)
-        self._report(choice, pixels, trial_cost(pixels.fitted, step_seconds))
+        plan = FitPlan(settings.fit_iterations, light_size, Priors.of(settings), self.seed, diffuse)
+        choice = fit_two_levels(coarse, fine, self.half, plan, each)
+        seconds = time.perf_counter() - started
+        self._report(choice, pixels, 0.0 if diffuse else seconds)
         return choice
 
     def _report(self, choice: ChosenFit, pixels: _PhotoPixels, saved: float) -> None:
         """Report the decisions of the fit; skipping specular reflection would have `saved` so many seconds."""
         monitor, fitted = self.monitor, choice.fitted
-        monitor.decide("initial roughness", f"{choice.roughness:g}", choice.evidence)
-        if choice.metal_evidence:
-            verdict = "metallic confirmed" if fitted.metal.any() else "metallic rejected on validation views"
-            monitor.decide("metallic validation", verdict, choice.metal_evidence)
+        monitor.decide("initial material", f"metallic {choice.metallic:g}, roughness {choice.roughness:g}", choice.evidence)
         skipped, done = "diffuse object", "specular reflection fitted"
         decide_skip(monitor, "specular", self.settings.specular, pixels.diffuse, pixels.evidence, skipped, done, saved)
         adjustments = "; ".join(map(str, fitted.light_adjustments))
@@ -215,37 +230,42 @@ class _Fitting:
 
     def _full_texture(self, choice: ChosenFit, pixels: _PhotoPixels) -> Floats:
         """The fitted values at all texels (n, 5 or 8), without the maps that are not needed, with fine detail."""
-        coarse, fit, fitted, settings = self.coarse, choice.fit, choice.fitted, self.settings
+        coarse, settings, fit, fitted = self.coarse, self.settings, choice.fit, choice.fitted
         detail = coarse.detail(self.projected.values)
-        validation = pixels.held_out if any(map(len, pixels.held_out)) else pixels.fitted
-        metals = int(fitted.metal.sum())
+        validation = pixels.validation if any(map(len, pixels.validation)) else pixels.fitted
         rules = {"metallic_map": settings.metallic_map, "roughness_map": settings.roughness_map}
 
         def decide(name: str, holds: bool, evidence: str, skipped: str, done: str) -> bool:
             return decide_skip(self.monitor, name, rules[name], holds, evidence, skipped, done)
 
-        selected = drop_unneeded_maps(fitted.values, fitted.weight, metals, partial(fit.psnr, validation), decide)
+        metal = fitted.values[:, 4] > 0.5
+        selected = drop_unneeded_maps(fitted.values, fitted.weight, int(metal.sum()), partial(fit.psnr, validation), decide)
         values = coarse.up(selected)
         values[:, :3] *= detail
-        if metals and selected[:, 4].any():
+        if metal.any() and selected[:, 4].any():
             photos = list(zip(pixels.fitted, pixels.cameras, strict=True))
-            values = superresolve_metals(self.surface, coarse, fit, fitted.metal, selected[:, 3], values, photos)
+            values = superresolve_metals(self.surface, coarse, fit, metal, selected[:, 3], values, photos)
         if fitted.emissive_regions:
             values = np.concatenate([values, coarse.up(fitted.emission) * detail], 1)
         return values
 
-    def _result(self, choice: ChosenFit, values: Floats, footprint: float, photos: list[Pixels]) -> FittedTextures:
-        """Textures, refined normals, light and figures."""
+    def _result(self, choice: ChosenFit, values: Floats, footprint: float, pixels: _PhotoPixels) -> FittedTextures:
+        """Textures, refined normals, light and figures; `fit_psnr` is that on test photos."""
         coarse, fitted = self.coarse, choice.fitted
         observed = coarse.up(fitted.weight[:, None])[:, 0] > MIN_OBSERVATIONS * (coarse.edge / footprint) ** 2
         normal = self.detail.normal + np.where(observed[:, None], coarse.up(fitted.normal_offset), 0)
         normal /= np.linalg.norm(normal, axis=1, keepdims=True)
         figures: dict[str, Any] = {
-            "fit_psnr": fitted.held_out_psnr,
-            "fit_pixels": sum(map(len, photos)),
+            "fit_psnr": choice.fit.psnr(pixels.test),
+            "fit_pixels": sum(map(len, pixels.fitted)),
             "fit_texels": len(coarse.texels),
-            "fit_metal_texels": int(fitted.metal.sum()),
+            "fit_metal_texels": _metal_count(fitted),
             "fit_emissive_regions": fitted.emissive_regions,
         }
         textures = replace(self.projected, values=values, views=np.where(observed, self.projected.views, 0))
         return FittedTextures(textures, replace(self.detail, normal=normal), fitted.light, figures)
+
+
+def _metal_count(fitted: Fitted) -> int:
+    """Number of metallic texels."""
+    return int((fitted.values[:, 4] > 0.5).sum())

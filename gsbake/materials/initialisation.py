@@ -1,116 +1,84 @@
-"""Choice of the fit's initial roughness, and of whether to search for metals, on validation views.
+"""Start of the material fit: initial metallic and roughness, compared on validation photos.
 
-The initial roughness decides which light is found: a surface that starts too rough cannot localise light, and its reflections end up in
-base colour; one that starts too smooth makes the light blurred. Short trials from a few values are compared on photos that they were not
-fitted to. Where two are close, both are fitted in full.
-
-Detected metals should be confirmed by photos that were not fitted. Where those are reproduced nearly as well with metallic 0, the metals
-may be white or black dielectrics, and the fit is repeated without them.
+Gradient steps find the optimum near their start. A surface that starts too rough cannot localise light, and its reflections end up in base
+colour; one that starts dielectric explains a metal's reflections by a diffuse base colour under a light of their colour, and stays there.
+So short fits on the coarse level, from all-dielectric and all-metal starts of several roughnesses, are compared on photos that they were
+not fitted to. On the way `MaterialFit` decides texel by texel between metal and dielectric, so either start can end as any mixture. The
+best of them is continued with all searches, and so is the best of the other kind where it is close; all on the coarse level.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 
 from gsbake.materials.fit import Fitted, MaterialFit
-from gsbake.materials.map_selection import without_metal
+from gsbake.materials.levels import FitLevel
 from gsbake.materials.options import FitSchedule
-from gsbake.materials.pixels import Pixels
 
-#: Initial roughness of the trials.
-TRIAL_ROUGHNESS = (0.2, 0.45, 0.8)
-#: Iterations of a trial, pixels of each photo in it, and every how many-th photo validates it.
-TRIAL_STEPS, TRIAL_PIXELS, TRIAL_HOLDOUT = 100, 15_000, 5
-#: Trials within this many dB of the best are fitted in full: 100 steps find a blurred light sooner than a sharp one and so favour smooth
-#: initial values.
+#: Compared starts: metallic and roughness.
+STARTS = ((0.05, 0.2), (0.05, 0.45), (0.05, 0.8), (0.9, 0.2), (0.9, 0.45))
+#: When trials search for metals, as shares of their steps.
+METAL_SEARCHES_AT = (0.4, 0.8)
+#: Start of a diffuse object, and without validation photos.
+DIFFUSE_START, DEFAULT_START = (0.05, 0.8), (0.05, 0.45)
+#: The best start of the other kind, dielectric or metal, is continued as well when it is within this many dB of the best.
 CANDIDATE_MARGIN = 1.0
-#: Metals that raise held-out PSNR by less than this many dB are validated by a fit without them.
-METAL_MARGIN = 0.5
 
-#: Builds a fit with an initial roughness.
-MakeFit = Callable[[float], MaterialFit]
+#: Initial metallic and roughness.
+Start = tuple[float, float]
+#: Builds a fit on the coarse level from a start.
+MakeFit = Callable[[float, float], MaterialFit]
+#: Called after every step with the number of steps done and their total.
+Each = Callable[[int, int], None]
 
 
 @dataclass(frozen=True)
 class ChosenFit:
-    """The chosen `fit` and its result `fitted`, its initial `roughness`, the number of full `fits` made, the `evidence` for that roughness,
-    and `metal_evidence` where metals were validated by a fit without them."""
+    """The chosen `fit` with its result `fitted`, its initial `metallic` and `roughness`, the number of continued `fits`, and the
+    `evidence`."""
 
     fit: MaterialFit
     fitted: Fitted
+    metallic: float
     roughness: float
     fits: int
     evidence: str
-    metal_evidence: str | None
 
 
-def best_fit(
-    make: MakeFit,
-    photos: list[Pixels],
-    held_out: list[Pixels],
-    steps: int,
-    seed: int,
-    trials: Mapping[float, float],
-    diffuse: bool,
-    each: Callable[[int, int], None] | None = None,
-) -> ChosenFit:
-    """Fit in full from each candidate of the `trials` (PSNR in dB by roughness); take the one with the best PSNR on `held_out`.
-
-    A `diffuse` object starts from the highest roughness and has no metals. Without held-out photos the first candidate is taken.
-    """
-    starts = roughness_candidates(trials) or [TRIAL_ROUGHNESS[-1] if diffuse else TRIAL_ROUGHNESS[1]]
-    starts = starts if any(map(len, held_out)) else starts[:1]
-    fits = [make(roughness) for roughness in starts]
-    results = [fit.run(photos, held_out, FitSchedule(steps, seed, diffuse=diffuse), each) for fit in fits]
-    best = max(range(len(fits)), key=lambda k: results[k].held_out_psnr or 0.0)
-    chosen, fitted, made = fits[best], results[best], len(fits)
-    evidence = ", ".join(f"{score:.2f} dB from {roughness:g}" for roughness, score in trials.items())
-    if len(fits) > 1:
-        scores = [f"{f.held_out_psnr:.2f} dB from {r:g}" for f, r in zip(results, starts, strict=True)]
-        evidence += f"; full fits: {', '.join(scores)}"
-    metal_evidence = None
-    dielectric = chosen.psnr(held_out, without_metal(fitted.values)) if fitted.metal.any() else None
-    if dielectric is not None and fitted.held_out_psnr is not None and dielectric > fitted.held_out_psnr - METAL_MARGIN:
-        again = make(starts[best])
-        other = again.run(photos, held_out, FitSchedule(steps, seed, metallic=False), each)
-        made += 1
-        metal_evidence = f"held-out PSNR {fitted.held_out_psnr:.2f} dB with metals, {other.held_out_psnr or 0.0:.2f} dB fitted without"
-        if (other.held_out_psnr or 0.0) > fitted.held_out_psnr:
-            chosen, fitted = again, other
-    evidence = evidence or ("diffuse object" if diffuse else "too few photos for trials")
-    return ChosenFit(chosen, fitted, starts[best], made, evidence, metal_evidence)
-
-
-def trial_roughness(make: MakeFit, photos: list[Pixels], seed: int, each: Callable[[int, int], None] | None = None) -> dict[float, float]:
-    """Validation PSNR in dB of a short fit from each of `TRIAL_ROUGHNESS`.
-
-    Empty with fewer than `TRIAL_HOLDOUT` photos.
-    """
-    if len(photos) < TRIAL_HOLDOUT:
-        return {}
-    subset = [p.subsampled(TRIAL_PIXELS) for p in photos]
-    validation, training = subset[::TRIAL_HOLDOUT], [p for i, p in enumerate(subset) if i % TRIAL_HOLDOUT]
-    found: dict[float, float] = {}
-    for turn, roughness in enumerate(TRIAL_ROUGHNESS):
-        schedule = FitSchedule(TRIAL_STEPS, seed, metallic=False, emission=False, intensity=False, sparsity=False)
-        score = make(roughness).run(training, validation, schedule).held_out_psnr
-        if score is not None:
-            found[roughness] = score
-        if each is not None:
-            each(turn + 1, len(TRIAL_ROUGHNESS))
+def trial_fits(make: MakeFit, level: FitLevel, steps: int, seed: int, diffuse: bool, each: Each) -> dict[Start, tuple[MaterialFit, Fitted]]:
+    """Fits of `steps` steps on the coarse `level`: from all `STARTS`, or the default one for a `diffuse` object or without validation
+    photos."""
+    starts: tuple[Start, ...] = STARTS
+    if diffuse or not any(map(len, level.held_out)):
+        starts = (DIFFUSE_START if diffuse else DEFAULT_START,)
+    plan = FitSchedule(steps, seed, METAL_SEARCHES_AT, emission=False, intensity=False, sparsity=False, diffuse=diffuse)
+    found: dict[Start, tuple[MaterialFit, Fitted]] = {}
+    for start in starts:
+        fit = make(*start)
+        found[start] = fit, fit.run(level.fitted, level.held_out, plan, each)
     return found
 
 
-def roughness_candidates(trials: Mapping[float, float]) -> list[float]:
-    """The roughnesses of `trials` (PSNR in dB of each) within `CANDIDATE_MARGIN` of the best, best first."""
-    order = sorted(trials, key=lambda roughness: -trials[roughness])
-    return [roughness for roughness in order if trials[roughness] > trials[order[0]] - CANDIDATE_MARGIN]
+def best_fit(trials: dict[Start, tuple[MaterialFit, Fitted]], level: FitLevel, plan: FitSchedule, each: Each) -> ChosenFit:
+    """The fit with the best validation PSNR on `level` of those that continue the best of the `trials` by `plan`."""
+    scores = {start: fitted.held_out_psnr or 0.0 for start, (_, fitted) in trials.items()}
+    evidence = _scores(scores) if len(scores) > 1 else ("diffuse object" if plan.diffuse else "no validation photos")
+    found = {start: (trials[start][0], trials[start][0].run(level.fitted, level.held_out, plan, each)) for start in candidates(scores)}
+    continued = {start: fitted.held_out_psnr or 0.0 for start, (_, fitted) in found.items()}
+    best = max(continued, key=lambda start: continued[start])
+    if len(continued) > 1:
+        evidence += f"; continued: {_scores(continued)}"
+    return ChosenFit(*found[best], *best, len(continued), evidence)
 
 
-def trial_cost(photos: list[Pixels], step: float) -> float:
-    """Seconds that `trial_roughness` takes, from those of one `step` of the full fit; cost is proportional to the pixels shaded."""
-    if len(photos) < TRIAL_HOLDOUT:
-        return 0.0
-    pixels = sum(len(p) for p in photos) / len(photos)
-    return len(TRIAL_ROUGHNESS) * TRIAL_STEPS * step * min(1.0, TRIAL_PIXELS / max(1.0, pixels))
+def _scores(scores: dict[Start, float]) -> str:
+    return ", ".join(f"{score:.2f} dB from metallic {m:g} roughness {r:g}" for (m, r), score in scores.items())
+
+
+def candidates(trials: dict[Start, float]) -> list[Start]:
+    """The best start of `trials` (validation PSNR in dB), and the best of the other kind if it is within `CANDIDATE_MARGIN`."""
+    order = sorted(trials, key=lambda start: -trials[start])
+    best = order[0]
+    others = [start for start in order if (start[0] > 0.5) != (best[0] > 0.5) and trials[start] > trials[best] - CANDIDATE_MARGIN]
+    return [best, *others[:1]]

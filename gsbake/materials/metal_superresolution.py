@@ -35,8 +35,9 @@ import scipy.sparse
 from numpy.typing import NDArray
 
 from gsbake.geometry.cameras import Camera
+from gsbake.imaging.srgb import encode
 from gsbake.materials.fit import MaterialFit
-from gsbake.materials.metallic import MIN_METAL_ALBEDO, ROBUST_SCALE, LinearShading, PhotoSamples, unclipped_weights
+from gsbake.materials.metallic import MIN_METAL_ALBEDO, LinearShading, PhotoSamples, unclipped_weights
 from gsbake.materials.pixels import PixelReader, Pixels
 from gsbake.texturing.resampling import CoarseTexture
 from gsbake.texturing.texels import Texels
@@ -66,6 +67,8 @@ MIN_CORRELATION = 0.25
 UNCONSTRAINED_STEPS, MAX_BRIGHTNESS, BRIGHTNESS_POWER = 3, 1.5, 4
 #: Thresholds between hole and bar that are interpolated, and the final one; shares of the metal's brightness.
 BAR_THRESHOLDS, HOLE_THRESHOLD = (0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8), 0.25
+#: sRGB errors beyond this count linearly.
+ROBUST_SCALE = 0.1
 #: Reflectance of dielectrics at normal incidence.
 DIELECTRIC_F0 = 0.04
 
@@ -103,7 +106,7 @@ def superresolve_metals(
         rows, samples = fit.samples_of(pixels, region)
         pixel = pixels.pixel[rows]
         row, column = np.divmod(pixel, camera.width)
-        shading = LinearShading.of(samples, roughness, 1.0)
+        shading = LinearShading.of(samples.shade, roughness, 1.0)
         metal_pixels.append(MetalPixels(column, row, *reader.subpixel_texels(camera, pixel), samples, shading))
     return superresolved(values, surface.texels, coarse.up(region[:, None].astype(np.float32))[:, 0] > 0.5, metal_pixels)
 
@@ -243,7 +246,8 @@ class _PhotoSystem:
 
     def _robust_weights(self, base: Floats, shading: LinearShading) -> Floats:
         """The weights (m, 3), reduced for pixels with large errors of `shading` at `base` (m, 3)."""
-        return np.asarray(self.weight / np.maximum(np.abs(shading.error(self.colour, base)) / ROBUST_SCALE, 1), np.float32)
+        error = np.abs(shading.srgb(base) - encode(self.colour))
+        return np.asarray(self.weight / np.maximum(error / ROBUST_SCALE, 1), np.float32)
 
 
 def _photo_systems(photos: Sequence[MetalPixels], region: NDArray[np.bool_]) -> list[_PhotoSystem]:

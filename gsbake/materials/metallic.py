@@ -6,11 +6,17 @@ environment, though, both models are linear in the base colour b,
     dielectric: shade = b · E(n) + L(d) · (.04 A + B)        metal: shade = b · L(d) A + L(d) B
 
 so for each of a few roughnesses the best b is a weighted least-squares solution over the texel's pixels; weights contain the squared slope
-of the sRGB curve, so that errors count as they are displayed. The residual with that b is clipped at white and robust: displays are no
-brighter than white, and one misplaced reflection must not outweigh the other pixels. A metal must reflect clearly more of every channel
-than the 4 % of dielectrics, else glossy black would pass for a dark metal. A texel has too few pixels to decide by itself: residuals are
-averaged over neighbours of similar colour (`bilateral`), and isolated texels follow the majority around them. Clean metals reflect a third
-or more (gold's blue is .34: Lagarde & de Rousiers, *Moving Frostbite to PBR*, 2014), rusty, anodised and dirty ones go down to .1.
+of the sRGB curve, so that errors count as they are displayed. The two are compared by their likelihood. Its standard deviation differs
+from pixel to pixel: normals are a few degrees off, which hardly changes a diffuse colour and moves a metal's reflections a lot. So it is
+the noise of photos together with the change of the predicted colour when the normal is tilted (propagation of uncertainty). Where equal
+residuals would favour the dielectric, whose predictions are nearly constant, that decides for the metal, and where a metal predicts a
+uniform reflection, as under an overcast sky, an error counts in full. Student's t distribution keeps one misplaced reflection from
+outweighing the other pixels. Colours are clipped at white: displays are no brighter.
+
+A metal must reflect clearly more of every channel than the 4 % of dielectrics, else glossy black would pass for a dark metal: clean metals
+reflect a third or more (gold's blue is .34: Lagarde & de Rousiers, *Moving Frostbite to PBR*, 2014), rusty, anodised and dirty ones go down
+to .1. A texel has too few pixels to decide by itself: likelihoods are averaged over neighbours of similar colour (`bilateral`), and
+isolated texels follow the majority around them.
 """
 
 from __future__ import annotations
@@ -28,14 +34,18 @@ Floats = NDArray[np.float64]
 
 #: Roughnesses tried beside a texel's own.
 TRIED_ROUGHNESS = (0.1, 0.2, 0.35, 0.55)
-#: Lowest linear base colour of a metal, and lowest mean base colour of a clean one.
-MIN_METAL_ALBEDO, CLEAN_METAL_ALBEDO = 0.1, 0.3
-#: The metal's residual must be below this share of the dielectric's: for dark metals, which are rarer, and for clean ones.
-MAX_RESIDUAL_RATIO = (0.9, 1.0)
+#: Roughest metal: rougher ones shade like dielectrics, and oxides, which are rough, are dielectrics.
+MAX_METAL_ROUGHNESS = 0.6
+#: Lowest linear base colour of a metal.
+MIN_METAL_ALBEDO = 0.1
 #: Share of metal among similar neighbours above which a texel is metal: removes isolated texels and fills isolated gaps.
 MAJORITY = 0.5
-#: Linear values above the first are taken as clipped; sRGB residuals beyond the second count linearly.
-CLIPPED, ROBUST_SCALE = 0.95, 0.1
+#: Linear values above this are taken as clipped.
+CLIPPED = 0.95
+#: Noise of sRGB values (0..1), and degrees of freedom of Student's t distribution of their errors.
+NOISE, DEGREES_OF_FREEDOM = 0.01, 3.0
+#: Standard deviation of normals, as a length added to the unit normal along each tangent.
+NORMAL_ERROR = 0.035
 #: Lowest linear colour at which the slope of the sRGB curve is taken.
 MIN_SLOPE_COLOUR = 0.02
 #: Texels with less weight of pixels than the first are undecided, as are those visible in fewer photos than the second: from few directions
@@ -48,14 +58,15 @@ Shader = Callable[[float, NDArray[np.float32], float], NDArray[np.float32]]
 
 @dataclass(frozen=True)
 class PhotoSamples:
-    """n pixels of one photo: the `texel` (n,) each shows, its linear `colour` (n, 3), `weight` (n,), the `block` (n,) of
-    the photo it lies in, and the function that shades them."""
+    """n pixels of one photo: the `texel` (n,) each shows, its linear `colour` (n, 3), `weight` (n,), the `block` (n,) of the photo it lies
+    in, the function that shades them, and functions that shade them with normals `tilted` by `NORMAL_ERROR` along a tangent each."""
 
     texel: NDArray[np.int64]
     colour: NDArray[np.float32]
     weight: NDArray[np.float32]
     block: NDArray[np.int32]
     shade: Shader
+    tilted: tuple[Shader, ...] = ()
 
 
 def perceptual_weights(samples: PhotoSamples) -> NDArray[np.float32]:
@@ -78,11 +89,12 @@ def observed_weight(photos: Sequence[PhotoSamples], texels: int) -> Floats:
 
 @dataclass(frozen=True)
 class MetalTexels:
-    """Texels (m,) detected as metal, with linear base colour (m, 3) and roughness (m,)."""
+    """Texels (m,) detected as metal, with linear base colour (m, 3) and roughness (m,); `dielectric` the same of the other decided ones."""
 
     texel: NDArray[np.int64]
     base: Floats
     roughness: Floats
+    dielectric: tuple[NDArray[np.int64], Floats, Floats]
 
 
 @dataclass(frozen=True)
@@ -93,20 +105,39 @@ class LinearShading:
     offset: NDArray[np.float32]
 
     @classmethod
-    def of(cls, samples: PhotoSamples, roughness: NDArray[np.float32], metallic: float) -> LinearShading:
-        """The shading of `samples` at `roughness` (texels,) and `metallic` 0 or 1."""
-        offset = samples.shade(0.0, roughness, metallic)
-        return cls(samples.shade(1.0, roughness, metallic) - offset, offset)
+    def of(cls, shade: Shader, roughness: NDArray[np.float32], metallic: float) -> LinearShading:
+        """What `shade` gives at `roughness` (texels,) and `metallic` 0 or 1."""
+        offset = shade(0.0, roughness, metallic)
+        return cls(shade(1.0, roughness, metallic) - offset, offset)
 
-    def error(self, colour: NDArray[np.float32], base: NDArray[Any]) -> NDArray[np.float32]:
-        """Errors (n, 3) in sRGB, clipped at white, of base colours `base` (n, 3) against linear `colour` (n, 3)."""
-        return np.asarray(encode(np.clip(base * self.slope + self.offset, 0, 1)) - encode(colour))
+    def srgb(self, base: NDArray[Any]) -> NDArray[np.float32]:
+        """sRGB colours (n, 3), clipped at white, of base colours `base` (n, 3)."""
+        return np.asarray(encode(np.clip(base * self.slope + self.offset, 0, 1)), np.float32)
 
-    def residual(self, samples: PhotoSamples, base: Floats) -> Floats:
-        """Weighted pseudo-Huber errors (texels,) of base colours `base` (texels, 3)."""
-        error = self.error(samples.colour, base[samples.texel])
-        robust = (np.sqrt(error**2 + ROBUST_SCALE**2) - ROBUST_SCALE).sum(1)
-        return np.asarray(np.bincount(samples.texel, samples.weight * robust, len(base)), np.float64)
+
+@dataclass(frozen=True)
+class ShadingModel:
+    """The `shading` of a photo's pixels at one roughness and metallic, and the same with `tilted` normals."""
+
+    shading: LinearShading
+    tilted: tuple[LinearShading, ...]
+
+    @classmethod
+    def of(cls, samples: PhotoSamples, roughness: NDArray[np.float32], metallic: float) -> ShadingModel:
+        """The model of the `samples` at `roughness` (texels,) and `metallic` 0 or 1."""
+        shading, *tilted = (LinearShading.of(shade, roughness, metallic) for shade in (samples.shade, *samples.tilted))
+        return cls(shading, tuple(tilted))
+
+    def negative_log_likelihood(self, samples: PhotoSamples, base: Floats) -> Floats:
+        """Weighted sums (texels,) over pixels and channels, up to a constant, for base colours `base` (texels, 3)."""
+        b = base[samples.texel]
+        shown = self.shading.srgb(b)
+        variance = np.full(shown.shape, NOISE**2, np.float32)
+        for tilted in self.tilted:
+            variance += np.square(tilted.srgb(b) - shown)
+        error = np.square(shown - encode(samples.colour)) / variance
+        nll = 0.5 * (DEGREES_OF_FREEDOM + 1) * np.log1p(error / DEGREES_OF_FREEDOM) + 0.5 * np.log(variance)
+        return np.asarray(np.bincount(samples.texel, samples.weight * nll.sum(1), len(base)), np.float64)
 
 
 class _LeastSquares:
@@ -141,36 +172,42 @@ def find_metals(
     `average` filters values (texels,) over similar neighbours, which decide together.
     """
     texels = len(own)
-    dielectric, metal, base, roughness = _compare_models(photos, own)
+    dielectric, metal = _compare_models(photos, own)
     visible = sum((average((np.bincount(e.texel, e.weight, texels) > 0).astype(np.float64)) > MIN_PHOTO_SHARE for e in photos),
                   np.zeros(texels, int))  # fmt: skip
     decided = (observed_weight(photos, texels) > MIN_WEIGHT) & (visible >= MIN_PHOTOS)
-    count = np.maximum(average(decided.astype(np.float64)), 1e-9)
-    albedo = average(np.where(decided, base.mean(1), 0.0)) / count
-    ratio = np.where(albedo < CLEAN_METAL_ALBEDO, *MAX_RESIDUAL_RATIO)
-    better = np.asarray(average(metal) < ratio * average(dielectric))
-    chosen = np.flatnonzero(majority_vote(better, decided, average))
-    return MetalTexels(chosen, base[chosen], roughness[chosen])
+    better = np.asarray(average(metal.cost - dielectric.cost) < 0)
+    is_metal = majority_vote(better, decided, average)
+    chosen, others = np.flatnonzero(is_metal), np.flatnonzero(decided & ~is_metal)
+    rest = others, dielectric.base[others], dielectric.roughness[others]
+    return MetalTexels(chosen, metal.base[chosen], metal.roughness[chosen], rest)
 
 
-def _compare_models(photos: Sequence[PhotoSamples], own: NDArray[np.float32]) -> tuple[Floats, Floats, Floats, Floats]:
-    """Lowest residuals (texels,) as dielectric and as metal over all roughnesses tried, and the metal's base colour (texels, 3) and
-    roughness (texels,)."""
+class _BestModel:
+    """The base colour (texels, 3) and roughness (texels,) with the lowest `cost` (texels,), a negative log-likelihood, so far."""
+
+    def __init__(self, texels: int) -> None:
+        self.cost, self.base, self.roughness = np.full(texels, np.inf), np.zeros((texels, 3)), np.zeros(texels)
+
+    def offer(self, cost: Floats, base: Floats, roughness: NDArray[np.float32]) -> None:
+        better = cost < self.cost
+        self.cost[better], self.base[better], self.roughness[better] = cost[better], base[better], roughness[better]
+
+
+def _compare_models(photos: Sequence[PhotoSamples], own: NDArray[np.float32]) -> tuple[_BestModel, _BestModel]:
+    """The best dielectric and the best metal of each texel over all roughnesses tried."""
     texels = len(own)
     weights = [unclipped_weights(e) for e in photos]
-    dielectric, metal = np.full(texels, np.inf), np.full(texels, np.inf)
-    base, roughness = np.zeros((texels, 3)), np.zeros(texels)
+    dielectric, metal = _BestModel(texels), _BestModel(texels)
     for tried in (own, *(np.full(texels, r, np.float32) for r in TRIED_ROUGHNESS)):
         for metallic, lowest in ((0.0, 0.0), (1.0, MIN_METAL_ALBEDO)):
-            shadings = [LinearShading.of(samples, tried, metallic) for samples in photos]
+            if metallic and tried is own:
+                tried = np.minimum(own, np.float32(MAX_METAL_ROUGHNESS))
+            models = [ShadingModel.of(samples, tried, metallic) for samples in photos]
             equations = _LeastSquares(texels)
-            for samples, weight, shading in zip(photos, weights, shadings, strict=True):
-                equations.add(samples, weight, shading)
+            for samples, weight, model in zip(photos, weights, models, strict=True):
+                equations.add(samples, weight, model.shading)
             b = equations.solve(lowest)
-            residual = sum((s.residual(samples, b) for samples, s in zip(photos, shadings, strict=True)), np.zeros(texels))
-            if not metallic:
-                dielectric = np.minimum(dielectric, residual)
-                continue
-            better = residual < metal
-            metal[better], base[better], roughness[better] = residual[better], b[better], tried[better]
-    return dielectric, metal, base, roughness
+            cost = sum((m.negative_log_likelihood(s, b) for s, m in zip(photos, models, strict=True)), np.zeros(texels))
+            (metal if metallic else dielectric).offer(cost, b, tried)
+    return dielectric, metal

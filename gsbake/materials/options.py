@@ -27,17 +27,19 @@ class Priors:
 class FitSchedule:
     """What a fit does in `iterations` steps of one photo each, whose order follows from `seed`.
 
-    Without `metallic` no metals are searched for, nor on an object that is `diffuse`. Without `emission` nothing is emissive, without
-    `intensity` the light's intensity is left to gradient steps, without `sparsity` the sparsity prior is off.
+    Metals are searched for at the shares `metal_searches_at` of all steps, but not on an object that is `diffuse`. Without `emission`
+    nothing is emissive, without `intensity` the light's intensity is left to gradient steps, without `sparsity` the sparsity prior is off.
+    `rate` is a factor on all learning rates.
     """
 
     iterations: int
     seed: int = 0
-    metallic: bool = True
+    metal_searches_at: tuple[float, ...] = (0.3, 0.55, 0.8)
     emission: bool = True
     intensity: bool = True
     sparsity: bool = True
     diffuse: bool = False
+    rate: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -47,7 +49,7 @@ class FitOptions:
     #: Adam's learning rate of the texels' logits, per step.
     texel_rate: float = 0.15
     #: Adam's learning rate of the environment map's raw values, per step.
-    light_rate: float = 0.15
+    light_rate: float = 0.3
     #: Adam's learning rate of the normal offsets, per step; small, as the mesh's normals are nearly right.
     normal_rate: float = 0.01
     #: Factor on all learning rates at the last step; the decay is exponential.
@@ -57,8 +59,6 @@ class FitOptions:
     #: Adam's ε for texels and normals, a gradient of the loss per texel: texels that few pixels show take smaller steps.
     epsilon: float = 2e-3
 
-    #: Initial metallic of all texels: nearly dielectric, where the logit still has a gradient.
-    initial_metallic: float = 0.05
     #: Range of initial linear base colour: logits stay finite.
     base_color_range: tuple[float, float] = (0.01, 0.95)
 
@@ -72,8 +72,6 @@ class FitOptions:
     normal_offset_weight: float = 0.1
     #: Weight of the squared difference of neighbouring normal offsets, on a texture of 512 texels; grows with the square of the size.
     normal_smoothness: float = 60.0
-    #: Share of the neighbouring pairs that one step compares; a random quarter saves time.
-    compared_pairs: float = 0.25
 
     #: Steps between updates of visibility and indirect light; both change slowly.
     visibility_interval: int = 25
@@ -88,17 +86,22 @@ class FitOptions:
     #: When emissive regions are searched for: the light must be known.
     emission_search_at: float = 0.5
 
-    #: When metals are searched for: again as the light gets sharper.
-    metal_searches_at: tuple[float, ...] = (0.3, 0.55, 0.8)
+    #: Pixels per texel, of all photos together, that such a search uses: neighbouring texels decide together.
+    metal_pixels: int = 3
     #: Metallic of texels detected as metal, from where gradient steps go on.
     detected_metallic: float = 0.8
-    #: Detected texels that end below this metallic do not count as metal.
-    min_metallic: float = 0.3
+    #: The same of dielectric texels.
+    detected_dielectric: float = 0.05
 
     #: When the light's intensity is searched for.
     intensity_searches_at: tuple[float, ...] = (0.5, 0.6, 0.7, 0.8)
-    #: Pixels that such a search uses at most.
+    #: Pixels that such a search uses at most, and the least share of dielectric texels: reflections of metal do not tell the intensity.
     intensity_pixels: int = 100_000
+    min_dielectric_share: float = 0.5
+    #: Else this quantile of the strongest channel of metals' base colours is set to the following value, changed at most by the factor.
+    metal_quantile: float = 0.5
+    metal_base_color: float = 0.4
+    max_metal_factor: float = 4.0
     #: Texels below this metallic take part as dielectric.
     max_dielectric_metallic: float = 0.3
     #: Searches that include the light's tint on a diffuse object: its reflections hardly determine the tint, which then drifts.

@@ -57,7 +57,10 @@ class Pixels:
 
     def subsampled(self, max_count: int) -> Pixels:
         """Every second, third … pixel, at most `max_count` of them."""
-        step = max(1, -(-len(self) // max_count))
+        return self.every(max(1, -(-len(self) // max_count)))
+
+    def every(self, step: int) -> Pixels:
+        """Every `step`-th pixel."""
         every = {field.name: getattr(self, field.name) for field in fields(self)}
         chosen: Any = {name: None if part is None else part[::step] for name, part in every.items()}
         return Pixels(**chosen)

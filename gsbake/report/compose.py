@@ -127,7 +127,7 @@ def mean(values: Sequence[float]) -> float | None:
 
 def headline(manifests: Manifests, asset: Asset, bytes_: int, scored: Sequence[ViewScore], photos: tuple[int, int]) -> tuple[Figure, ...]:
     """Figures at the top of the page; `photos` = number of registered and of ingested photos."""
-    kind = "held-out photos" if scored and scored[0].held_out else "training photos"
+    kind = "test photos" if scored and scored[0].held_out else "training photos"
     psnr, ssim = mean([s.metrics.psnr for s in scored]), mean([s.metrics.ssim for s in scored])
     out = []
     if psnr is not None and ssim is not None:

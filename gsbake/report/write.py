@@ -20,7 +20,7 @@ from gsbake.report.html import Light, Page, Panel, render_page
 from gsbake.report.quality import asset_cameras, select_views
 from gsbake.report.render import Asset, Renderer, Shader, unlit
 from gsbake.report.sheets import map_panels
-from gsbake.surfels.training.views import held_out
+from gsbake.surfels.training.views import test_photos
 from gsbake.text import number
 
 #: Maximum number of compared photos; more hardly change the mean.
@@ -103,7 +103,7 @@ class _ReportWriter:
         shader: Shader = learnt or unlit
         monitor.check_stop()
         with monitor.part("compare"):
-            indices, held = select_views(len(posed), held_out(len(posed), self.options.holdout), MAX_COMPARED)
+            indices, held = select_views(len(posed), test_photos(len(posed), self.options.holdout), MAX_COMPARED)
             scored = compose.score_views(
                 renderer, shader, posed, cameras, indices, held, settings.view_size, lambda k, n: monitor.progress(k, 2 * n, "comparison")
             )

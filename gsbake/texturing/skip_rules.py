@@ -12,8 +12,8 @@ from gsbake.texturing.normal_map import DenseSamples
 #: Gains between photos below this factor count as view dependence, not exposure: dividing them out would remove reflections.
 MAX_GAIN_SPREAD = 1.25
 #: So do gains that explain less than this share of the differences between photos: exposure scales all of a photo equally, reflections do
-#: not. It is .01 to .06 at constant exposure, .17 even on specular surfaces where exposures vary by .3 (RMS of the logarithm).
-MIN_EXPLAINED = 0.1
+#: not. With tie points a lower share is enough.
+MIN_EXPLAINED, MIN_EXPLAINED_WITH_TIE_POINTS = 0.35, 0.1
 #: Tie points, which are rarely specular, reveal changes of exposure from this factor on.
 MAX_TIE_POINT_SPREAD = 1.15
 #: No normal map is needed where normals deviate by less than this angle (degrees) at this share of the texels.
@@ -27,13 +27,14 @@ def constant_exposure(gains: NDArray[Any], explained: float, tie_point_spread: f
     explain; `tie_point_spread` is the factor within which nine tenths of the photos agree at tie points (`capture.photos.exposure`).
     """
     spread = float(np.exp(np.abs(np.log(gains)).max()))
+    needed = MIN_EXPLAINED if tie_point_spread is None else MIN_EXPLAINED_WITH_TIE_POINTS
     evidence = f"gains on the surface up to {spread:.2f}x, threshold {MAX_GAIN_SPREAD:g}x"
     if spread >= MAX_GAIN_SPREAD:
-        evidence += f"; they explain {100 * explained:.0f} % of the differences, threshold {100 * MIN_EXPLAINED:g} %"
+        evidence += f"; they explain {100 * explained:.0f} % of the differences, threshold {100 * needed:g} %"
     if tie_point_spread is not None:
         evidence += f"; 90 % of tie points agree within {tie_point_spread:.2f}x, threshold {MAX_TIE_POINT_SPREAD:g}x"
     agreeing = tie_point_spread is not None and tie_point_spread < MAX_TIE_POINT_SPREAD
-    return spread < MAX_GAIN_SPREAD or explained < MIN_EXPLAINED or agreeing, evidence
+    return spread < MAX_GAIN_SPREAD or explained < needed or agreeing, evidence
 
 
 def normals_agree(detail: DenseSamples, normal: NDArray[Any]) -> tuple[bool, str]:

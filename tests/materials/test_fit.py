@@ -20,9 +20,10 @@ from gsbake.geometry.raycast import RayCaster
 from gsbake.imaging.srgb import decode, encode
 from gsbake.materials.adjacency import neighbours
 from gsbake.materials.fit import FitSurface, MaterialFit
-from gsbake.materials.initialisation import TRIAL_HOLDOUT, trial_roughness
+from gsbake.materials.initialisation import trial_fits
+from gsbake.materials.levels import FitLevel, InterpolatedTransport, coarse_pixels, coarse_surface, coarse_texels
 from gsbake.materials.options import FitSchedule, Priors
-from gsbake.materials.pixels import SUBPIXEL_OFFSETS, PixelReader, Pixels
+from gsbake.materials.pixels import PixelReader, Pixels
 from gsbake.shading.environment import EnvironmentLight
 from gsbake.shading.split_sum import shade
 from gsbake.texturing.resampling import CoarseTexture
@@ -68,7 +69,7 @@ class Scene:
 
     With `reference` the images are made by `tests.support.monte_carlo`."""
 
-    def __init__(self, roughness: float, count: int = 12, even: bool = False, reference: bool = False) -> None:
+    def __init__(self, roughness: float, count: int = 12, even: bool = False, reference: bool = False, metallic: float = 0.0) -> None:
         mesh, uv = sphere()
         caster = RayCaster(mesh.vertices, mesh.faces, 1)
         self.texels: Texels = rasterise(uv, mesh.faces, SIZE)
@@ -87,18 +88,21 @@ class Scene:
             n = len(blank)
             if reference:
                 unit = normal / np.linalg.norm(normal, axis=1, keepdims=True)
-                linear = render(unit, blank.view, base_color, np.full(n, roughness), np.zeros(n), room)
+                linear = render(unit, blank.view, base_color, np.full(n, roughness), np.full(n, metallic), room)
             else:
                 with torch.no_grad():
                     n_, base_ = torch.as_tensor(normal, dtype=torch.float32), torch.as_tensor(base_color, dtype=torch.float32)
-                    linear = shade(n_, torch.as_tensor(blank.view), base_, torch.full((n,), roughness), torch.zeros(n), tables).numpy()
+                    rough_, metal_ = torch.full((n,), roughness), torch.full((n,), metallic)
+                    linear = shade(n_, torch.as_tensor(blank.view), base_, rough_, metal_, tables).numpy()
             self.photos.append(replace(blank, colour=encode(linear)))
 
-    def fit(self, roughness: float, priors: Priors = WEAK_PRIORS) -> MaterialFit:
+    def surface(self) -> FitSurface:
         n = len(self.texels)
         pairs = neighbours(self.texels, self.normal, self.normal)
-        surface = FitSurface(self.texels, self.normal, pairs, self.normal, np.ones(n), np.full((n, 3), 0.3))
-        return MaterialFit(surface, 16, priors, roughness)
+        return FitSurface(self.texels, self.normal, pairs, self.normal, np.ones(n), np.full((n, 3), 0.3))
+
+    def fit(self, roughness: float, priors: Priors = WEAK_PRIORS, metallic: float = 0.05) -> MaterialFit:
+        return MaterialFit(self.surface(), 16, priors, roughness, metallic)
 
 
 @pytest.fixture(scope="module")
@@ -117,7 +121,7 @@ def test_materials_are_recovered_from_reference_images(rendered: Scene) -> None:
     known = fitted.weight > 0.3
     base_color, truth = fitted.values[known, :3], rendered.base_color[known]
     gain = (base_color * truth).sum(0) / (base_color**2).sum(0)
-    assert np.abs(encode(base_color * gain) - encode(truth)).mean() < 0.0095
+    assert np.abs(encode(base_color * gain) - encode(truth)).mean() < 0.014
     assert np.abs(fitted.values[known, 3] - 0.25).mean() < 0.13
     assert fitted.values[known, 4].mean() < 0.04
     assert fitted.held_out_psnr is not None and fitted.held_out_psnr > 22
@@ -149,16 +153,13 @@ def test_base_colour_and_roughness_are_recovered(glossy: Scene) -> None:
     base_color, truth = fitted.values[known, :3], glossy.base_color[known]
     gain = (base_color * truth).sum(0) / (base_color**2).sum(0)  # brightness is shared with the light
     assert np.abs(encode(base_color * gain) - encode(truth)).mean() < 0.06
-    assert np.abs(fitted.values[known, 3] - 0.25).mean() < 0.06
+    assert np.abs(fitted.values[known, 3] - 0.25).mean() < 0.08
     assert fitted.values[known, 4].mean() < 0.1
     assert fitted.held_out_psnr is not None and fitted.held_out_psnr > 22
 
 
 def test_all_metal_object_has_no_light_adjustment(glossy: Scene) -> None:
-    fit = glossy.fit(0.2)
-    with torch.no_grad():
-        fit._logits[:, 4] = 3.0
-    fitted = fit.run(glossy.photos, [], FitSchedule(4, metallic=False, emission=False))
+    fitted = glossy.fit(0.2, metallic=0.9).run(glossy.photos, [], FitSchedule(4, metal_searches_at=(), emission=False))
     assert len(fitted.light_adjustments) > 0 and all(adjustment.improvement == 0 for adjustment in fitted.light_adjustments)
 
 
@@ -189,13 +190,74 @@ def test_normal_offsets_reduce_normal_error(glossy: Scene) -> None:
     assert error[1] < 0.97 * error[0]  # low-resolution photos of a rather rough sphere are weak evidence
 
 
+def trial_scores(scene: Scene) -> dict[tuple[float, float], float]:
+    level = FitLevel(scene.surface(), scene.photos[2:], scene.photos[:2])
+    trials = trial_fits(lambda m, r: scene.fit(r, metallic=m), level, 100, 0, False, skip)
+    return {start: fitted.held_out_psnr or 0.0 for start, (_, fitted) in trials.items()}
+
+
+def skip(done: int, total: int) -> None:
+    """Do nothing after a step."""
+
+
 def test_trials_find_the_roughness(glossy: Scene) -> None:
-    smooth = trial_roughness(glossy.fit, glossy.photos, 0)
-    scene = Scene(0.85)
-    rough = trial_roughness(scene.fit, scene.photos, 0)
-    assert max(smooth, key=lambda k: smooth[k]) == 0.2
-    assert max(rough, key=lambda k: rough[k]) == 0.8
-    assert trial_roughness(glossy.fit, glossy.photos[: TRIAL_HOLDOUT - 1], 0) == {}
+    smooth, rough = trial_scores(glossy), trial_scores(Scene(0.85))
+    dielectric = [(0.05, r) for r in (0.2, 0.45, 0.8)]
+    assert max(dielectric, key=lambda k: smooth[k]) == (0.05, 0.2)
+    assert max(dielectric, key=lambda k: rough[k]) == (0.05, 0.8)
+
+
+def test_metal_is_found_from_the_best_start() -> None:
+    """A sphere of two metals, in reference images: from the start that the trials choose, nearly all texels end as metal."""
+    scene = Scene(0.25, reference=True, metallic=1.0)
+    scores = trial_scores(scene)
+    metallic, roughness = max(scores, key=lambda start: scores[start])
+    fitted = scene.fit(roughness, metallic=metallic).run(scene.photos[2:], scene.photos[:2], FitSchedule(200))
+    known = fitted.weight > 0.3
+    assert (fitted.values[known, 4] > 0.5).mean() > 0.9
+    dielectric = scene.fit(0.2).run(scene.photos[2:], scene.photos[:2], FitSchedule(200, metal_searches_at=()))
+    assert fitted.held_out_psnr is not None and dielectric.held_out_psnr is not None
+    assert fitted.held_out_psnr > dielectric.held_out_psnr + 1
+
+
+def test_the_fine_level_continues_from_the_coarse_one(glossy: Scene) -> None:
+    fine = glossy.surface()
+    _, uv = sphere()
+    texture = CoarseTexture.sized(uv, sphere()[0].faces, glossy.texels, 1.0, SIZE // 2)
+    coarse = coarse_surface(fine, texture)
+    photos = [coarse_pixels(p, texture) for p in glossy.photos]
+    assert sum(map(len, photos)) == pytest.approx(sum(map(len, glossy.photos)) / 4, rel=0.02)
+    parent = coarse_texels(texture)
+    known = parent >= 0
+    distance = np.linalg.norm(coarse.position[parent[known]] - fine.position[known], axis=1)
+    assert known.mean() > 0.9 and distance.max() < 0.2  # texels are about 0.1 wide
+    fit = MaterialFit(coarse, 16, WEAK_PRIORS, 0.2)
+    fitted = fit.run(photos[2:], photos[:2], FitSchedule(150, metal_searches_at=(), emission=False, intensity=False))
+    continued = fit.continued_on(fine, texture.up).run(glossy.photos[2:], glossy.photos[:2], FitSchedule(1, rate=1e-6, intensity=False))
+    np.testing.assert_allclose(np.median(continued.values, 0), np.median(fitted.values, 0), atol=0.03)
+    scratch = glossy.fit(0.2).run(glossy.photos[2:], glossy.photos[:2], FitSchedule(1, rate=1e-6, intensity=False))
+    assert continued.held_out_psnr is not None and scratch.held_out_psnr is not None
+    assert continued.held_out_psnr > scratch.held_out_psnr + 3
+
+
+def test_coarse_transport_is_interpolated(glossy: Scene) -> None:
+    """Constant and linear transport arrive unchanged at the fine texels."""
+    texture = CoarseTexture.sized(sphere()[1], sphere()[0].faces, glossy.texels, 1.0, SIZE // 2)
+    position = texture.texels.interpolate(np.asarray(sphere()[0].vertices), sphere()[0].faces)
+
+    class Linear:
+        def visible_share(self, radiance: NDArray[np.float32]) -> NDArray[np.float32]:
+            return 0.5 + 0.4 * position[:, 2]
+
+        def indirect_irradiance(self, irradiance: NDArray[np.float32], reflectance: NDArray[np.float32]) -> NDArray[np.float32]:
+            return irradiance * reflectance
+
+    transport = InterpolatedTransport(Linear(), texture)
+    n = len(glossy.texels)
+    at = glossy.texels.interpolate(np.asarray(sphere()[0].vertices), sphere()[0].faces)
+    assert np.abs(transport.visible_share(np.zeros((6, 4, 4, 3))) - (0.5 + 0.4 * at[:, 2])).mean() < 0.01
+    indirect = transport.indirect_irradiance(np.full((n, 3), 2.0, np.float32), np.full((n, 3), 0.25, np.float32))
+    np.testing.assert_allclose(indirect, 0.5, atol=1e-5)
 
 
 def test_fit_is_deterministic_and_base_colour_prior_darkens(glossy: Scene) -> None:
@@ -229,21 +291,6 @@ def test_pixels_read_the_texture_at_the_ray_hit() -> None:
     assert np.allclose(pixels.view, (camera.centre - point) / np.linalg.norm(camera.centre - point, axis=1, keepdims=True), atol=0.01)
     assert np.allclose(pixels.bilinear.sum(1), 1)
     assert len(pixels.subsampled(100)) <= 100
-
-
-def test_subpixel_texels_lie_inside_their_pixels() -> None:
-    mesh, uv = sphere()
-    texels = rasterise(uv, mesh.faces, 512)
-    at = texels.interpolate(np.asarray(mesh.vertices), mesh.faces)
-    camera = cameras(1, 120)[0]
-    reader = PixelReader(RayCaster(mesh.vertices, mesh.faces, 1), uv, texels, 2.0)
-    pixel = reader.read(camera, np.zeros((120, 120, 3), np.uint8), None).pixel
-    texel, counts = reader.subpixel_texels(camera, pixel)
-    assert texel.shape == counts.shape == (len(pixel), len(SUBPIXEL_OFFSETS)) and counts.mean() > 0.9
-    for k, (dx, dy) in enumerate(SUBPIXEL_OFFSETS):
-        pixel_position, _ = camera.project(at[texel[:, k]])
-        expected = np.stack([pixel % 120, pixel // 120], 1) + 0.5 + (dx, dy)
-        assert np.abs(pixel_position - expected)[counts[:, k]].max() < 0.5  # half a texel, which is up to a pixel at normal incidence
 
 
 def test_gain_is_divided_out_of_linear_colour() -> None:

@@ -1,85 +1,79 @@
-"""Choice of the initial roughness and validation of metals, on fits with known held-out PSNR."""
+"""Choice of the fit's start on fits with known validation PSNR."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from types import SimpleNamespace
 from typing import Any
 
-import numpy as np
 import pytest
-from numpy.typing import NDArray
 
-from gsbake.materials.fit import Fitted
-from gsbake.materials.initialisation import CANDIDATE_MARGIN, METAL_MARGIN, TRIAL_ROUGHNESS, ChosenFit, best_fit, roughness_candidates
+from gsbake.materials.initialisation import (
+    CANDIDATE_MARGIN,
+    DEFAULT_START,
+    DIFFUSE_START,
+    STARTS,
+    ChosenFit,
+    Start,
+    best_fit,
+    candidates,
+    trial_fits,
+)
 from gsbake.materials.options import FitSchedule
-from gsbake.shading.environment import EnvironmentLight
-
-N = 4
-#: Stand-ins for photos; only their length is used.
-PHOTOS: Any = [range(10)] * 4
 
 
-@dataclass
-class KnownFit:
-    """A fit with held-out PSNR `scores[roughness]`, `gain` dB more with metals, and `loss` dB less with metallic set to 0."""
+class Fit:
+    """A fit with the validation PSNR `psnr` that records its schedules."""
 
-    roughness: float
-    scores: dict[float, float]
-    gain: float = 0.0
-    loss: float = 0.0
-    runs: list[tuple[float, bool]] = field(default_factory=list)
-    metals: bool = False
+    def __init__(self, psnr: float, runs: list[FitSchedule]) -> None:
+        self._psnr, self._runs = psnr, runs
 
-    def run(self, photos: Any, held: Any, schedule: FitSchedule, each: Any = None) -> Fitted:
-        metals = schedule.metallic and not schedule.diffuse
-        self.metals = metals and self.gain + self.loss != 0
-        self.runs.append((self.roughness, metals))
-        score = self.scores[self.roughness] + (self.gain if self.metals else 0)
-        metal = np.full(N, self.metals)
-        values = np.full((N, 5), 0.5, np.float32)
-        return Fitted(values, np.zeros((N, 3)), np.ones(N), np.zeros((N, 3)), EnvironmentLight(4), score if held else None, metal, 0, ())
-
-    def psnr(self, photos: Any, values: NDArray[Any]) -> float:
-        assert (values[:, 4] == 0).all() and np.allclose(values[:, :3], 0.25)  # metallic 0, same diffuse reflectance
-        return self.scores[self.roughness] + self.gain - self.loss
+    def run(self, photos: Any, held_out: Any, schedule: FitSchedule, each: Any) -> Any:
+        self._runs.append(schedule)
+        return SimpleNamespace(held_out_psnr=self._psnr if held_out else None)
 
 
-def chosen(
-    trials: dict[float, float], scores: dict[float, float], held: Any = PHOTOS, diffuse: bool = False, **known: Any
-) -> tuple[ChosenFit, list[tuple[float, bool]]]:
-    """The result of `best_fit`, and the full fits made as (roughness, metals)."""
-    runs: list[tuple[float, bool]] = []
-    make: Any = lambda roughness: KnownFit(roughness, scores, runs=runs, **known)  # noqa: E731
-    return best_fit(make, PHOTOS, held, 10, 0, trials, diffuse), runs
+def level(held_out: bool = True) -> Any:
+    return SimpleNamespace(fitted=[[1]], held_out=[[1]] if held_out else [])
 
 
-def test_close_trials_are_candidates() -> None:
-    assert roughness_candidates({0.2: 21.0, 0.45: 21.0 + 0.5 * CANDIDATE_MARGIN, 0.8: 21.0 - 0.6 * CANDIDATE_MARGIN}) == [0.45, 0.2]
-    assert roughness_candidates({}) == []
+def nothing(done: int, total: int) -> None:
+    pass
 
 
-def test_held_out_photos_choose_between_candidates() -> None:
-    choice, runs = chosen({0.2: 21.0, 0.45: 20.5, 0.8: 15.0}, {0.2: 22.0, 0.45: 23.0})
-    assert choice.roughness == 0.45 and runs == [(0.2, True), (0.45, True)] and choice.fits == 2
-    assert "full fits: 22.00 dB from 0.2, 23.00 dB from 0.45" in choice.evidence and choice.metal_evidence is None
-    choice, runs = chosen({0.2: 21.0, 0.45: 20.5}, {0.2: 22.0, 0.45: 23.0}, held=[])
-    assert choice.roughness == 0.2 and runs == [(0.2, True)]  # no validation
+def chosen(trial_scores: dict[Start, float], full_scores: dict[Start, float]) -> tuple[ChosenFit, list[FitSchedule]]:
+    runs: list[FitSchedule] = []
+    trials: Any = {
+        start: (Fit(full_scores.get(start, 0.0), runs), SimpleNamespace(held_out_psnr=score)) for start, score in trial_scores.items()
+    }
+    return best_fit(trials, level(), FitSchedule(10), nothing), runs
 
 
-@pytest.mark.parametrize(("diffuse", "start"), [(True, TRIAL_ROUGHNESS[-1]), (False, TRIAL_ROUGHNESS[1])])
-def test_without_trials(diffuse: bool, start: float) -> None:
-    choice, runs = chosen({}, {start: 30.0}, diffuse=diffuse)
-    assert choice.roughness == start and runs == [(start, not diffuse)]
+def test_all_starts_are_tried_without_searches_for_the_light() -> None:
+    runs: list[FitSchedule] = []
+    trials = trial_fits(lambda m, r: Fit(10 * m + r, runs), level(), 7, 1, False, nothing)  # type: ignore[arg-type,return-value]
+    assert tuple(trials) == STARTS and len(runs) == len(STARTS)
+    assert all(run.iterations == 7 and run.metal_searches_at and not run.intensity and not run.emission for run in runs)
+    assert {m > 0.5 for m, _ in STARTS} == {True, False}
 
 
-def test_metals_with_clear_gain_are_accepted() -> None:
-    choice, runs = chosen({0.2: 21.0}, {0.2: 22.0}, gain=1.0, loss=METAL_MARGIN + 0.1)
-    assert choice.fitted.metal.all() and choice.fits == 1 and choice.metal_evidence is None
+@pytest.mark.parametrize(("diffuse", "held_out", "start"), [(True, True, DIFFUSE_START), (False, False, DEFAULT_START)])
+def test_one_start_where_nothing_is_compared(diffuse: bool, held_out: bool, start: Start) -> None:
+    trials = trial_fits(lambda m, r: Fit(1.0, []), level(held_out), 7, 0, diffuse, nothing)  # type: ignore[arg-type,return-value]
+    assert tuple(trials) == (start,)
 
 
-@pytest.mark.parametrize(("gain", "accepted"), [(0.2, True), (-0.2, False)])
-def test_metals_are_rejected_where_a_fit_without_is_better(gain: float, accepted: bool) -> None:
-    choice, runs = chosen({0.2: 21.0}, {0.2: 22.0}, gain=gain, loss=METAL_MARGIN - 0.1)
-    assert runs == [(0.2, True), (0.2, False)] and choice.fits == 2
-    assert choice.fitted.metal.all() == accepted and choice.metal_evidence is not None
-    assert f"{22 + gain:.2f} dB with metals, 22.00 dB fitted without" in choice.metal_evidence
+def test_close_starts_are_continued_and_compared() -> None:
+    near = 21.0 - 0.5 * CANDIDATE_MARGIN
+    choice, runs = chosen({STARTS[0]: 21.0, STARTS[3]: near, STARTS[1]: 15.0}, {STARTS[0]: 22.0, STARTS[3]: 23.0})
+    assert (choice.metallic, choice.roughness) == STARTS[3] and choice.fits == len(runs) == 2
+    assert "continued: 22.00 dB" in choice.evidence and "21.00 dB from metallic 0.05 roughness 0.2" in choice.evidence
+
+
+def test_only_a_clear_winner_is_continued() -> None:
+    choice, runs = chosen({STARTS[0]: 21.0, STARTS[1]: 20.9, STARTS[3]: 21.1 + CANDIDATE_MARGIN}, {STARTS[3]: 20.0})
+    assert (choice.metallic, choice.roughness) == STARTS[3] and len(runs) == 1
+
+
+def test_one_candidate_of_either_kind() -> None:
+    first, second = candidates({start: 20.0 for start in STARTS})
+    assert first[0] < 0.5 < second[0]

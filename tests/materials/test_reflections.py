@@ -119,7 +119,7 @@ def test_reflection_does_not_change_base_colour(corner: Corner) -> None:
         surface = FitSurface(corner.texels, corner.at, pairs, corner.normal, visible_share, start, visibility)
         fit = MaterialFit(surface, 8, Priors.of(Bake()), 0.2)
         photos = [photo(k, traced) for k in range(16)]
-        fitted = fit.run(photos, [], FitSchedule(120, metallic=False, emission=False))
+        fitted = fit.run(photos, [], FitSchedule(120, metal_searches_at=(), emission=False))
         known = corner.floor & (fitted.weight > 0.3) & (corner.at[:, 1] < 0.8)
         return float(np.abs(encode(fitted.values[known, :3]) - encode(base_color[known])).mean())
 

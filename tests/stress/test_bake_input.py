@@ -18,7 +18,6 @@ from gsbake.geometry.ply import write_mesh
 from gsbake.gltf.export import ExportOptions, export_asset
 from gsbake.gltf.read import read_glb
 from gsbake.imaging.exr import read_exr, write_exr
-from gsbake.materials import initialisation
 from gsbake.materials.bake import BakeOptions, bake_textures
 from gsbake.materials.delighting import find_irradiance, remove_shading
 from gsbake.materials.light_intensity import adjust_radiance, search_light
@@ -30,12 +29,6 @@ from tests.stress.meshes import MESHES
 from tests.support.recorder import Recorder
 
 SIZE = 128
-
-
-@pytest.fixture(autouse=True)
-def short_trials(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The trials of the initial roughness are the longest part of a fit."""
-    monkeypatch.setattr(initialisation, "TRIAL_STEPS", 4)
 
 
 def bake(folder: Path, mesh: str, cameras: str, pictures: str, outlines: str, to_world: Similarity | None = None, **settings: Any) -> bool:

@@ -1,15 +1,12 @@
-"""Skip rules of the bake: exposure gains, normal map; and the cost of roughness trials."""
+"""Skip rules of the bake: exposure gains, normal map."""
 
 from __future__ import annotations
-
-from typing import Any
 
 import numpy as np
 import pytest
 import trimesh
 
 from gsbake.geometry.raycast import RayCaster
-from gsbake.materials.initialisation import TRIAL_PIXELS, TRIAL_ROUGHNESS, TRIAL_STEPS, trial_cost
 from gsbake.texturing.normal_map import sample_dense_mesh, vertex_normals
 from gsbake.texturing.skip_rules import MAX_GAIN_SPREAD, MAX_TIE_POINT_SPREAD, MIN_EXPLAINED, constant_exposure, normals_agree
 
@@ -72,10 +69,3 @@ def test_distant_dense_mesh_gives_no_map() -> None:
     detail = sample_dense_mesh(np.zeros((4, 3)), normal, dense, vertex_normals(dense.vertices, dense.faces), 2.0)
     holds, evidence = normals_agree(detail, normal)
     assert holds and "no dense surface" in evidence
-
-
-def test_trial_cost_is_proportional_to_pixels() -> None:
-    photos: Any = [range(2 * TRIAL_PIXELS)] * 10
-    assert trial_cost(photos, 0.2) == pytest.approx(len(TRIAL_ROUGHNESS) * TRIAL_STEPS * 0.2 / 2)
-    assert trial_cost([range(10)] * 10, 0.2) == pytest.approx(len(TRIAL_ROUGHNESS) * TRIAL_STEPS * 0.2)  # type: ignore[list-item]
-    assert trial_cost(photos[:2], 0.2) == 0  # too few photos for trials

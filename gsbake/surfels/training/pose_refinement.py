@@ -1,4 +1,4 @@
-"""Pose and exposure refinement during training, decided by a trial on held-out photos.
+"""Pose and exposure refinement during training, decided by a trial on validation photos.
 
 Held-out photos are aligned to the surfels on half of their pixels (squares of a checkerboard). This measures pose and exposure errors and,
 on the other half, how well surfels fit the photos once aligned (PSNR). Large errors start a trial: the same steps with and without
@@ -59,7 +59,7 @@ def trial_improves(before: Tensor, after: Tensor) -> tuple[bool, str]:
     """Whether a trial improves held-out photos, and the evidence; `before` and `after` (k,) are PSNR in dB."""
     gain = after - before
     holds = float(gain.mean()) >= MIN_PSNR_GAIN and float((gain > 0).double().mean()) >= MIN_IMPROVED_SHARE
-    return holds, f"a trial gained {float(gain.mean()):+.2f} dB on held-out photos; {MIN_PSNR_GAIN:g} dB are needed"
+    return holds, f"a trial gained {float(gain.mean()):+.2f} dB on validation photos; {MIN_PSNR_GAIN:g} dB are needed"
 
 
 class Aligner:
@@ -99,7 +99,7 @@ class Aligner:
         return align.make_scene(t.surfels, t.light, t.masked, t.background)
 
     def measure(self, what: CorrectionKinds) -> AlignmentResult:
-        """Align held-out photos (training photos where none is held out) on half of their pixels and compare the other half."""
+        """Align validation photos (training photos where there are none) on half of their pixels and compare the other half."""
         t = self.trainer
         pool = t.validation_indices or t.training_indices
         scene, rows = self._scene(), []

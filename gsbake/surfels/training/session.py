@@ -22,7 +22,7 @@ from gsbake.surfels.raster.threads import configure
 from gsbake.surfels.training.corrections import Correction
 from gsbake.surfels.training.pose_refinement import Aligner
 from gsbake.surfels.training.trainer import Plan, Trainer
-from gsbake.surfels.training.views import held_out, load_views
+from gsbake.surfels.training.views import load_views, test_photos, validation_photos
 
 #: Checkpoints of other versions are ignored.
 CHECKPOINT_VERSION = 4
@@ -96,14 +96,14 @@ class Session:
             gains = json.loads((trained / EXPOSURE).read_text())["log_gains"]
             exposure = [Correction(torch.zeros(6).double(), torch.tensor(gains[view.name]).double()) for view in full]
             full, half = ([c.apply(view) for view, c in zip(views, exposure, strict=True)] for views in (full, half))
-        validation = held_out(len(full), options.train.holdout)
+        validation, test = (roles(len(full), options.train.holdout) for roles in (validation_photos, test_photos))
         sections = options.train, options.model, options.loss
         policy = schedule.policy
         plan = Plan(
             *sections, schedule.iterations, schedule.coarse_share, policy is not None, run.seed, options.converged_steps, policy or "none"
         )
         light = None if light is None else light.to(run.device)
-        self.trainer = Trainer(plan, surfels.to(run.device), light, full, half, validation)
+        self.trainer = Trainer(plan, surfels.to(run.device), light, full, half, validation, test)
         self.aligner = None if trained else Aligner(self.trainer, options.pose_refinement, options.exposure_refinement)
         self.before = len(surfels)
         self.step_seconds = 0.0  # measured by `run`, evaluations included
@@ -213,7 +213,7 @@ class Session:
             "surfels_before": self.before,
             "surfels": len(trainer.surfels),
             "psnr": round(psnr, 3),
-            "held_out": [trainer.views[i].name for i in trainer.validation_indices],
+            "validation": [trainer.views[i].name for i in trainer.validation_indices],
             "gamma": round(float(trainer.surfels.gamma), 4),
             "sdf_median": round(float(trainer.surfels.sdf.abs().median()), 6) if len(trainer.surfels) else None,
         }

@@ -7,6 +7,7 @@ The schedule is the paper's in shares of the run (of 30 000 steps: median, proje
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -70,13 +71,14 @@ class Trainer:
         views: list[TrainView],
         half_views: list[TrainView],
         validation_indices: list[int],
+        test_indices: Sequence[int] = (),
     ) -> None:
-        """`views` and `half_views` are all photos at full and half training size; `validation_indices` those held out; `light` is an
-        `EnvironmentLight` or None."""
+        """`views` and `half_views` are all photos at full and half training size; `validation_indices` those that decisions look at and
+        `test_indices` those that nothing looks at, neither of them trained on; `light` is an `EnvironmentLight` or None."""
         self.plan, self.surfels, self.light = plan, surfels, light
         self.views, self.half_views = views, half_views
         self.validation_indices = validation_indices
-        self.training_indices = [i for i in range(len(views)) if i not in set(validation_indices)]
+        self.training_indices = [i for i in range(len(views)) if i not in {*validation_indices, *test_indices}]
         self.adam = Adam()
         self.generator = torch.Generator().manual_seed(plan.seed)
         self.stats = Statistics.zeros(len(surfels), surfels.position.device)
@@ -215,7 +217,7 @@ class Trainer:
 
     @torch.no_grad()
     def evaluate(self, max_views: int = 6) -> float:
-        """PSNR in dB over held-out photos (over training photos when none is held out), inside the mask where there is one."""
+        """PSNR in dB over validation photos (over training photos when there are none), inside the mask where there is one."""
         training = self.training_indices
         chosen = self.validation_indices[:max_views] or training[:: max(1, len(training) // max_views)][:max_views]
         views = self.half_views if self.coarse() else self.views

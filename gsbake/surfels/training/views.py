@@ -21,6 +21,16 @@ def held_out(count: int, every: int) -> list[int]:
     return list(range(every // 2, count, every))
 
 
+def validation_photos(count: int, every: int) -> list[int]:
+    """The held-out photos that decisions look at: every second one, from the first."""
+    return held_out(count, every)[::2]
+
+
+def test_photos(count: int, every: int) -> list[int]:
+    """The held-out photos that no decision looks at: figures that are reported use these alone."""
+    return held_out(count, every)[1::2]
+
+
 @dataclass(frozen=True)
 class TrainView:
     """One photo at one size: `rgb` (3, h, w) sRGB and `mask` (h, w) or None as 8-bit tensors, world→camera pose, camera `centre`,

@@ -1,31 +1,22 @@
-"""Differentiable shading of one photo's pixels.
+"""Reference implementation of a step of the material fit in PyTorch: shading and loss of one photo's pixels, and the priors.
 
 The split sum (`shading.split_sum`) with the light transport of each texel: visibility of the present light, indirect light and emission.
 Where a pixel's reflected ray was traced and meets the object, the outgoing radiance of the texel that it hits replaces the environment.
+`fit_kernel` computes the same with its gradient.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
-from typing import Any
+from dataclasses import dataclass
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
-from gsbake.imaging.srgb import decode
-from gsbake.materials.metallic import PhotoSamples
+from gsbake.imaging.srgb_torch import linear_to_srgb
+from gsbake.materials.photo_batch import EMISSION, INDIRECT, OCCLUSION, OUTGOING, VISIBILITY
 from gsbake.materials.pixels import Pixels
 from gsbake.shading.light_tables import LightTables
 from gsbake.shading.split_sum import mirror_reflection, shade, traced_specular_visibility
-
-Floats = NDArray[np.float32]
-
-#: Columns of a texel's light transport: visibility (0..1) of the present light and, for specular reflection, of uniform light (ambient
-#: occlusion); indirect irradiance / π; emission; outgoing radiance, which reflections of the object show.
-VISIBILITY, OCCLUSION, INDIRECT, EMISSION, OUTGOING = 0, 1, slice(2, 5), slice(5, 8), slice(8, 11)
-TRANSPORT_CHANNELS = 11
 
 
 @dataclass(frozen=True)
@@ -48,7 +39,6 @@ class Batch:
     view: Tensor
     colour: Tensor
     weight: Tensor
-    block: Tensor
     normal: Tensor
     reflected_texel: Tensor | None
 
@@ -57,37 +47,24 @@ class Batch:
         """The `pixels` of a photo on a mesh whose texels have the `normal` (texels, 3)."""
         texel, bilinear = torch.as_tensor(pixels.texel), torch.as_tensor(pixels.bilinear)
         view, colour, weight = (torch.as_tensor(x) for x in (pixels.view, pixels.colour, pixels.weight))
-        block = torch.as_tensor(pixels.block)
         reflected = None if pixels.reflected_texel is None else torch.as_tensor(pixels.reflected_texel)
-        return cls(texel, bilinear, view, colour, weight, block, _interpolate(normal, texel, bilinear), reflected)
+        return cls(texel, bilinear, view, colour, weight, _interpolate(normal, texel, bilinear), reflected)
 
     def shade(self, values: Tensor, normal_offset: Tensor, tables: LightTables, transport: Tensor) -> Tensor:
         """Linear colours (n, 3) of the pixels for texels with material `values` (texels, 5) and light `transport` (texels, 11)."""
-        g = _interpolate(values, self.texel, self.bilinear)
-        return self._shade(self._normals(normal_offset), g[:, :3], g[:, 3], g[:, 4], tables, self._transport(transport))
+        metal = values[:, 4:]
+        parameters = torch.cat([(1 - metal) * values[:, :3], 0.04 * (1 - metal) + metal * values[:, :3], values[:, 3:4]], 1)
+        g = _interpolate(parameters, self.texel, self.bilinear)
+        albedo, f0, roughness = g[:, :3], g[:, 3:6], g[:, 6]
+        black, zero = torch.zeros_like(albedo), torch.zeros_like(roughness)
 
-    @property
-    def dominant_texel(self) -> Tensor:
-        """The texel (n,) with the largest bilinear weight in each pixel."""
-        return self.texel.gather(1, self.bilinear.argmax(1, keepdim=True))[:, 0]
+        def shaded(base: Tensor, metallic: Tensor) -> Tensor:
+            return self._shade(self._normals(normal_offset), base, roughness, metallic, tables, self._transport(transport))
 
-    def select(self, chosen: Tensor) -> Batch:
-        """The pixels whose dominant texel is `chosen` (texels,)."""
-        keep = chosen[self.dominant_texel]
-        every = {field.name: getattr(self, field.name) for field in fields(self)}
-        selected: Any = {name: None if part is None else part[keep] for name, part in every.items()}
-        return Batch(**selected)
-
-    def samples(self, normal_offset: Tensor, tables: LightTables, transport: Tensor) -> PhotoSamples:
-        """The pixels for searches over all photos; each counts for its dominant texel."""
-        normal, pixel_transport, texel = self._normals(normal_offset), self._transport(transport), self.dominant_texel
-
-        def shaded(base: float, roughness: Floats, metallic: float) -> Floats:
-            n = len(texel)
-            constant = (torch.full((n, 3), base), torch.as_tensor(roughness)[texel], torch.full((n,), metallic))
-            return np.asarray(self._shade(normal, *constant, tables, pixel_transport).numpy())
-
-        return PhotoSamples(texel.numpy(), decode(self.colour.numpy()), self.weight.numpy(), self.block.numpy(), shaded)
+        # Shading is linear in diffuse albedo and F0: three materials give its coefficients.
+        dielectric = shaded(black, zero)
+        specular = (shaded(black + 1, zero + 1) - dielectric) / 0.96
+        return dielectric + albedo * (shaded(black + 1, zero) - dielectric) + (f0 - 0.04) * specular
 
     def _normals(self, normal_offset: Tensor) -> Tensor:
         """Shading normals (n, 3) of the pixels, of any length, with the texels' `normal_offset` (texels, 3)."""
@@ -120,3 +97,37 @@ def _interpolate(values: Tensor, texel: Tensor, bilinear: Tensor) -> Tensor:
     """`values` (texels, c) at pixels with the taps `texel` (n, 4) and weights `bilinear` (n, 4): (n, c)."""
     first, *others = (values[texel[:, k]] * bilinear[:, k, None] for k in range(4))
     return sum(others, first)
+
+
+def photo_loss(
+    batch: Batch, values: Tensor, normal_offset: Tensor, tables: LightTables, transport: Tensor, residual_weight: float, robust: float
+) -> Tensor:
+    """Mean weighted pseudo-Huber error of the pixels in sRGB, for texels with material `values` (texels, 5)."""
+    # Clamped: a reflection brighter than white that the photo does not show has no gradient; it is misplaced rather than too bright.
+    error = linear_to_srgb(batch.shade(values, normal_offset, tables, transport).clamp(0, 1)) - batch.colour
+    return (residual_weight * ((error.square() + robust**2).sqrt() - robust).mean(1) * batch.weight).mean()
+
+
+def prior_loss(
+    values: Tensor,
+    normal_offset: Tensor,
+    pairs: Tensor,
+    smoothness: Tensor,
+    mean_weight: Tensor,
+    offset_weight: float,
+    common: Tensor,
+    common_weight: Tensor,
+) -> Tensor:
+    """The priors, summed over texels: |Δ| of material `values` (n, 5) and Δ² of `normal_offset` (n, 3) between neighbouring `pairs` (m, 2)
+    with the weights `smoothness` (8,); `mean_weight` (5,) times the values, of base colour the diffuse part; squared normal offset; squared
+    distance of sRGB base colour and roughness to the `common` materials (n, 4) with half of `common_weight` (4,)."""
+    change = values[pairs[:, 0]] - values[pairs[:, 1]]
+    difference = normal_offset[pairs[:, 0]] - normal_offset[pairs[:, 1]]
+    distance = torch.cat([linear_to_srgb(values[:, :3]), values[:, 3:4]], 1) - common
+    return (
+        (change.abs() @ smoothness[:5]).sum()
+        + (difference.square() @ smoothness[5:]).sum()
+        + (values[:, :3] * (1 - values[:, 4:].detach()) @ mean_weight[:3] + values[:, 3:] @ mean_weight[3:]).sum()
+        + offset_weight * normal_offset.square().sum()
+        + 0.5 * (distance.square() @ common_weight).sum()
+    )

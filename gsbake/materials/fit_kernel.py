@@ -1,0 +1,375 @@
+"""Numba kernels of one step of the material fit on the CPU in float32; `fit_reference` is the same in PyTorch.
+
+`shade_and_differentiate` reads the texels of each pixel, shades it (split sum, light transport, reflections of the object), compares it
+with the photo, and writes the gradient with respect to the pixel's material; pixels are independent. Gradients of the light's table are
+summed in a fixed number of chunks. `gather_gradient` adds the pixels' gradients up per texel, from a list of each texel's pixels, and
+`adam_step` adds the priors and updates each texel from its neighbours' old values. Every sum has a fixed order: results do not depend on
+threads.
+
+All literals are float32: a float64 constant would widen the whole expression. The fast-math flags omit `nnan`, because the index clamps
+must hold for NaN.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numba import njit, prange
+
+from gsbake.shading.split_sum_kernel import (
+    _CLAMP_TERM,
+    _F0,
+    _FLAGS,
+    CHUNKS,
+    MIN_SQUARED_LENGTH,
+    _bilinear,
+    _bilinear_backward,
+    _encode,
+    _encode_backward,
+    _mirror_weight,
+    _roughness_level,
+    _table_cell,
+    _taps,
+)
+
+_0, _1, _2, _HALF = np.float32(0), np.float32(1), np.float32(2), np.float32(0.5)
+_16 = np.float32(16)
+_MIN_OCCLUSION_BASE = np.float32(1e-3)
+_U1 = np.uint64(1)
+# sRGB curve (IEC 61966-2-1).
+_THRESHOLD, _SLOPE, _SCALE, _OFFSET = np.float32(0.0031308), np.float32(12.92), np.float32(1.055), np.float32(0.055)
+_POWER = np.float32(1 / 2.4)
+
+#: Columns of a texel's parameters: base colour (3), roughness, metallic, normal offset (3).
+PARAMETERS = 8
+#: Columns of a pixel's shading parameters: diffuse albedo (3), F0 (3), roughness, normal offset (3).
+SHADING = 10
+#: Columns of a texel's light transport: visibility, ambient occlusion, indirect irradiance / π (3), emission (3), outgoing radiance (3).
+TRANSPORT = 11
+
+
+@njit(inline="always", **_FLAGS)
+def srgb_and_slope(linear: Any) -> Any:
+    """sRGB of a linear value in [0, 1], and its derivative."""
+    if linear > _THRESHOLD:
+        power = linear**_POWER
+        return _SCALE * power - _OFFSET, _SCALE * _POWER * power / linear
+    return _SLOPE * linear, _SLOPE
+
+
+@njit(inline="always", **_FLAGS)
+def specular_occlusion(cosine: Any, roughness: Any, occlusion: Any) -> Any:
+    """Specular occlusion of Lagarde & de Rousiers for a positive `cosine`."""
+    exponent = np.float32(2) ** (-_16 * roughness - _1)
+    return min(max(max(min(cosine, _1) + occlusion, _MIN_OCCLUSION_BASE) ** exponent - _1 + occlusion, _0), _1)
+
+
+@njit(parallel=True, **_FLAGS)
+def shade_and_differentiate(
+    texel: Any, bilinear: Any, normal: Any, view: Any, colour: Any, weight: Any, reflected: Any,
+    values: Any, transport: Any, table: Any, knots: Any, sizes: Any, offsets: Any, lut: Any,
+    residual_weight: Any, robust: Any, factor: Any, gradient: Any, g_table: Any, sums: Any,
+) -> None:  # fmt: skip
+    """Loss and gradients of n pixels of one photo.
+
+    `texel`, `bilinear` (n, 4) taps; `normal` (n, 3) of the mesh; `view`, sRGB `colour` (n, 3); `weight` (n,); `reflected` (n,) texel that
+    the reflected ray hits, −1: none, or empty: not traced; `values` (texels, PARAMETERS); `transport` (texels, TRANSPORT); `table` … `lut`
+    as in `split_sum_kernel`. `factor` scales the gradients. Written: `gradient` (n, SHADING) of the pixels' interpolated parameters;
+    added: `g_table` (CHUNKS, rows, 3); `sums` (CHUNKS, 3) loss, weighted mean squared error and weight.
+    """
+    n = texel.shape[0]
+    traced = reflected.shape[0] > 0
+    last = sizes.shape[0] - 1
+    half2 = _HALF * np.float32(sizes[last])
+    third = factor * residual_weight / np.float32(3)  # errors are means over the channels
+    for chunk in prange(CHUNKS):
+        table_grad = g_table[chunk]
+        loss_sum = 0.0
+        square_sum = 0.0
+        weight_sum = 0.0
+        shading = np.empty(SHADING, np.float32)
+        local = np.empty(8, np.float32)
+        for pixel in range(chunk * n // CHUNKS, (chunk + 1) * n // CHUNKS):
+            i = np.uint64(pixel)
+            for c in range(SHADING):
+                shading[c] = _0
+            for c in range(8):
+                local[c] = _0
+            for k in range(4):
+                w = bilinear[i, k]
+                t = np.uint64(texel[i, k])
+                if w > _0:
+                    w_metal = w * values[t, 4]
+                    for c in range(3):
+                        shading[c] += (w - w_metal) * values[t, c]
+                        shading[3 + c] += (w - w_metal) * _F0 + w_metal * values[t, c]
+                        shading[7 + c] += w * values[t, 5 + c]
+                    shading[6] += w * values[t, 3]
+                    for c in range(8):
+                        local[c] += w * transport[t, c]
+            rough = shading[6]
+            visible = local[0]
+            occlusion = local[1]
+
+            # Geometry.
+            nx = normal[i, 0] + shading[7]
+            ny = normal[i, 1] + shading[8]
+            nz = normal[i, 2] + shading[9]
+            inverse = _1 / math.sqrt(max(nx * nx + ny * ny + nz * nz, MIN_SQUARED_LENGTH))
+            nx *= inverse
+            ny *= inverse
+            nz *= inverse
+            vx, vy, vz = view[i, 0], view[i, 1], view[i, 2]
+            c = nx * vx + ny * vy + nz * vz
+            soft_root = math.sqrt(c * c + _CLAMP_TERM)
+            soft = _HALF * (c + soft_root)
+            root = math.sqrt(soft)
+            row, col, fx, fy = _table_cell(root, rough, lut)
+            a00, a01, a10, a11 = lut[row, col, 0], lut[row, col + _U1, 0], lut[row + _U1, col, 0], lut[row + _U1, col + _U1, 0]
+            b00, b01, b10, b11 = lut[row, col, 1], lut[row, col + _U1, 1], lut[row + _U1, col, 1], lut[row + _U1, col + _U1, 1]
+            scale = (_1 - fy) * (a00 + fx * (a01 - a00)) + fy * (a10 + fx * (a11 - a10))
+            bias = (_1 - fy) * (b00 + fx * (b01 - b00)) + fy * (b10 + fx * (b11 - b10))
+            mirror, mirror_slope = _mirror_weight(rough)
+            coeff = _1 + mirror * (_2 * c - _1)
+            rx = coeff * nx - mirror * vx
+            ry = coeff * ny - mirror * vy
+            rz = coeff * nz - mirror * vz
+            u, v = _encode(rx, ry, rz)
+            level, t_level = _roughness_level(rough, knots)
+            base0, stride0, fx0, fy0 = _taps(u, v, sizes[level], offsets[level])
+            base1, stride1, fx1, fy1 = _taps(u, v, sizes[level + 1], offsets[level + 1])
+            u, v = _encode(nx, ny, nz)
+            base2, stride2, fx2, fy2 = _taps(u, v, sizes[last], offsets[last])
+            visible_s = specular_occlusion(soft, rough, occlusion)
+            incident = _0
+            hit = np.uint64(0)
+            if traced:
+                visible_s *= _1 - mirror
+                if reflected[i] >= 0:
+                    incident = mirror
+                    hit = np.uint64(reflected[i])
+                else:
+                    visible_s += mirror
+
+            # Shade, compare, differentiate; one channel at a time.
+            w = weight[i]
+            g_u = g_v = g_un = g_vn = g_t = g_scale = g_bias = _0
+            half0 = _HALF * np.float32(sizes[level])
+            half1 = _HALF * np.float32(sizes[level + 1])
+            squares = _0
+            loss = _0
+            for ch in range(3):
+                albedo = shading[ch]
+                f0 = shading[3 + ch]
+                lower = _bilinear(table, base0, stride0, fx0, fy0, ch)
+                upper = _bilinear(table, base1, stride1, fx1, fy1, ch)
+                irradiance = _bilinear(table, base2, stride2, fx2, fy2, ch)
+                light = lower + t_level * (upper - lower)
+                bounced = incident * transport[hit, np.uint64(8 + ch)]
+                reflectance = f0 * scale + bias
+                diffuse = visible * irradiance + local[2 + ch]
+                linear = albedo * diffuse + (visible_s * light + bounced) * reflectance + local[5 + ch]
+                encoded, slope = srgb_and_slope(min(max(linear, _0), _1))
+                error = encoded - colour[i, ch]
+                squares += error * error
+                length = math.sqrt(error * error + robust * robust)
+                loss += length - robust
+                g = _0
+                if _0 <= linear <= _1:
+                    g = third * w * error / length * slope
+                g_s = g * visible_s
+                gradient[i, ch] = g * diffuse
+                gradient[i, 3 + ch] = (g_s * light + g * bounced) * scale
+                g_scale += g_s * light * f0
+                g_bias += g_s * light
+                g_light = g_s * reflectance
+                g_t += g_light * (upper - lower)
+                du, dv = _bilinear_backward(table, table_grad, base0, stride0, fx0, fy0, ch, g_light * (_1 - t_level))
+                g_u += du * half0
+                g_v += dv * half0
+                du, dv = _bilinear_backward(table, table_grad, base1, stride1, fx1, fy1, ch, g_light * t_level)
+                g_u += du * half1
+                g_v += dv * half1
+                du, dv = _bilinear_backward(table, table_grad, base2, stride2, fx2, fy2, ch, g * visible * albedo)
+                g_un += du * half2
+                g_vn += dv * half2
+            loss_sum += w * residual_weight * loss
+            square_sum += w * squares
+            weight_sum += w
+
+            # Split-sum table: derivatives along √(n·v) and roughness. Visibility and reflected radiance count as constants.
+            d_root = g_scale * ((_1 - fy) * (a01 - a00) + fy * (a11 - a10)) + g_bias * ((_1 - fy) * (b01 - b00) + fy * (b11 - b10))
+            d_rough = g_scale * ((_1 - fx) * (a10 - a00) + fx * (a11 - a01)) + g_bias * ((_1 - fx) * (b10 - b00) + fx * (b11 - b01))
+            g_c = d_root * np.float32(lut.shape[1] - 1) * _HALF / root * _HALF * (_1 + c / soft_root)
+            gx, gy, gz = _encode_backward(rx, ry, rz, g_u, g_v)
+            g_along = gx * nx + gy * ny + gz * nz
+            g_c += _2 * mirror * g_along
+            g_mirror = (_2 * c - _1) * g_along - (gx * vx + gy * vy + gz * vz)
+            gradient[i, 6] = g_t / (knots[level + 1] - knots[level]) + d_rough * np.float32(lut.shape[0] - 1) + g_mirror * mirror_slope
+            hx, hy, hz = _encode_backward(nx, ny, nz, g_un, g_vn)
+            hx += coeff * gx + g_c * vx
+            hy += coeff * gy + g_c * vy
+            hz += coeff * gz + g_c * vz
+            radial = hx * nx + hy * ny + hz * nz
+            keep = inverse if inverse * inverse * MIN_SQUARED_LENGTH < _1 else _0
+            gradient[i, 7] = keep * (hx - radial * nx)
+            gradient[i, 8] = keep * (hy - radial * ny)
+            gradient[i, 9] = keep * (hz - radial * nz)
+        sums[chunk, 0] += loss_sum / 3
+        sums[chunk, 1] += square_sum / 3
+        sums[chunk, 2] += weight_sum
+
+
+@njit(parallel=True, **_FLAGS)
+def gather_gradient(touched: Any, start: Any, pixel: Any, share: Any, gradient: Any, values: Any, out: Any) -> None:
+    """Set rows `touched` (m,) of `out` (texels, PARAMETERS) to the gradient of the texels' parameters `values` (texels, PARAMETERS).
+
+    It is the sum of `share` (e,) times `gradient` (n, SHADING) of `pixel` (e,), by the chain rule through diffuse albedo and F0. The
+    entries of the texel touched[j] are start[j] … start[j + 1].
+    """
+    for j in prange(touched.shape[0]):
+        t = np.uint64(touched[j])
+        a0 = a1 = a2 = f0 = f1 = f2 = rough = x = y = z = _0
+        for e in range(start[j], start[j + 1]):
+            p = np.uint64(pixel[e])
+            w = share[e]
+            a0 += w * gradient[p, 0]
+            a1 += w * gradient[p, 1]
+            a2 += w * gradient[p, 2]
+            f0 += w * gradient[p, 3]
+            f1 += w * gradient[p, 4]
+            f2 += w * gradient[p, 5]
+            rough += w * gradient[p, 6]
+            x += w * gradient[p, 7]
+            y += w * gradient[p, 8]
+            z += w * gradient[p, 9]
+        metal = values[t, 4]
+        out[t, 0] = (_1 - metal) * a0 + metal * f0
+        out[t, 1] = (_1 - metal) * a1 + metal * f1
+        out[t, 2] = (_1 - metal) * a2 + metal * f2
+        out[t, 3] = rough
+        b0, b1, b2 = values[t, 0], values[t, 1], values[t, 2]
+        out[t, 4] = (b0 - _F0) * f0 + (b1 - _F0) * f1 + (b2 - _F0) * f2 - b0 * a0 - b1 * a1 - b2 * a2
+        out[t, 5] = x
+        out[t, 6] = y
+        out[t, 7] = z
+
+
+@njit(inline="always", **_FLAGS)
+def _sign(x: Any) -> Any:
+    return _1 if x > _0 else (-_1 if x < _0 else _0)
+
+
+@njit(parallel=True, **_FLAGS)
+def adam_step(
+    raw: Any, values: Any, new_values: Any, data: Any, first: Any, second: Any, start: Any, neighbour: Any, smoothness: Any,
+    mean_weight: Any, offset_weight: Any, common: Any, common_weight: Any, rate: Any, beta1: Any, beta2: Any, correction1: Any,
+    correction2: Any, epsilon: Any,
+) -> None:  # fmt: skip
+    """One Adam step on all texels, with the priors' gradients added to `data` (texels, PARAMETERS), which is set to zero.
+
+    `raw` (texels, PARAMETERS) are logits, for the normal offset the values themselves; `values` the old values, `new_values` the new ones.
+    `start`, `neighbour` is the adjacency list; `smoothness` (PARAMETERS,) weighs |Δ| of the materials and Δ² of the normal offsets of each
+    pair, `mean_weight` (PARAMETERS,) the values (of base colour the
+    diffuse part), `offset_weight` the squared normal offset; `common` (texels or 0, 4) with
+    `common_weight` (4,) draws sRGB base colour and roughness. `rate` (PARAMETERS,) learning rates; `first`, `second` moments.
+    """
+    regular = common.shape[0] > 0
+    for t in prange(raw.shape[0]):
+        for c in range(PARAMETERS):
+            value = values[t, c]
+            g = data[t, c] + mean_weight[c] * (_1 - values[t, 4] if c < 3 else _1)  # of base colour only the diffuse part
+            data[t, c] = _0
+            pull = _0
+            if c < 5:
+                for e in range(start[t], start[t + 1]):
+                    pull += _sign(value - values[neighbour[e], c])
+                g += smoothness[c] * pull
+                if regular and c < 3:
+                    encoded, slope = srgb_and_slope(value)
+                    g += common_weight[c] * (encoded - common[t, c]) * slope
+                elif regular and c == 3:
+                    g += common_weight[3] * (value - common[t, 3])
+                g *= value * (_1 - value)
+            else:
+                for e in range(start[t], start[t + 1]):
+                    pull += value - values[neighbour[e], c]
+                g += _2 * (smoothness[c] * pull + offset_weight * value)
+            m = beta1 * first[t, c] + (_1 - beta1) * g
+            s = beta2 * second[t, c] + (_1 - beta2) * g * g
+            first[t, c] = m
+            second[t, c] = s
+            r = raw[t, c] - rate[c] * m * correction1 / (math.sqrt(s * correction2) + epsilon)
+            raw[t, c] = r
+            new_values[t, c] = r if c >= 5 else _1 / (_1 + math.exp(-r))
+
+
+@njit(parallel=True, **_FLAGS)
+def linear_shading(
+    texel: Any, normal: Any, view: Any, reflected: Any, local: Any, outgoing: Any, rough: Any, table: Any, knots: Any, sizes: Any,
+    offsets: Any, lut: Any, diffuse: Any, scaled: Any, constant: Any,
+) -> None:  # fmt: skip
+    """Shading of n pixels as a linear function of base colour b.
+
+    A dielectric shows b · `diffuse` + .04 · `scaled` + `constant`, a metal b · `scaled` + `constant`; (n, 3) each. `texel` (n,) is the
+    texel whose roughness `rough` (texels,) and `outgoing` radiance (texels, 3) count; `local` (n, 8) the light transport of the pixels.
+    """
+    n = normal.shape[0]
+    traced = reflected.shape[0] > 0
+    last = sizes.shape[0] - 1
+    for pixel in prange(n):
+        i = np.uint64(pixel)
+        roughness = rough[texel[i]]
+        nx, ny, nz = normal[i, 0], normal[i, 1], normal[i, 2]
+        inverse = _1 / math.sqrt(max(nx * nx + ny * ny + nz * nz, MIN_SQUARED_LENGTH))
+        nx *= inverse
+        ny *= inverse
+        nz *= inverse
+        vx, vy, vz = view[i, 0], view[i, 1], view[i, 2]
+        c = nx * vx + ny * vy + nz * vz
+        soft = _HALF * (c + math.sqrt(c * c + _CLAMP_TERM))
+        row, col, fx, fy = _table_cell(math.sqrt(soft), roughness, lut)
+        a0 = lut[row, col, 0] + fx * (lut[row, col + _U1, 0] - lut[row, col, 0])
+        a1 = lut[row + _U1, col, 0] + fx * (lut[row + _U1, col + _U1, 0] - lut[row + _U1, col, 0])
+        b0 = lut[row, col, 1] + fx * (lut[row, col + _U1, 1] - lut[row, col, 1])
+        b1 = lut[row + _U1, col, 1] + fx * (lut[row + _U1, col + _U1, 1] - lut[row + _U1, col, 1])
+        scale = a0 + fy * (a1 - a0)
+        bias = b0 + fy * (b1 - b0)
+        mirror, _ = _mirror_weight(roughness)
+        coeff = _1 + mirror * (_2 * c - _1)
+        u, v = _encode(coeff * nx - mirror * vx, coeff * ny - mirror * vy, coeff * nz - mirror * vz)
+        level, t = _roughness_level(roughness, knots)
+        base0, stride0, fx0, fy0 = _taps(u, v, sizes[level], offsets[level])
+        base1, stride1, fx1, fy1 = _taps(u, v, sizes[level + 1], offsets[level + 1])
+        u, v = _encode(nx, ny, nz)
+        base2, stride2, fx2, fy2 = _taps(u, v, sizes[last], offsets[last])
+        visible_s = specular_occlusion(soft, roughness, local[i, 1])
+        incident = _0
+        hit = np.uint64(0)
+        if traced:
+            visible_s *= _1 - mirror
+            if reflected[i] >= 0:
+                incident = mirror
+                hit = np.uint64(reflected[i])
+            else:
+                visible_s += mirror
+        for ch in range(3):
+            lower = _bilinear(table, base0, stride0, fx0, fy0, ch)
+            upper = _bilinear(table, base1, stride1, fx1, fy1, ch)
+            light = visible_s * (lower + t * (upper - lower)) + incident * outgoing[hit, ch]
+            diffuse[i, ch] = local[i, 0] * _bilinear(table, base2, stride2, fx2, fy2, ch) + local[i, 2 + ch]
+            scaled[i, ch] = light * scale
+            constant[i, ch] = light * bias + local[i, 5 + ch]
+
+
+@njit(parallel=True, **_FLAGS)
+def interpolate_taps(values: Any, texel: Any, bilinear: Any, out: Any) -> None:
+    """`out` (n, c): `values` (texels, c) at the taps `texel` (n, 4) with the weights `bilinear` (n, 4)."""
+    for i in prange(texel.shape[0]):
+        for c in range(values.shape[1]):
+            total = _0
+            for k in range(4):
+                total += bilinear[i, k] * values[texel[i, k], c]
+            out[i, c] = total

@@ -1,0 +1,184 @@
+"""The pixels of one photo, laid out for the kernels of the material fit, and their shading as a linear function of base colour."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gsbake.imaging.srgb import decode
+from gsbake.materials import fit_kernel
+from gsbake.materials.metallic import NORMAL_ERROR, PhotoSamples, Shader
+from gsbake.materials.pixels import Pixels
+from gsbake.shading import brdf
+from gsbake.shading.light_tables import LightTables
+
+Floats = NDArray[np.float32]
+
+#: Columns of a texel's light transport: visibility (0..1) of the present light and, for specular reflection, of uniform light (ambient
+#: occlusion); indirect irradiance / π; emission; outgoing radiance, which reflections of the object show.
+VISIBILITY, OCCLUSION, INDIRECT, EMISSION, OUTGOING = 0, 1, slice(2, 5), slice(5, 8), slice(8, 11)
+
+
+@dataclass(frozen=True)
+class KernelTables:
+    """A prefiltered light as the kernels read it: the flat `table` (rows, 3) and its layout, and the split-sum table `lut`."""
+
+    table: Floats
+    knots: Floats
+    sizes: NDArray[np.int64]
+    offsets: NDArray[np.int64]
+    lut: Floats
+
+    @classmethod
+    def of(cls, tables: LightTables) -> KernelTables:
+        """The arrays of `tables`, without gradient."""
+        layout = tables.layout
+        table = np.ascontiguousarray(tables.table.detach().numpy())
+        return cls(table, np.array(layout.roughness, np.float32), np.array(layout.sizes), np.array(layout.offsets), brdf.split_sum_table())
+
+    @property
+    def arrays(self) -> tuple[NDArray[Any], ...]:
+        """All arrays, in the order of the kernels' arguments."""
+        return self.table, self.knots, self.sizes, self.offsets, self.lut
+
+
+@dataclass(frozen=True)
+class PhotoBatch:
+    """The n pixels of one photo, fields as in `Pixels`, with the mesh's `normal` (n, 3) there, of any length; `reflected` is empty where
+    reflections were not traced."""
+
+    texel: NDArray[np.int32]
+    bilinear: Floats
+    view: Floats
+    colour: Floats
+    weight: Floats
+    block: NDArray[np.int32]
+    normal: Floats
+    reflected: NDArray[np.int32]
+
+    @classmethod
+    def of(cls, pixels: Pixels, normal: Floats) -> PhotoBatch:
+        """The `pixels` of a photo on a mesh whose texels have the `normal` (texels, 3)."""
+        reflected = np.zeros(0, np.int64) if pixels.reflected_texel is None else pixels.reflected_texel
+        texel = np.ascontiguousarray(pixels.texel, np.int32)
+        bilinear, view, colour = (np.ascontiguousarray(x, np.float32) for x in (pixels.bilinear, pixels.view, pixels.colour))
+        weight = np.ascontiguousarray(pixels.weight, np.float32)
+        return cls(texel, bilinear, view, colour, weight, pixels.block, interpolate(normal, texel, bilinear), reflected.astype(np.int32))
+
+    def __len__(self) -> int:
+        return len(self.weight)
+
+    @cached_property
+    def dominant_texel(self) -> NDArray[np.int64]:
+        """The texel (n,) with the largest bilinear weight in each pixel."""
+        return np.take_along_axis(self.texel, self.bilinear.argmax(1)[:, None], 1)[:, 0].astype(np.int64)
+
+    @cached_property
+    def entries(self) -> tuple[NDArray[Any], ...]:
+        """The pixels of each texel: the texels `touched` (m,) in order, `start` (m + 1,) of their entries, `pixel` and `share` of each."""
+        flat, share = self.texel.ravel(), self.bilinear.ravel()
+        used = np.flatnonzero(share > 0)
+        order = used[np.argsort(flat[used], kind="stable")]
+        touched, start = np.unique(flat[order], return_index=True)
+        return touched, np.append(start, len(order)), (order // 4).astype(np.int32), share[order]
+
+    def select(self, chosen: NDArray[np.bool_]) -> PhotoBatch:
+        """The pixels whose dominant texel is `chosen` (texels,)."""
+        return self._rows(chosen[self.dominant_texel])
+
+    def every(self, step: int) -> PhotoBatch:
+        """Every `step`-th pixel."""
+        return self if step == 1 else self._rows(slice(None, None, step))
+
+    def _rows(self, keep: Any) -> PhotoBatch:
+        return PhotoBatch(
+            self.texel[keep], self.bilinear[keep], self.view[keep], self.colour[keep], self.weight[keep], self.block[keep],
+            self.normal[keep], self.reflected[keep] if len(self.reflected) else self.reflected,
+        )  # fmt: skip
+
+    def samples(self, normal_offset: Floats, tables: KernelTables, transport: Floats, tilted: bool = False) -> PhotoSamples:
+        """The pixels for searches over all photos, with `tilted` normals as well; each counts for its dominant texel."""
+        normal = self.normal + interpolate(normal_offset, self.texel, self.bilinear)
+        local = interpolate(transport[:, : OUTGOING.start], self.texel, self.bilinear)
+        light = tables, local, np.ascontiguousarray(transport[:, OUTGOING])
+        others = tuple(self._shader(n, *light) for n in _tilted(normal)) if tilted else ()
+        return PhotoSamples(self.dominant_texel, decode(self.colour), self.weight, self.block, self._shader(normal, *light), others)
+
+    def _shader(self, normal: Floats, tables: KernelTables, local: Floats, outgoing: Floats) -> Shader:
+        """The function that shades the pixels with the `normal` (n, 3) and light transport `local` (n, 8) and `outgoing` (texels, 3)."""
+        last: list[tuple[NDArray[np.float32], tuple[Floats, Floats, Floats]]] = []
+
+        def parts(roughness: NDArray[np.float32]) -> tuple[Floats, Floats, Floats]:
+            if not last or last[0][0] is not roughness:
+                out = np.empty_like(normal), np.empty_like(normal), np.empty_like(normal)
+                fit_kernel.linear_shading(
+                    self.dominant_texel, normal, self.view, self.reflected, local, outgoing, np.ascontiguousarray(roughness, np.float32),
+                    *tables.arrays, *out,
+                )  # fmt: skip
+                last[:] = [(roughness, out)]
+            return last[0][1]
+
+        def shaded(base: float, roughness: NDArray[np.float32], metallic: float) -> Floats:
+            diffuse, scaled, constant = parts(roughness)
+            b, m = np.float32(base), np.float32(metallic)
+            f0 = np.float32(0.04) * (1 - m) + m * b
+            return (1 - m) * b * diffuse + f0 * scaled + constant
+
+        return shaded
+
+
+def _tilted(normal: Floats) -> tuple[Floats, Floats]:
+    """The `normal` (n, 3), of any length, tilted by `NORMAL_ERROR` along two tangents."""
+    unit = normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-20)
+    axis = np.where(np.abs(unit[:, :1]) < 0.7, np.array([[1, 0, 0]]), np.array([[0, 1, 0]])).astype(np.float32)
+    first = np.cross(unit, axis)
+    first /= np.maximum(np.linalg.norm(first, axis=1, keepdims=True), 1e-20)
+    step = np.float32(NORMAL_ERROR)
+    return unit + step * first, unit + step * np.cross(unit, first)
+
+
+def interpolate(values: NDArray[Any], texel: NDArray[Any], bilinear: Floats) -> Floats:
+    """`values` (texels, c) at pixels with the taps `texel` (n, 4) and weights `bilinear` (n, 4): (n, c)."""
+    out = np.empty((len(texel), values.shape[1]), np.float32)
+    fit_kernel.interpolate_taps(np.ascontiguousarray(values, np.float32), texel, bilinear, out)
+    return out
+
+
+class FitStep:
+    """Buffers for shading photos of `texels` texels and for the gradients."""
+
+    def __init__(self, texels: int) -> None:
+        self.gradient = np.zeros((texels, fit_kernel.PARAMETERS), np.float32)
+        self._pixels = np.zeros((0, fit_kernel.SHADING), np.float32)
+        self.table = np.zeros((fit_kernel.CHUNKS, 0, 3), np.float32)
+
+    def __call__(
+        self,
+        batch: PhotoBatch,
+        values: Floats,
+        tables: KernelTables,
+        transport: Floats,
+        residual_weight: float,
+        robust: float,
+        factor: float,
+    ) -> NDArray[np.float64]:
+        """Shade the photo, leave the texels' gradient in `gradient` and the table's in `table` (CHUNKS, rows, 3); the sums (3,) of loss,
+        squared error and weight. Gradients are multiplied by `factor`; with 0 they are left out."""
+        n = len(batch)
+        if len(self._pixels) < n:
+            self._pixels = np.zeros((n, fit_kernel.SHADING), np.float32)
+        if self.table.shape[1] != len(tables.table):
+            self.table = np.zeros((fit_kernel.CHUNKS, len(tables.table), 3), np.float32)
+        self.table[:] = 0
+        sums = np.zeros((fit_kernel.CHUNKS, 3))
+        fit_kernel.shade_and_differentiate(
+            batch.texel, batch.bilinear, batch.normal, batch.view, batch.colour, batch.weight, batch.reflected, values, transport,
+            *tables.arrays, np.float32(residual_weight), np.float32(robust), np.float32(factor), self._pixels, self.table, sums,
+        )  # fmt: skip
+        if factor:
+            fit_kernel.gather_gradient(*batch.entries, self._pixels, values, self.gradient)
+        return np.asarray(sums.sum(0))

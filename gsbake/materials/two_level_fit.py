@@ -1,0 +1,59 @@
+"""The schedule of the material fit over two resolutions: trials, searches, and refinement.
+
+Short trials from several starts and the continued fit with all searches (light, metals, emissive regions) run on the coarse level, where a
+step costs a quarter. The fine level continues from the result for a few steps: it sharpens base colours and the edges of metals.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+from gsbake.materials.fit import MaterialFit
+from gsbake.materials.initialisation import ChosenFit, best_fit, trial_fits
+from gsbake.materials.levels import FitLevel
+from gsbake.materials.options import FitOptions, FitSchedule, Priors
+from gsbake.texturing.resampling import CoarseTexture
+
+#: Steps of a trial, of the continued fit on the coarse level, and on the fine one, as shares of the iterations.
+TRIAL_SHARE, COARSE_SHARE, FINE_SHARE = 0.25, 0.5, 0.25
+#: When metals are searched for on the fine level, as a share of its steps.
+FINE_METAL_SEARCHES_AT = (0.3,)
+
+#: Called after every step with what is being done, the number of steps done and their total.
+Progress = Callable[[str, int, int], None]
+
+
+@dataclass(frozen=True)
+class FitPlan:
+    """`iterations` in all of one candidate; `light_size` edge of the environment map's faces in texels; `diffuse`: without specular
+    reflection."""
+
+    iterations: int
+    light_size: int
+    priors: Priors
+    seed: int = 0
+    diffuse: bool = False
+    options: FitOptions | None = None
+
+
+def fit_two_levels(coarse: FitLevel, fine: FitLevel, texture: CoarseTexture, plan: FitPlan, progress: Progress) -> ChosenFit:
+    """The fit on the `fine` level, whose texels `texture` reduces to those of `coarse`."""
+
+    def steps(share: float) -> int:
+        return max(1, round(share * plan.iterations))
+
+    def each(name: str) -> Callable[[int, int], None]:
+        return lambda done, total: progress(name, done, total)
+
+    def make(metallic: float, roughness: float) -> MaterialFit:
+        return MaterialFit(coarse.surface, plan.light_size, plan.priors, roughness, metallic, plan.options)
+
+    trials = trial_fits(make, coarse, steps(TRIAL_SHARE), plan.seed, plan.diffuse, each("trial fits"))
+    schedule = FitSchedule(steps(COARSE_SHARE), plan.seed, diffuse=plan.diffuse)
+    choice = best_fit(trials, coarse, schedule, each("material fit, coarse level"))
+    fit = choice.fit.continued_on(fine.surface, texture.up)
+    refine = replace(
+        schedule, iterations=steps(FINE_SHARE), metal_searches_at=FINE_METAL_SEARCHES_AT, emission=False, intensity=False
+    )  # fmt: skip
+    return replace(choice, fit=fit, fitted=fit.run(fine.fitted, fine.held_out, refine, each("material fit, fine level")))
