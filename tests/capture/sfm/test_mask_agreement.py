@@ -31,7 +31,7 @@ def ring(turn: float = 1.0) -> list[Camera]:
 
 
 def write_masks(folder: Path, cameras: list[Camera]) -> dict[str, Path]:
-    """Silhouettes of a bent bar: it looks different from every side."""
+    """Silhouettes of a curved bar: it looks different from every side."""
     folder.mkdir(parents=True)
     t = np.linspace(-1, 1, 60)
     line = np.stack([0.8 * t, 0.5 * t**2, 0.4 * t], 1)
