@@ -25,8 +25,8 @@ SMALL = (
 
 #: Bounds: chamfer in % of the diagonal, angles in degrees, root mean square errors, decibels.
 CHAMFER, NORMALS = 0.151, 7.1
-ROUGHNESS, METALLIC = 0.251, 0.364
-BASE_COLOR, RELIT = 16.9, 23.5
+ROUGHNESS, METALLIC = 0.303, 0.48
+BASE_COLOR, RELIT = 14.8, 23.3
 
 
 def gsbake(*args: object) -> None:

