@@ -12,6 +12,7 @@ from typing import Any
 from urllib.parse import quote
 
 from gsbake.capture.photos.undistortion import intrinsics_key
+from gsbake.capture.sfm.mask_agreement import mask_agreement
 from gsbake.capture.sfm.pairs import choose_matching
 from gsbake.capture.sfm.process import JobCallbacks, run_job
 from gsbake.capture.sfm.static_background import is_background_static
@@ -24,6 +25,8 @@ from gsbake.text import shortlist
 #: Time limit of triangulation with given poses in seconds, per photo and at least. Far above any measured time: it ends a process that
 #: hangs, and the run with it.
 SECONDS_PER_PHOTO, MIN_SECONDS = 60.0, 1800.0
+#: Agreement of cameras and masks (`mask_agreement`) below which features of whole photos are not trusted.
+MIN_AGREEMENT = 0.85
 
 
 @dataclass(frozen=True)
@@ -33,6 +36,16 @@ class Solved:
     cameras: list[Camera]
     cloud: Path
     figures: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class _Attempt:
+    """A solution: the COLMAP process's `result`, the `cameras`, the `folder` of its files, and whether features are `masked`."""
+
+    result: dict[str, Any]
+    cameras: list[Camera]
+    folder: Path
+    masked: bool
 
 
 @dataclass(frozen=True)
@@ -57,9 +70,8 @@ class PoseSolver:
         names = sorted(e["name"] for e in self.entries)
         kind, evidence = choose_matching(self.options.matching, names)
         self.monitor.decide("matching", kind, evidence)
-        masks = self._feature_masks()
-        job = self._job("solve", self.entries, masks) | {"matching": kind, "mapper": self.options.mapper}
-        result = self._run(job)
+        found = self._checked(self._attempt(kind, self._feature_masks()), kind)
+        result = found.result
         count, missing = int(result["registered"]), list(result["missing"])
         if count < max(3, self.options.min_registered * len(names)):
             raise BadInputError(
@@ -78,13 +90,46 @@ class PoseSolver:
             "reprojection_px": result["reprojection_px"],
             "points": result["points"],
             "track_length": result["track_length"],
-            "cameras": len(job["lenses"]),
+            "cameras": len(_lenses(self.entries)),
             "matching": kind,
-            "masked_features": masks is not None,
+            "masked_features": found.masked,
             "fine_features": result["fine_features"],
             "seconds": result["seconds"],
         }
-        return Solved(list(CameraSet.load(self.folder / "cameras.json").cameras), self.folder / "points.ply", figures)
+        if found.folder != self.folder:
+            shutil.rmtree(self.folder, ignore_errors=True)
+            found.folder.rename(self.folder)
+        return Solved(found.cameras, self.folder / "points.ply", figures)
+
+    def _attempt(self, matching: str, masks: Path | None) -> _Attempt:
+        """Structure from motion with features in whole photos, or inside `masks`; each has a database of its own."""
+        suffix = "" if masks is None else "_masked"
+        folder = self.scratch / f"solve{suffix}"
+        job = self._job("solve", self.entries, masks) | {"matching": matching, "mapper": self.options.mapper}
+        job["work"] = str(self.scratch / f"colmap{suffix}")
+        result = self._run(job, folder)
+        cameras = list(CameraSet.load(folder / "cameras.json").cameras) if result["registered"] else []
+        return _Attempt(result, cameras, folder, masks is not None)
+
+    def _checked(self, found: _Attempt, matching: str) -> _Attempt:
+        """`found`, or a second attempt with features inside the masks where these contradict the first one and agree better with it."""
+        masks = {e["name"]: self.ingest / e["mask"] for e in self.entries if e["mask"]}
+        if found.masked or self.options.masked_features is False or len(masks) < len(self.entries):
+            return found
+
+        def agreement(attempt: _Attempt) -> float:
+            """Of all photos: those that are not registered agree with nothing."""
+            return mask_agreement(attempt.cameras, masks) * len(attempt.cameras) / len(self.entries) if attempt.cameras else 0.0
+
+        before = agreement(found)
+        if before >= MIN_AGREEMENT:
+            return found
+        other = self._attempt(matching, self._write_feature_masks())
+        after = agreement(other)
+        chosen = other if after > before else found
+        evidence = f"masks agree with the cameras to {before:.2f} with features of whole photos, {after:.2f} inside the masks"
+        self.monitor.decide("features", "inside the masks" if chosen.masked else "in whole photos", evidence)
+        return chosen
 
     def triangulate(self) -> Solved:
         """Tie points for given poses, from the given model or triangulated. Raises BadInputError with fewer than 3 poses."""
@@ -101,7 +146,7 @@ class PoseSolver:
         job |= {"cameras": str(self.ingest / "poses" / "cameras.json"), "lenses": _given_lenses(cameras)}
         limit = max(MIN_SECONDS, SECONDS_PER_PHOTO * len(cameras))
         cloud = self.folder / "points.ply"
-        solved = self._run(job, limit)
+        solved = self._run(job, self.folder, limit)
         figures |= {k: solved[k] for k in ("points", "reprojection_px", "track_length", "seconds")}
         self.monitor.decide("tie points", f"{solved['points']} triangulated", "with the given poses")
         return Solved(cameras, cloud, figures)
@@ -123,14 +168,17 @@ class PoseSolver:
             "seed": self.seed,
         }
 
-    def _run(self, job: dict[str, Any], limit: float | None = None) -> dict[str, Any]:
-        """Run the COLMAP process and time its parts. Raises what `run_job` raises, and what the monitor raises on a stop request."""
+    def _run(self, job: dict[str, Any], folder: Path, limit: float | None = None) -> dict[str, Any]:
+        """Run the COLMAP process, with its results in `folder`, and time its parts.
+
+        Raises what `run_job` raises, and what the monitor raises on a stop request.
+        """
         work = Path(job["work"])
         if not _database_is_intact(work / "database.db"):
             self.monitor.warn("COLMAP's database of the interrupted run is damaged; structure from motion starts over.")
             shutil.rmtree(work)
         work.mkdir(parents=True, exist_ok=True)
-        shutil.rmtree(self.folder, ignore_errors=True)
+        shutil.rmtree(folder, ignore_errors=True)
         with ExitStack() as part_timer:
             current = ""
 
@@ -142,7 +190,7 @@ class PoseSolver:
                     current = part
                 self.monitor.progress(done, total, part)
 
-            result = run_job(job, self.folder, JobCallbacks(progress, self.monitor.stop_requested), limit)
+            result = run_job(job, folder, JobCallbacks(progress, self.monitor.stop_requested), limit)
         if result is None:
             self.monitor.check_stop()
             raise InterruptedRun("Stopped on request.")
@@ -160,9 +208,13 @@ class PoseSolver:
             self.monitor.decide("features", "inside the masks" if static else "in whole photos", evidence)
             if not static:
                 return None
+        return self._write_feature_masks()
+
+    def _write_feature_masks(self) -> Path:
+        """Copy the masks under COLMAP's file names; their folder."""
         folder = self.scratch / "feature_masks"
         folder.mkdir(parents=True, exist_ok=True)
-        for entry in masked:
+        for entry in (e for e in self.entries if e["mask"]):
             target = folder / f"{entry['name']}.png.png"
             with suppress(FileNotFoundError):
                 target.unlink()
