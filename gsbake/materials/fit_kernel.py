@@ -28,6 +28,7 @@ from gsbake.shading.split_sum_kernel import (
     _bilinear_backward,
     _encode,
     _encode_backward,
+    _geometry,
     _mirror_weight,
     _roughness_level,
     _table_cell,
@@ -66,6 +67,25 @@ def specular_occlusion(cosine: Any, roughness: Any, occlusion: Any) -> Any:
     return min(max(max(min(cosine, _1) + occlusion, _MIN_OCCLUSION_BASE) ** exponent - _1 + occlusion, _0), _1)
 
 
+@njit(inline="always", **_FLAGS)
+def _specular_visibility(cosine: Any, roughness: Any, occlusion: Any, mirror: Any, reflected: Any, i: Any) -> Any:
+    """Visible share of the specular lobe of pixel i, weight of the radiance that a traced ray meets, and the texel where it does.
+
+    `mirror` is the weight of the mirror direction; `reflected` (n,) as in `shade_and_differentiate`, empty: not traced.
+    """
+    visible = specular_occlusion(cosine, roughness, occlusion)
+    incident = _0
+    hit = np.uint64(0)
+    if reflected.shape[0] > 0:
+        visible *= _1 - mirror
+        if reflected[i] >= 0:
+            incident = mirror
+            hit = np.uint64(reflected[i])
+        else:
+            visible += mirror
+    return visible, incident, hit
+
+
 @njit(parallel=True, **_FLAGS)
 def shade_and_differentiate(
     texel: Any, bilinear: Any, normal: Any, view: Any, colour: Any, weight: Any, reflected: Any,
@@ -80,7 +100,6 @@ def shade_and_differentiate(
     added: `g_table` (CHUNKS, rows, 3); `sums` (CHUNKS, 3) loss, weighted mean squared error and weight.
     """
     n = texel.shape[0]
-    traced = reflected.shape[0] > 0
     last = sizes.shape[0] - 1
     half2 = _HALF * np.float32(sizes[last])
     third = factor * residual_weight / np.float32(3)  # errors are means over the channels
@@ -142,16 +161,7 @@ def shade_and_differentiate(
             base1, stride1, fx1, fy1 = _taps(u, v, sizes[level + 1], offsets[level + 1])
             u, v = _encode(nx, ny, nz)
             base2, stride2, fx2, fy2 = _taps(u, v, sizes[last], offsets[last])
-            visible_s = specular_occlusion(soft, rough, occlusion)
-            incident = _0
-            hit = np.uint64(0)
-            if traced:
-                visible_s *= _1 - mirror
-                if reflected[i] >= 0:
-                    incident = mirror
-                    hit = np.uint64(reflected[i])
-                else:
-                    visible_s += mirror
+            visible_s, incident, hit = _specular_visibility(soft, rough, occlusion, mirror, reflected, i)
 
             # Shade, compare, differentiate; one channel at a time.
             w = weight[i]
@@ -317,18 +327,12 @@ def linear_shading(
     texel whose roughness `rough` (texels,) and `outgoing` radiance (texels, 3) count; `local` (n, 8) the light transport of the pixels.
     """
     n = normal.shape[0]
-    traced = reflected.shape[0] > 0
     last = sizes.shape[0] - 1
     for pixel in prange(n):
         i = np.uint64(pixel)
         roughness = rough[texel[i]]
-        nx, ny, nz = normal[i, 0], normal[i, 1], normal[i, 2]
-        inverse = _1 / math.sqrt(max(nx * nx + ny * ny + nz * nz, MIN_SQUARED_LENGTH))
-        nx *= inverse
-        ny *= inverse
-        nz *= inverse
+        _, nx, ny, nz, c = _geometry(normal, view, i)
         vx, vy, vz = view[i, 0], view[i, 1], view[i, 2]
-        c = nx * vx + ny * vy + nz * vz
         soft = _HALF * (c + math.sqrt(c * c + _CLAMP_TERM))
         row, col, fx, fy = _table_cell(math.sqrt(soft), roughness, lut)
         a0 = lut[row, col, 0] + fx * (lut[row, col + _U1, 0] - lut[row, col, 0])
@@ -345,16 +349,7 @@ def linear_shading(
         base1, stride1, fx1, fy1 = _taps(u, v, sizes[level + 1], offsets[level + 1])
         u, v = _encode(nx, ny, nz)
         base2, stride2, fx2, fy2 = _taps(u, v, sizes[last], offsets[last])
-        visible_s = specular_occlusion(soft, roughness, local[i, 1])
-        incident = _0
-        hit = np.uint64(0)
-        if traced:
-            visible_s *= _1 - mirror
-            if reflected[i] >= 0:
-                incident = mirror
-                hit = np.uint64(reflected[i])
-            else:
-                visible_s += mirror
+        visible_s, incident, hit = _specular_visibility(soft, roughness, local[i, 1], mirror, reflected, i)
         for ch in range(3):
             lower = _bilinear(table, base0, stride0, fx0, fy0, ch)
             upper = _bilinear(table, base1, stride1, fx1, fy1, ch)

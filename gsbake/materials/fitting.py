@@ -238,7 +238,7 @@ class _Fitting:
         def decide(name: str, holds: bool, evidence: str, skipped: str, done: str) -> bool:
             return decide_skip(self.monitor, name, rules[name], holds, evidence, skipped, done)
 
-        metal = fitted.values[:, 4] > 0.5
+        metal = _metals(fitted)
         selected = drop_unneeded_maps(fitted.values, fitted.weight, int(metal.sum()), partial(fit.psnr, validation), decide)
         values = coarse.up(selected)
         values[:, :3] *= detail
@@ -259,13 +259,13 @@ class _Fitting:
             "fit_psnr": choice.fit.psnr(pixels.test),
             "fit_pixels": sum(map(len, pixels.fitted)),
             "fit_texels": len(coarse.texels),
-            "fit_metal_texels": _metal_count(fitted),
+            "fit_metal_texels": int(_metals(fitted).sum()),
             "fit_emissive_regions": fitted.emissive_regions,
         }
         textures = replace(self.projected, values=values, views=np.where(observed, self.projected.views, 0))
         return FittedTextures(textures, replace(self.detail, normal=normal), fitted.light, figures)
 
 
-def _metal_count(fitted: Fitted) -> int:
-    """Number of metallic texels."""
-    return int((fitted.values[:, 4] > 0.5).sum())
+def _metals(fitted: Fitted) -> NDArray[np.bool_]:
+    """Which texels (n,) are metallic."""
+    return np.asarray(fitted.values[:, 4] > 0.5)

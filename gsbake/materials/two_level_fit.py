@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from gsbake.materials.fit import MaterialFit
 from gsbake.materials.initialisation import ChosenFit, best_fit, trial_fits
 from gsbake.materials.levels import FitLevel
-from gsbake.materials.options import FitOptions, FitSchedule, Priors
+from gsbake.materials.options import FitSchedule, Priors
 from gsbake.texturing.resampling import CoarseTexture
 
 #: Steps of a trial, of the continued fit on the coarse level, and on the fine one, as shares of the iterations.
@@ -34,7 +34,6 @@ class FitPlan:
     priors: Priors
     seed: int = 0
     diffuse: bool = False
-    options: FitOptions | None = None
 
 
 def fit_two_levels(coarse: FitLevel, fine: FitLevel, texture: CoarseTexture, plan: FitPlan, progress: Progress) -> ChosenFit:
@@ -47,7 +46,7 @@ def fit_two_levels(coarse: FitLevel, fine: FitLevel, texture: CoarseTexture, pla
         return lambda done, total: progress(name, done, total)
 
     def make(metallic: float, roughness: float) -> MaterialFit:
-        return MaterialFit(coarse.surface, plan.light_size, plan.priors, roughness, metallic, plan.options)
+        return MaterialFit(coarse.surface, plan.light_size, plan.priors, roughness, metallic)
 
     trials = trial_fits(make, coarse, steps(TRIAL_SHARE), plan.seed, plan.diffuse, each("trial fits"))
     schedule = FitSchedule(steps(COARSE_SHARE), plan.seed, diffuse=plan.diffuse)

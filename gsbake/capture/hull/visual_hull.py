@@ -181,6 +181,10 @@ class Hull:
         """Whether no cell is left."""
         return not bool(self.occupancy.any())
 
+    def centres(self) -> Array:
+        """Centres (n, 3) of the occupied cells."""
+        return np.asarray(self.lower + (np.argwhere(self.occupancy) + 0.5) * self.cell)
+
     def _sample(self, points: Array) -> Array:
         from scipy import ndimage
 

@@ -60,8 +60,7 @@ def excluded_points(cameras: Sequence[Camera], masks: Sequence[Bytes], points: A
 
 def render_silhouette(hull: Hull, camera: Camera) -> NDArray[np.bool_]:
     """Pixels (h, w) of the camera that the hull covers, accurate to about a cell."""
-    centres = hull.lower + (np.argwhere(hull.occupancy) + 0.5) * hull.cell
-    pixel, z = camera.project(centres)
+    pixel, z = camera.project(hull.centres())
     visible = camera.in_view(pixel, z)
     image = np.zeros((camera.height, camera.width), np.uint8)
     column, row = np.floor(pixel[visible]).astype(np.int64).T

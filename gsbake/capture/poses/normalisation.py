@@ -108,7 +108,7 @@ def bounding_sphere_from_masks(cameras: Sequence[Camera], masks: Sequence[Bytes]
         hull = Hull.from_masks(cameras, masks, centre, radius, _FINE_CELLS if step else _COARSE_CELLS)
         if hull.empty:
             return None
-        occupied = hull.lower + (np.argwhere(hull.occupancy) + 0.5) * hull.cell
+        occupied = hull.centres()
         low, high = occupied.min(0), occupied.max(0)
         centre = 0.5 * (low + high)
         tight = float(np.linalg.norm(occupied - centre, axis=1).max()) + 0.5 * hull.cell

@@ -9,7 +9,6 @@ is about the share of the mask that the others support.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,12 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsbake.capture.hull.visual_hull import Hull
+from gsbake.capture.masks.completion import render_silhouette
+from gsbake.capture.photos.decode import Bytes
 from gsbake.capture.photos.undistortion import pinhole_camera, remap_tables, resample
 from gsbake.capture.poses.normalisation import bounding_sphere_from_masks
 from gsbake.errors import BadInputError
 from gsbake.geometry.cameras import Camera
-
-Bytes = NDArray[np.uint8]
 
 #: Longer side of the compared masks in pixels, and cells along an edge of the hull's grid.
 MASK_SIZE, CELLS = 256, 96
@@ -43,8 +42,7 @@ def mask_agreement(cameras: Sequence[Camera], masks: Mapping[str, Path]) -> floa
     if sphere is None:
         return 0.0
     hull = Hull.from_masks(pinholes, images, sphere.centre, sphere.radius, CELLS)
-    points = hull.lower + (np.argwhere(hull.occupancy) + 0.5) * hull.cell
-    return float(np.median([_overlap(camera, mask, points, hull.cell) for camera, mask in views]))
+    return float(np.median([_overlap(mask, render_silhouette(hull, camera)) for camera, mask in views]))
 
 
 def _pinhole_view(camera: Camera, file: Path) -> tuple[Camera, Bytes]:
@@ -55,22 +53,12 @@ def _pinhole_view(camera: Camera, file: Path) -> tuple[Camera, Bytes]:
     small = camera.downscaled_to(MASK_SIZE)
     mask = cv2.resize(mask, (small.width, small.height), interpolation=cv2.INTER_AREA)
     pinhole = pinhole_camera(small)
-    if camera.distortion and any(camera.distortion):
+    if any(camera.distortion):
         mask = resample(np.asarray(mask, np.uint8), remap_tables(small, pinhole), mask=True)
-    return replace(pinhole, name=camera.name), np.asarray(mask, np.uint8)
+    return pinhole, np.asarray(mask, np.uint8)
 
 
-def _overlap(camera: Camera, mask: Bytes, points: NDArray[np.float64], cell: float) -> float:
-    """Intersection over union of the `mask` (h, w) and the projection of cells (n, 3) of edge `cell`."""
-    shown = np.zeros(mask.shape, np.uint8)
-    pixel, depth = camera.project(points)
-    front = depth > 1e-9
-    column, row = np.floor(pixel[front]).astype(np.int64).T
-    inside = (column >= 0) & (row >= 0) & (column < mask.shape[1]) & (row < mask.shape[0])
-    shown[row[inside], column[inside]] = 1
-    if inside.any():  # cells are squares of about this many pixels
-        width = int(np.ceil(cell * camera.fx / np.median(depth[front][inside]))) | 1
-        shown = np.asarray(cv2.morphologyEx(shown, cv2.MORPH_CLOSE, np.ones((width + 2, width + 2), np.uint8)), np.uint8)
-    object_ = mask > 127
-    union = np.count_nonzero(object_ | (shown > 0))
-    return np.count_nonzero(object_ & (shown > 0)) / union if union else 0.0
+def _overlap(mask: Bytes, shown: NDArray[np.bool_]) -> float:
+    """Intersection over union of the `mask` (h, w) and the pixels that the hull covers."""
+    union = np.count_nonzero((mask > 127) | shown)
+    return np.count_nonzero((mask > 127) & shown) / union if union else 0.0
