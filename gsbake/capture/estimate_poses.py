@@ -16,10 +16,12 @@ import numpy as np
 
 from gsbake.capture.hull.visual_hull import visual_hull
 from gsbake.capture.masks.completion import complete_masks
+from gsbake.capture.masks.consensus import MIN_CERTAIN_OVERLAP, MIN_OVERLAP, MIN_USED_AGREEMENT, correct_mask, distorted, find_consensus
 from gsbake.capture.photos.redundancy import find_redundant_photos
 from gsbake.capture.photos.undistortion import intrinsics_key, pinhole_camera, remap_tables, resample
 from gsbake.capture.posed_photos import PosedPhotos
 from gsbake.capture.poses.normalisation import BoundingSphere, bounding_sphere_from_masks, bounding_sphere_from_views
+from gsbake.capture.sfm.feature_masks import FeatureMasks
 from gsbake.capture.sfm.solve import PoseSolver
 from gsbake.config.schema import Poses
 from gsbake.errors import BadInputError
@@ -58,8 +60,9 @@ def estimate_poses(
     """Estimate the cameras of the photos in the artifact folder `ingest`, write the posed capture into `out`; return the figures.
 
     Written: `cameras.json` (`CameraSet`, unit frame), `photos/`, `masks/` (pinhole), `points.ply` (tie points, unit frame; may be absent),
-    `sparse/` (COLMAP binary model, input frame). `scratch` holds COLMAP's database, from which an interrupted run resumes. Raises
-    BadInputError when too few photos register, or required poses are missing.
+    `photo_masks/` (masks that were guessed, as the photos show them), `sparse/` (COLMAP binary model, input frame). `scratch` holds the
+    database of COLMAP, from which an interrupted run resumes. Raises BadInputError when too few photos register, or required poses are
+    missing.
     """
     if scratch is None:
         with tempfile.TemporaryDirectory(prefix="gsbake-poses-") as folder:
@@ -88,6 +91,8 @@ class _Estimation:
         given = self._use_given(len(entries))
         solved = solver.triangulate() if given else solver.solve()
         points, colours = read_cloud(solved.cloud) if solved.cloud.exists() else (None, None)
+        with monitor.part("automatic masks"):
+            automatic = self._write_automatic_masks(entries, solved.cameras)
         with monitor.part("undistortion"):
             pinholes = self._undistort(solved.cameras)
         with monitor.part("normalisation"):
@@ -109,7 +114,7 @@ class _Estimation:
             shutil.copytree(solver.folder / "sparse", self.out / "sparse")
         monitor.decide("unit frame", f"radius {sphere.radius:.4g} in world units", sphere.evidence)
         centre = sphere.centre.tolist()
-        return {"poses": origin, **solved.figures, "dropped_photos": dropped, "centre": centre, "radius": sphere.radius}
+        return {"poses": origin, **solved.figures, **automatic, "dropped_photos": dropped, "centre": centre, "radius": sphere.radius}
 
     def _use_given(self, photos: int) -> bool:
         """Whether given poses are used. Raises BadInputError when they are required but missing."""
@@ -122,13 +127,52 @@ class _Estimation:
         self.monitor.decide("pose source", "given" if use else "structure from motion", evidence)
         return use
 
+    def _write_automatic_masks(self, entries: Sequence[dict[str, Any]], cameras: Sequence[Camera]) -> dict[str, Any]:
+        """Write `photo_masks/`: guesses corrected by agreement between photos, as the photos show them; returns the figures.
+
+        Nothing is written where no mask was guessed, or the guesses do not agree with the cameras.
+        """
+        by_name = {e["name"]: e for e in entries}
+        files = FeatureMasks(self.ingest, [by_name[c.name] for c in cameras], self.scratch).files
+        guessed = [c.name for c in cameras if not by_name[c.name]["mask"] and by_name[c.name].get("guess")]
+        if not guessed or len(files) < len(cameras):
+            return {}
+        found = find_consensus(cameras, files)
+        agreement = 0.0 if found is None else found.agreement
+        if found is None or agreement < MIN_USED_AGREEMENT:
+            evidence = f"the guesses of the network agree with the cameras to {agreement:.2f}, which is below {MIN_USED_AGREEMENT:g}"
+            self.monitor.decide("automatic masks", "not used", evidence)
+            return {"automatic_masks": 0, "mask_agreement": agreement}
+        (self.out / "photo_masks").mkdir()
+        overlaps = {}
+        for camera, silhouette, overlap in zip(cameras, found.silhouettes, found.overlap.tolist(), strict=True):
+            if camera.name not in guessed:
+                continue
+            overlaps[camera.name] = overlap
+            guess: Any = cv2.imread(str(files[camera.name]), cv2.IMREAD_GRAYSCALE)
+            if guess is None:
+                raise FileNotFoundError(files[camera.name])
+            full = cv2.resize(guess, (camera.width, camera.height), interpolation=cv2.INTER_CUBIC)
+            mask = correct_mask(np.asarray(full, np.uint8), distorted(silhouette, camera), overlap)
+            write_png(self.out / "photo_masks" / f"{camera.name}.png", np.where(mask > 127, 255, 0).astype(np.uint8))
+        doubtful = sorted((name for name in overlaps if overlaps[name] < MIN_CERTAIN_OVERLAP), key=lambda name: overlaps[name])
+        corrected = sum(overlap < MIN_OVERLAP for overlap in overlaps.values())
+        counts = f"{corrected} of {len(guessed)} were corrected, {len(doubtful)} are doubtful"
+        evidence = f"the guesses of the network agree with the cameras to {agreement:.2f}; {counts}"
+        self.monitor.decide("automatic masks", "used", evidence)
+        if doubtful:
+            self.monitor.warn(
+                f"{len(doubtful)} of {len(guessed)} automatic masks are doubtful ({shortlist(doubtful)}); edit them (`gsbake masks`)."
+            )
+        return {"automatic_masks": len(guessed), "mask_agreement": agreement, "corrected_masks": corrected, "doubtful_masks": doubtful}
+
     def _undistort(self, cameras: Sequence[Camera]) -> list[Camera]:
         """Write photos and masks undistorted, and return their pinhole cameras; photos without distortion are copied."""
         groups: dict[tuple[float, ...], list[Camera]] = {}
         for camera in cameras:
             groups.setdefault(intrinsics_key(camera), []).append(camera)
         (self.out / "photos").mkdir()
-        if any((self.ingest / "masks" / f"{c.name}.png").exists() for c in cameras):
+        if any(self._mask_file(c.name).exists() for c in cameras):
             (self.out / "masks").mkdir()
         cv2.setNumThreads(1)
         done = 0
@@ -151,8 +195,8 @@ class _Estimation:
 
     def _resample(self, sub: str, name: str, tables: Any) -> None:
         """Resample one photo or mask (the folder `sub`) through `tables` of `remap_tables`, or copy it when they are None."""
-        source, target = self.ingest / sub / f"{name}.png", self.out / sub / f"{name}.png"
         mask = sub == "masks"
+        source, target = self._mask_file(name) if mask else self.ingest / sub / f"{name}.png", self.out / sub / f"{name}.png"
         if mask and not source.exists():
             return
         if tables is None:
@@ -163,6 +207,11 @@ class _Estimation:
             raise FileNotFoundError(source)
         result = resample(np.asarray(image, np.uint8), tables, mask)
         write_png(target, result if mask else np.ascontiguousarray(result[..., ::-1]))
+
+    def _mask_file(self, name: str) -> Path:
+        """The mask of a photo as it shows it: the one that this stage made, else the given one; it may be missing."""
+        made = self.out / "photo_masks" / f"{name}.png"
+        return made if made.exists() else self.ingest / "masks" / f"{name}.png"
 
     def _hull_masks(self, cameras: Sequence[Camera]) -> list[tuple[Camera, Any]]:
         """Camera and mask (None where there is none) of each photo at HULL_MASK_SIZE."""

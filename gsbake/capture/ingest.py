@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
@@ -15,14 +16,17 @@ import numpy as np
 from blake3 import blake3
 
 from gsbake.capture.masks.matching import match_masks
+from gsbake.capture.masks.saliency import SaliencyNetwork
+from gsbake.capture.masks.weights import INSTALL, WEIGHTS, resolve_network
 from gsbake.capture.photos.conversion import Conversion, ConvertedPhoto
 from gsbake.capture.photos.decode import RawPhoto, UnreadablePhotoError, to_working_size
 from gsbake.capture.photos.quality import find_blurred, find_near_duplicates
 from gsbake.capture.photos.reader_pool import ReaderPool
 from gsbake.capture.photos.sharpness import detect_oversampling
+from gsbake.capture.photos.video_process import extract_frames
 from gsbake.capture.poses.frames import GivenPoses, PhotoSize
 from gsbake.capture.poses.given import read_poses
-from gsbake.capture.sources import list_photos
+from gsbake.capture.sources import is_video, list_photos
 from gsbake.config.schema import Ingest
 from gsbake.errors import BadInputError
 from gsbake.geometry.cameras import CameraSet
@@ -31,6 +35,8 @@ from gsbake.imaging.png import write_png
 from gsbake.monitor import SILENT, Monitor, Rule, decide_skip
 from gsbake.text import shortlist
 
+#: Folder of the frames of a video, while they are read.
+FRAMES = "frames"
 #: Longest name of a photo in bytes; file systems allow 255, and suffixes are added.
 MAX_NAME_BYTES = 200
 #: Most processes that read photos.
@@ -55,11 +61,11 @@ def ingest(
     threads: int = 2,
     monitor: Monitor = SILENT,
 ) -> dict[str, Any]:
-    """Decode, check and downsample all photos of the folder `photos`; write the working files into the folder `out` and return the figures.
+    """Decode, check and downsample all photos of the folder or video `photos`; write the working files into the folder `out`; the figures.
 
-    Written: `photos/<name>.png` and `masks/<name>.png` (8-bit), `photos.json` (metadata of each photo, and the skipped files), and with
-    known `poses` (a file or folder that `read_poses` reads) `poses/cameras.json` and `poses/points.ply`. Raises BadInputError when too few
-    photos are usable, or required masks are missing.
+    Written: `photos/<name>.png` and `masks/<name>.png` (8-bit), `guesses/<name>.png` where masks are guessed, `photos.json` (metadata of
+    each photo, and the skipped files), and with known `poses` (a file or folder that `read_poses` reads) `poses/cameras.json` and
+    `poses/points.ply`. Raises BadInputError when too few photos are usable, or required masks are missing.
     """
     run = _Ingestion(photos, out, options or IngestOptions(), masks, poses, threads, monitor)
     return run.run()
@@ -78,10 +84,13 @@ class _Ingestion:
     monitor: Monitor
     skipped: list[dict[str, str]] = field(default_factory=list)
     read: dict[str, ConvertedPhoto] = field(default_factory=dict)
+    video: Path | None = None
 
     def run(self) -> dict[str, Any]:
         """Execute all steps; returns the figures."""
         settings = self.options.ingest
+        if is_video(self.folder):
+            self._extract_frames()
         paths = {path.relative_to(self.folder).as_posix(): path for path in list_photos(self.folder)}
         names = photo_names(paths)
         use_masks = settings.masks != "ignore"
@@ -101,6 +110,9 @@ class _Ingestion:
         self._report_masks(masks)
         with self.monitor.part("resolution"):
             self._reduce_resolution()
+        if self.video is not None:
+            shutil.rmtree(self.folder)
+        guesses = self._guess_masks()
         results = {"poses": "none"} if self.poses is None else self._read_poses(self.poses, list(names))
         entries = self._entries
         (self.out / "photos.json").write_text(json.dumps({"photos": entries, "skipped": self.skipped}, indent=1))
@@ -109,6 +121,7 @@ class _Ingestion:
             "photos": len(entries),
             "skipped": len(self.skipped),
             "masks": sum(e["mask"] is not None for e in entries),
+            "guessed_masks": guesses,
             "near_duplicates": sum(e["duplicate_of"] is not None for e in entries),
             "blur_median": blur[len(blur) // 2],
             "megapixels": sum(e["width"] * e["height"] for e in entries) / 1e6,
@@ -118,6 +131,15 @@ class _Ingestion:
     @property
     def _entries(self) -> list[dict[str, Any]]:
         return [photo.entry for photo in self.read.values()]
+
+    def _extract_frames(self) -> None:
+        """Replace the video by a folder of its frames, which is removed when they are read."""
+        self.video, self.folder = self.folder, self.out / FRAMES
+        self.folder.mkdir(exist_ok=True)
+        with self.monitor.part("frames"):
+            settings = self.options.ingest
+            written, total = extract_frames(self.video, self.folder, settings.frames, settings.max_megapixels)
+        self.monitor.decide("frames", f"{written} of {total}", "the sharpest of equal stretches of the video's motion")
 
     def _skip_identical_files(self, paths: dict[str, Path]) -> None:
         """Remove from `paths` files that cannot be read or are identical to an earlier one."""
@@ -194,8 +216,37 @@ class _Ingestion:
         files = sum(relative in masks for relative in self.read)
         given = f"{count} of {total} photos have one: {files} mask files, {count - files} alpha channels" if count else "no photo has one"
         self.monitor.decide("masks", "used" if count else "none", "set by the profile" if setting == "ignore" else given)
-        if count and without:
+        if count and without and not self._makes_masks:
             self.monitor.warn(f"{len(without)} of {total} photos have no mask ({shortlist(without)}); give every photo one.")
+
+    @property
+    def _makes_masks(self) -> bool:
+        """Whether masks that are missing are guessed."""
+        return self.options.ingest.masks == "auto" and resolve_network(self.options.ingest.mask_network) != "none"
+
+    def _guess_masks(self) -> int:
+        """Write the network's guess for each photo without a mask; returns their number."""
+        for entry in self._entries:
+            entry["guess"] = None
+        without = [entry for entry in self._entries if entry["mask"] is None]
+        if not without or self.options.ingest.masks != "auto":
+            return 0
+        if not self._makes_masks:
+            reason = "set by the profile" if WEIGHTS.is_file() else f"its weights are not installed: run `{INSTALL}`"
+            self.monitor.decide("automatic masks", "none", f"no mask network is used; {reason}")
+            return 0
+        (self.out / "guesses").mkdir()
+        with self.monitor.part("mask guesses"):
+            network = SaliencyNetwork(self.threads)
+            for done, entry in enumerate(without):
+                self.monitor.check_stop()
+                self.monitor.progress(done, len(without), "mask guesses")
+                bgr: Any = cv2.imread(str(self.out / entry["file"]), cv2.IMREAD_COLOR)
+                entry["guess"] = f"guesses/{entry['name']}.png"
+                write_png(self.out / entry["guess"], network.probability(np.ascontiguousarray(bgr[..., ::-1])))
+        evidence = f"{len(without)} of {len(self._entries)} photos have no mask; agreement between photos corrects the guesses"
+        self.monitor.decide("automatic masks", "guessed by u2netp", evidence)
+        return len(without)
 
     def _reduce_resolution(self) -> None:
         """Halve the working photos and masks when the photos are oversampled."""

@@ -13,21 +13,35 @@ from gsbake.errors import BadInputError
 
 #: File name suffixes of photos.
 PHOTO_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".exr", ".webp"})
+#: File name suffixes of videos.
+VIDEO_SUFFIXES = frozenset({".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm"})
 #: Sub-folders of a capture folder that hold its photos, in order of precedence.
 PHOTO_FOLDERS = ("images", "photos")
 #: Sub-folders of a photo folder that are skipped.
 SKIPPED_FOLDERS = frozenset({"masks", "gt", "sparse", "depths", "depth"})
+#: Pose formats that a user may name, for messages.
+POSE_FORMATS = "a transforms.json, a COLMAP model folder, a poses_bounds.npy or Metashape's cameras as XML"
 _MODEL_FILES = ("cameras.bin", "cameras.txt")
 _MODEL_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse")
 
 
 @dataclass(frozen=True)
 class Sources:
-    """Paths of a capture: the photo folder, the mask folder or None, and the pose file or folder or None."""
+    """Paths of a capture: the photo folder or video, the mask folder or None, and the pose file or folder or None."""
 
     photos: Path
     masks: Path | None = None
     poses: Path | None = None
+
+
+def is_video(path: Path) -> bool:
+    """Whether a path is a video file by its name."""
+    return path.suffix.lower() in VIDEO_SUFFIXES and path.is_file()
+
+
+def source_files(source: Path) -> list[str]:
+    """Names of the photos of a folder, relative to it, or of the video. Raises BadInputError as `list_photos`."""
+    return [source.name] if is_video(source) else [path.relative_to(source).as_posix() for path in list_photos(source)]
 
 
 def list_photos(folder: Path) -> list[Path]:
@@ -37,7 +51,7 @@ def list_photos(folder: Path) -> list[Path]:
     """
     if not folder.is_dir():
         kind = "is a file, not a folder" if folder.exists() else "does not exist"
-        raise BadInputError(f"The photo folder {folder} {kind}; give the folder that holds the photos.")
+        raise BadInputError(f"The photo folder {folder} {kind}; give the folder that holds the photos, or a video (mp4, mov, …).")
     pattern = "**/*" if folder.name in PHOTO_FOLDERS else "*"
     found = [
         path
@@ -79,23 +93,24 @@ def find_poses(folder: Path) -> Path | None:
 def _given_poses(path: Path) -> Path:
     """The pose file of a path given by the user, which may be the folder that holds it."""
     if not path.exists():
-        raise BadInputError(f"The poses {path} do not exist; give a transforms.json, a COLMAP model folder or a poses_bounds.npy.")
+        raise BadInputError(f"The poses {path} do not exist; give {POSE_FORMATS}.")
     if path.is_dir():
         found = path if is_colmap_model(path) else find_poses(path)
         if found is None:
             raise BadInputError(f"The folder {path} holds no poses (transforms.json, a COLMAP model or poses_bounds.npy).")
         return found
-    if path.suffix.lower() not in (".json", ".npy"):
-        raise BadInputError(f"The poses {path} have an unknown format; give a transforms.json, a COLMAP model or a poses_bounds.npy.")
+    if path.suffix.lower() not in (".json", ".npy", ".xml"):
+        raise BadInputError(f"The poses {path} have an unknown format; give {POSE_FORMATS}.")
     return path
 
 
 def discover(photos: Path, masks: Path | None = None, poses: Path | None = None) -> Sources:
     """Find the paths of a capture.
 
-    `photos` is a capture folder (photos in `images/` or `photos/`, beside them `masks/` and poses) or the photo folder itself. Masks and
-    poses are looked for in the photo folder, then in its parent; `masks` and `poses` override what is found. Raises BadInputError when a
-    given path does not exist, there is no photo, or a mask folder that was found is a link to elsewhere.
+    `photos` is a capture folder (photos in `images/` or `photos/`, beside them `masks/` and poses), the photo folder itself, or a video,
+    which has neither masks nor poses but those given. Masks and poses are looked for in the photo folder, then in its parent; `masks` and
+    `poses` override what is found. Raises BadInputError when a given path does not exist, there is no photo, or a mask folder that was
+    found is a link to elsewhere.
     """
     photos, folders = Path(photos), []
     if photos.is_dir():
@@ -104,7 +119,8 @@ def discover(photos: Path, masks: Path | None = None, poses: Path | None = None)
             photos, folders = inner, [inner, photos]
         else:
             folders = [photos, photos.resolve().parent]
-    list_photos(photos)
+    if not is_video(photos):
+        list_photos(photos)
     if masks is None:
         masks = next((f / "masks" for f in folders if (f / "masks").is_dir()), None)
         if masks is not None and folders[-1].resolve() not in masks.resolve().parents:

@@ -14,6 +14,7 @@ from pathlib import Path
 import psutil
 import typer
 
+from gsbake.capture.masks.weights import INSTALL, WEIGHTS
 from gsbake.cli.output import cell, print_json, print_table
 from gsbake.pipeline.machine import cpu_name, cuda_devices, default_threads, resolve_device, torch_cuda_build, versions
 from gsbake.python_process import python_command, python_environment
@@ -75,6 +76,7 @@ def machine_findings(out: Path) -> list[Finding]:
     place = next(p for p in (out.absolute(), *out.absolute().parents) if p.exists())
     free = shutil.disk_usage(place).free
     writable = os.access(place, os.W_OK)
+    network = "installed" if WEIGHTS.is_file() else f"weights not installed, so masks are not made: run `{INSTALL}`"
     return [
         Finding("Python", version, supported, "" if supported else "use Python 3.11, 3.12 or 3.13"),
         Finding("processor", f"{cpu_name()}, {default_threads()} cores used", True),
@@ -86,6 +88,7 @@ def machine_findings(out: Path) -> list[Finding]:
             "disk", f"{size(free)} free in {place}{'' if writable else ', not writable'}", writable and free > 2e9,
             "" if writable and free > 2e9 else "choose another folder with --out, or free 2 GB",
         ),
+        Finding("mask network", network, True),
         backend_finding(),
     ]  # fmt: skip
 

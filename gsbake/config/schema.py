@@ -42,9 +42,11 @@ class Ingest(Section):
     """Reading photos, masks and known poses."""
 
     max_size: PhotoSize = Field(1600, description="Longer side of the working photos in pixels. Larger photos are downsampled with an area filter.")
-    masks: Literal["auto", "require", "ignore"] = Field("auto", description="auto: use the masks there are; require: a photo without a mask is an error; ignore: use none.")
+    masks: Literal["auto", "require", "ignore"] = Field("auto", description="auto: use the masks there are, and make those that are missing (ingest.mask_network); require: a photo without a mask is an error; ignore: use none and make none.")
+    mask_network: Literal["auto", "u2netp", "none"] = Field("auto", description="Network that guesses missing masks, which agreement between photos then corrects. auto: u2netp where its weights are installed; none: masks are not made.")
     invert_masks: bool = Field(False, description="Masks are white on the background instead of the object.")
     max_megapixels: float = Field(250.0, gt=0, le=10_000, description="Photos and masks with more megapixels are skipped, from their header alone.")
+    frames: int = Field(120, ge=3, le=10_000, description="Most photos taken from a video: evenly along its motion, the sharpest frame of each stretch.")
     min_photos: int = Field(3, ge=2, le=10_000, description="Minimum number of usable photos; fewer are an error.")
 
 

@@ -134,6 +134,7 @@ class Page:
     memory_chart: str
     run_note: str
     footer: str
+    masks: tuple[Panel, ...] = ()
 
 
 def image_uri(rgb: NDArray[np.floating], alpha: NDArray[np.floating] | None = None, quality: int = 88) -> str:

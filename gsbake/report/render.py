@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Protocol
+from typing import Any, Protocol
 
 import cv2
 import numpy as np
@@ -92,6 +92,14 @@ class RenderedImage:
     normal: Floats
     orm: Floats
 
+    @staticmethod
+    def from_means(mean: Floats) -> RenderedImage:
+        """From means over the samples of each pixel (h, w, 13): radiance, coverage, base colour, normal, ORM, all weighted by coverage."""
+        straight: Floats = np.asarray(mean / np.maximum(mean[..., 3:4], 1e-6), np.float32)
+        normal: Floats = straight[..., 7:10]
+        normal = np.asarray(normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-6), np.float32)
+        return RenderedImage(straight[..., :3], mean[..., 3], straight[..., 4:7], normal, straight[..., 10:13])
+
     @property
     def rgb(self) -> Floats:
         """sRGB with straight alpha (h, w, 3) in 0..1."""
@@ -107,26 +115,52 @@ def unlit(samples: Samples) -> Floats:
     return samples.base_color
 
 
+def uv_density(position: NDArray[Any], uv: NDArray[Any], faces: NDArray[Any]) -> float:
+    """Texture area (UV units) per surface area of triangles (f, 3) with corners `position` (v, 3) and texture coordinates `uv` (v, 2)."""
+    corner, uv = position[faces], uv[faces].astype(np.float64)
+    area = np.linalg.norm(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=1)
+    e1, e2 = uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]
+    return float(np.abs(e1[:, 0] * e2[:, 1] - e1[:, 1] * e2[:, 0]).sum() / max(area.sum(), 1e-30))
+
+
+def select_mip_level(camera: Camera, distance: NDArray[Any], density: float, shape: tuple[int, ...]) -> int:
+    """Mip level of a texture (`shape` h, w, …) at which a texel is about as large as a sample's footprint on a surface at `distance` (n,)
+    whose texture has the `density` of `uv_density`."""
+    if len(distance) == 0:
+        return 0
+    footprint = float(np.median(distance)) ** 2 / (camera.fx * camera.fy)
+    texels = density * shape[0] * shape[1] * footprint
+    return max(0, min(round(0.5 * math.log2(max(texels, 1e-12))), int(math.log2(min(shape[:2])))))
+
+
+def downsampled(image: Floats, level: int) -> Floats:
+    """An image (h, w, c) reduced by 2**level with an area filter."""
+    if level == 0:
+        return image
+    size = (max(1, image.shape[1] >> level), max(1, image.shape[0] >> level))
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.float32)
+
+
+def tangent_space_normal(normal: Floats, tangent: Floats, local: Floats) -> Floats:
+    """Unit normals (n, 3) of vectors `local` (n, 3) of a normal map, at `normal` (n, 3) with `tangent` (n, 4), w the handedness (glTF)."""
+    sign = np.where(tangent[:, 3:] < 0, np.float32(-1), np.float32(1))
+    bitangent = sign * np.cross(normal, tangent[:, :3])
+    return unit(local[:, :1] * tangent[:, :3] + local[:, 1:2] * bitangent + local[:, 2:3] * normal)
+
+
 class Renderer:
     """Renders one asset from many cameras; the ray tracing structure and the mip levels are cached."""
 
     def __init__(self, asset: Asset, threads: int | None = None) -> None:
         self.asset = asset
         self._caster = RayCaster(asset.position, asset.faces, threads)
-        corner, uv = asset.position[asset.faces], asset.uv[asset.faces].astype(np.float64)
-        area = np.linalg.norm(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=1)
-        e1, e2 = uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]
-        # Texture area (in UV units) per surface area, for the choice of the mip level.
-        self._density = float(np.abs(e1[:, 0] * e2[:, 1] - e1[:, 1] * e2[:, 0]).sum() / max(area.sum(), 1e-30))
+        self._density = uv_density(asset.position, asset.uv, asset.faces)
         self._texture = lru_cache(maxsize=16)(self._mip_level)
 
     def _mip_level(self, name: str, level: int) -> Floats | None:
         """Texture `name` downsampled by 2**level, or None when the asset has no such texture."""
         image: Floats | None = getattr(self.asset, name)
-        if image is None or level == 0:
-            return image
-        size = (max(1, image.shape[1] >> level), max(1, image.shape[0] >> level))
-        return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.float32)
+        return None if image is None else downsampled(image, level)
 
     def _sample_texture(self, name: str, level: int, uv: Floats) -> Floats | None:
         """Texture values (n, 3) at uv (n, 2), or None when the asset has no such texture."""
@@ -155,11 +189,7 @@ class Renderer:
         full = np.zeros((fine.height, fine.width, 13), np.float32)
         full[inside] = part.reshape(*shape, 13)
         mean = full.reshape(height, samples, width, samples, 13).mean((1, 3), dtype=np.float32)
-        alpha = mean[..., 3]
-        straight = mean / np.maximum(alpha, 1e-6)[..., None]
-        normal = straight[..., 7:10]
-        length = np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-6)
-        return RenderedImage(straight[..., :3], alpha, straight[..., 4:7], normal / length, straight[..., 10:13])
+        return RenderedImage.from_means(mean)
 
     def _screen_bounds(self, camera: Camera) -> tuple[slice, slice]:
         """Rows and columns of the asset's projection; the whole image when a vertex is behind the camera."""
@@ -179,26 +209,14 @@ class Renderer:
 
         uv, normal = interpolate(asset.uv), unit(interpolate(asset.normal))
         view = unit(-rays.astype(np.float32))
-        level = self._select_mip_level(camera, distance)
+        level = select_mip_level(camera, distance, self._density, asset.base_color.shape)
         base = self._sample_texture("base_color", level, uv)
         orm = self._sample_texture("orm", level, uv)
         local = self._sample_texture("normal_map", level, uv)
         if local is not None and asset.tangent is not None:
-            tangent = interpolate(asset.tangent)
-            sign = np.where(tangent[:, 3:] < 0, np.float32(-1), np.float32(1))
-            bitangent = sign * np.cross(normal, tangent[:, :3])
-            normal = unit(local[:, :1] * tangent[:, :3] + local[:, 1:2] * bitangent + local[:, 2:] * normal)
+            normal = tangent_space_normal(normal, interpolate(asset.tangent), local)
         if orm is None:
             orm = np.broadcast_to(np.array([1, 1, 0], np.float32), (len(face), 3))
         assert base is not None
         position, emissive = interpolate(asset.position.astype(np.float32)), self._sample_texture("emissive", level, uv)
         return Samples(position, normal, view, base, orm[:, 0], orm[:, 1], orm[:, 2], emissive)
-
-    def _select_mip_level(self, camera: Camera, distance: Floats) -> int:
-        """Mip level at which a texel is about as large as a sample's footprint on the surface."""
-        if len(distance) == 0:
-            return 0
-        height, width = self.asset.base_color.shape[:2]
-        footprint = float(np.median(distance)) ** 2 / (camera.fx * camera.fy)
-        texels = self._density * height * width * footprint
-        return max(0, min(round(0.5 * math.log2(max(texels, 1e-12))), int(math.log2(min(height, width)))))

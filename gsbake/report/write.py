@@ -17,6 +17,7 @@ from gsbake.monitor import SILENT, Monitor
 from gsbake.report import compose, manifests
 from gsbake.report.asset import open_asset
 from gsbake.report.html import Light, Page, Panel, render_page
+from gsbake.report.masks import mask_panels
 from gsbake.report.quality import asset_cameras, select_views
 from gsbake.report.render import Asset, Renderer, Shader, unlit
 from gsbake.report.sheets import map_panels
@@ -162,6 +163,7 @@ class _ReportWriter:
             memory_chart=manifests.memory_chart(found),
             run_note=manifests.run_note(found),
             footer=f"gsbake {__version__}.",
+            masks=mask_panels(self.folders["poses"], found["poses"].get("results") or {}),
         )
 
 

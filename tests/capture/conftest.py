@@ -40,7 +40,8 @@ class Runner:
         settings: Mapping[str, Any] | None = None, **more: Any,
     ) -> tuple[dict[str, Any], Done]:  # fmt: skip
         found, done = discover(photos, masks, poses), Done(self.root / "ingest")
-        options = IngestOptions(Ingest(**{**(settings or {}), **more}), resolution)
+        # The network only where a test asks for it: with and without its weights the other tests do the same.
+        options = IngestOptions(Ingest(**{"mask_network": "none", **(settings or {}), **more}), resolution)
         return ingest(found.photos, done.out, options, masks=found.masks, poses=found.poses, monitor=done), done
 
     def poses(

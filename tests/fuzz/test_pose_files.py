@@ -1,4 +1,4 @@
-"""Pose files of strangers: transforms.json, LLFF, COLMAP text and binary."""
+"""Pose files of strangers: transforms.json, Metashape XML, LLFF, COLMAP text and binary."""
 
 from __future__ import annotations
 
@@ -49,6 +49,26 @@ def test_transforms(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
 
     documents = replaced_values(TRANSFORMS).map(lambda body: json.dumps(body).encode())
     fuzz(capsys, "transforms.json", st.one_of(documents, damaged([json.dumps(TRANSFORMS).encode(), b"[" * 5000, b"{}"])), check)
+
+
+METASHAPE = (
+    b'<document><chunk><sensors><sensor id="0" type="frame"><calibration type="frame"><resolution width="200" height="100"/>'
+    b"<f>150</f><cx>1</cx><k1>0.01</k1><p1>0</p1><b1>0</b1></calibration></sensor></sensors><cameras>"
+    b'<camera label="a.jpg" sensor_id="0"><transform>1 0 0 1 0 1 0 2 0 0 1 3 0 0 0 1</transform></camera></cameras>'
+    b"<transform><scale>1</scale></transform></chunk></document>"
+)
+
+
+def test_metashape(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "cameras.xml"
+
+    def check(data: bytes) -> GivenPoses | None:
+        path.write_bytes(data)
+        return check_poses(outcome(lambda: read_poses(path, list(SIZES), SIZES), BadInputError))
+
+    numbers = st.tuples(st.sampled_from([b"150", b"200", b"0.01", b"1 0 0 1", b"<scale>1"]), odd_floats.map(lambda x: repr(x).encode()))
+    replaced = numbers.map(lambda pair: METASHAPE.replace(pair[0], b"<scale>" + pair[1] if pair[0][:1] == b"<" else pair[1]))
+    fuzz(capsys, "Metashape XML", st.one_of(replaced, damaged([METASHAPE, b"<document/>", b"<a>" * 5000])), check)
 
 
 def npy(rows: np.ndarray[Any, Any]) -> bytes:

@@ -48,6 +48,7 @@ FULL = replace(
     comparisons=(Comparison("IMG_1", URI, URI, 27.123, 0.9234, True), Comparison("IMG_2", URI, URI, 21.0, 0.8, False)),
     relit=(Panel("Sunset", "front", image_uri(GREY, GREY[..., 0])),),
     maps=(Panel("Base colour", "1024", URI),),
+    masks=(Panel("IMG_7", "automatic mask", URI),),
     audit=(Check("triangles", "pass", "29 998"), Check("size", "fail", "9 MB")),
     curves=(lines([Curve("train", [0, 1, 2], [20, 21, 22])], "PSNR"),),
     skip_decisions=(SkipDecision("skip.converged_steps", "train", "stopped", "gain < 0.05 dB", "about 12 s"),),
@@ -105,10 +106,10 @@ def test_nothing_is_fetched(page: Page) -> None:
 
 def test_sections_without_data_are_omitted() -> None:
     ids = {attrs.get("id") for _, attrs in outline(render_page(FULL)).tags}
-    assert {"asset", "quality", "relit", "maps", "audit", "training", "run", "model", "light-1"} <= ids
+    assert {"asset", "quality", "masks", "relit", "maps", "audit", "training", "run", "model", "light-1"} <= ids
     bare = outline(render_page(EMPTY))
     ids = {attrs.get("id") for _, attrs in bare.tags}
-    assert not ids & {"asset", "quality", "relit", "maps", "audit", "training", "model"} and "run" in ids
+    assert not ids & {"asset", "quality", "masks", "relit", "maps", "audit", "training", "model"} and "run" in ids
     assert not any(tag == "model-viewer" for tag, _ in bare.tags)
     anchors = {attrs["href"] for tag, attrs in bare.tags if tag == "a"}
     assert anchors == {"#run"}

@@ -30,7 +30,7 @@ Floats = NDArray[np.float32]
 MAX_INCONSISTENT_SHARE = 0.03
 #: A point inside the frames of fewer than this share of the views (or of fewer than 2) is outside the hull.
 MIN_VISIBLE_SHARE = 0.25
-#: Number of largest distances kept per point; bounds how many views may be inconsistent.
+#: Number of largest distances kept per point under that share; bounds how many views may be inconsistent in large captures.
 _MAX_RANKED = 8
 #: Cells from the surface beyond which the distance outside is only a lower bound.
 _EXACT_BAND = 6.0
@@ -39,7 +39,7 @@ _EXACT_BAND = 6.0
 @nb.njit(parallel=True, error_model="numpy", cache=True)
 def _carve(
     distance: Floats, starts: NDArray[np.int64], sizes: NDArray[np.int64], intrinsics: Array, poses: Array, lower: Array, cell: float,
-    n: int, max_inconsistent_share: float, min_visible: int,
+    n: int, max_inconsistent_share: float, max_ranked: int, min_visible: int,
 ) -> Floats:  # fmt: skip
     """Signed distance (n, n, n) at cell centres; negative inside.
 
@@ -47,11 +47,11 @@ def _carve(
     intrinsics (v, 4) fx, fy, cx, cy; poses (v, 3, 4) world→camera.
     """
     views = starts.shape[0]
-    max_inconsistent = min(int(max_inconsistent_share * views + 0.5), _MAX_RANKED - 1)
+    max_inconsistent = min(int(max_inconsistent_share * views + 0.5), max_ranked - 1)
     far = _EXACT_BAND * cell
     out = np.empty((n, n, n), np.float32)
     for i in nb.prange(n):
-        largest = np.empty(_MAX_RANKED, np.float64)
+        largest = np.empty(max_ranked, np.float64)
         x = lower[0] + (i + 0.5) * cell
         for j in range(n):
             y = lower[1] + (j + 0.5) * cell
@@ -76,8 +76,8 @@ def _carve(
                     bottom = distance[base + width] * (1 - fu) + distance[base + width + 1] * fu
                     value = (top * (1 - fw) + bottom * fw) * depth / (0.5 * (intrinsics[v, 0] + intrinsics[v, 1]))
                     visible += 1
-                    if value > largest[_MAX_RANKED - 1]:
-                        slot = _MAX_RANKED - 1
+                    if value > largest[max_ranked - 1]:
+                        slot = max_ranked - 1
                         while slot > 0 and largest[slot - 1] < value:
                             largest[slot] = largest[slot - 1]
                             slot -= 1
@@ -89,7 +89,7 @@ def _carve(
                 elif visible < min_visible:
                     out[i, j, k] = cell
                 else:
-                    allowed = min(int(max_inconsistent_share * visible + 0.5), _MAX_RANKED - 1, visible - 1)
+                    allowed = min(int(max_inconsistent_share * visible + 0.5), max_ranked - 1, visible - 1)
                     out[i, j, k] = largest[allowed]
     return out
 
@@ -108,11 +108,15 @@ def silhouette_distance(mask: Bytes) -> Floats:
     return np.where(inside > 0, 0.5 - inner, outer - 0.5).astype(np.float32)
 
 
-def carve(cameras: Sequence[Camera], masks: Sequence[Bytes], centre: Array, radius: float, resolution: int) -> Floats:
+def carve(
+    cameras: Sequence[Camera], masks: Sequence[Bytes], centre: Array, radius: float, resolution: int,
+    max_inconsistent_share: float = MAX_INCONSISTENT_SHARE,
+) -> Floats:  # fmt: skip
     """Signed distance (n, n, n) of the hull on the cube of half edge `radius` around `centre` (3,), negative inside; axes x, y, z.
 
     `cameras` are pinholes of the masks' sizes; n = `resolution`. Where too few views see a cell, the value is one cell (outside).
-    The occupancy is `carve(...) < 0`.
+    The occupancy is `carve(...) < 0`. `max_inconsistent_share` of a point's views may exclude it; above the default there is no bound on
+    their number, which costs time in large captures.
     """
     fields = [silhouette_distance(m) for m in masks]
     sizes = np.array([f.shape for f in fields], np.int64).reshape(-1, 2)
@@ -124,9 +128,11 @@ def carve(cameras: Sequence[Camera], masks: Sequence[Bytes], centre: Array, radi
     cell = 2.0 * radius / resolution
     min_visible = max(2, int(np.ceil(MIN_VISIBLE_SHARE * len(fields))))
     flat = np.concatenate([f.ravel() for f in fields])
+    wide = max_inconsistent_share > MAX_INCONSISTENT_SHARE
+    ranked = max(_MAX_RANKED, int(max_inconsistent_share * len(fields) + 0.5) + 1) if wide else _MAX_RANKED
     return _carve(
         flat, starts[order], sizes[order], intrinsics[order], poses[order], np.asarray(centre, float) - radius, cell, resolution,
-        MAX_INCONSISTENT_SHARE, min_visible,
+        max_inconsistent_share, ranked, min_visible,
     )  # fmt: skip
 
 
@@ -155,9 +161,12 @@ class Hull:
     field: Floats
 
     @staticmethod
-    def from_masks(cameras: Sequence[Camera], masks: Sequence[Bytes], centre: Array, radius: float, resolution: int) -> Hull:
+    def from_masks(
+        cameras: Sequence[Camera], masks: Sequence[Bytes], centre: Array, radius: float, resolution: int,
+        max_inconsistent_share: float = MAX_INCONSISTENT_SHARE,
+    ) -> Hull:  # fmt: skip
         """Carve the cube of half edge `radius` around `centre`; small components are removed."""
-        field = carve(cameras, masks, centre, radius, resolution)
+        field = carve(cameras, masks, centre, radius, resolution, max_inconsistent_share)
         cell = 2.0 * radius / resolution
         inside = field < 0
         kept = _large_components(inside)

@@ -7,14 +7,16 @@ from pathlib import Path
 
 from gsbake.capture.poses.frames import GivenPoses, PhotoSize
 from gsbake.capture.poses.llff import read_llff
+from gsbake.capture.poses.metashape import read_metashape
 from gsbake.capture.poses.transforms_json import read_transforms
 
 
 def read_poses(path: Path, listing: Sequence[str], sizes: Mapping[str, PhotoSize]) -> GivenPoses:
     """Cameras for the photos, in the frame of the file.
 
-    `path` is a transforms.json, a poses_bounds.npy or a COLMAP model folder; `listing` names all photo files in order (LLFF poses refer to
-    photos by order), `sizes` holds the readable ones. Raises BadInputError when the file or a pose is invalid or no frame matches a photo.
+    `path` is a transforms.json, a poses_bounds.npy, a Metashape XML or a COLMAP model folder; `listing` names all photos in order (LLFF
+    poses refer to photos by order), `sizes` holds the readable ones. Raises BadInputError when the file or a pose is invalid or no frame
+    matches a photo.
     """
     if path.is_dir():
         from gsbake.capture.poses.colmap_model import read_model
@@ -22,4 +24,6 @@ def read_poses(path: Path, listing: Sequence[str], sizes: Mapping[str, PhotoSize
         return read_model(path, sizes)
     if path.suffix.lower() == ".npy":
         return read_llff(path, listing, sizes)
+    if path.suffix.lower() == ".xml":
+        return read_metashape(path, sizes)
     return read_transforms(path, sizes)

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gsbake.capture.hull.visual_hull import Hull
+from gsbake.capture.hull.visual_hull import MAX_INCONSISTENT_SHARE, Hull
 from gsbake.capture.photos.decode import Bytes
 from gsbake.geometry.cameras import Array, Camera, Similarity
 
@@ -92,11 +92,13 @@ def bounding_sphere_from_views(cameras: Sequence[Camera], points: Array | None) 
     return BoundingSphere(point, min(0.85 * frame, limit), "optical axes of the cameras")
 
 
-def bounding_sphere_from_masks(cameras: Sequence[Camera], masks: Sequence[Bytes]) -> BoundingSphere | None:
+def bounding_sphere_from_masks(
+    cameras: Sequence[Camera], masks: Sequence[Bytes], max_inconsistent_share: float = MAX_INCONSISTENT_SHARE
+) -> BoundingSphere | None:
     """Bounding sphere of the visual hull, or None when the hull is empty (wrong masks or wrong poses).
 
-    `masks` (h, w) have their cameras' sizes. The hull is carved coarsely in the common field of view, then repeatedly in its own bounding
-    sphere until that converges.
+    `masks` (h, w) have their cameras' sizes; `max_inconsistent_share` of a point's views may exclude it. The hull is carved coarsely in the
+    common field of view, then repeatedly in its own bounding sphere until that converges.
     """
     centre = nearest_point_to_axes(cameras)
     fits = [_frame_radius(c, centre) for c in cameras]
@@ -105,7 +107,7 @@ def bounding_sphere_from_masks(cameras: Sequence[Camera], masks: Sequence[Bytes]
         return None
     radius = 2.0 * float(np.median(finite))
     for step in range(_MAX_PASSES):
-        hull = Hull.from_masks(cameras, masks, centre, radius, _FINE_CELLS if step else _COARSE_CELLS)
+        hull = Hull.from_masks(cameras, masks, centre, radius, _FINE_CELLS if step else _COARSE_CELLS, max_inconsistent_share)
         if hull.empty:
             return None
         occupied = hull.centres()

@@ -5,17 +5,18 @@ from __future__ import annotations
 import shutil
 import sqlite3
 from collections.abc import Sequence
-from contextlib import ExitStack, closing, suppress
+from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-from gsbake.capture.photos.undistortion import intrinsics_key
-from gsbake.capture.sfm.mask_agreement import mask_agreement
+import numpy as np
+
+from gsbake.capture.photos.undistortion import distort, intrinsics_key, pinhole_camera
+from gsbake.capture.sfm.feature_masks import FeatureMasks
 from gsbake.capture.sfm.pairs import choose_matching
 from gsbake.capture.sfm.process import JobCallbacks, run_job
-from gsbake.capture.sfm.static_background import is_background_static
 from gsbake.config.schema import Poses
 from gsbake.errors import BadInputError, InterruptedRun
 from gsbake.geometry.cameras import Camera, CameraSet
@@ -25,8 +26,17 @@ from gsbake.text import shortlist
 #: Time limit of triangulation with given poses in seconds, per photo and at least. Far above any measured time: it ends a process that
 #: hangs, and the run with it.
 SECONDS_PER_PHOTO, MIN_SECONDS = 60.0, 1800.0
-#: Agreement of cameras and masks (`mask_agreement`) below which features of whole photos are not trusted.
-MIN_AGREEMENT = 0.85
+#: A trial on small photos decides which features are tried first in captures of more photos than this; smaller ones are solved quickly.
+MAX_UNTRIED_PHOTOS = 24
+#: Longer side of the trial's photos in pixels, its features per photo, and the share of photos it must register to tell anything.
+TRIAL_SIZE, TRIAL_FEATURES, MIN_TRIAL_SHARE = 600, 2048, 0.5
+#: Share of registered photos below which the other kind of features is tried too.
+MIN_PLACED_SHARE = 0.85
+#: Largest shift that a lens's distortion plausibly causes at the corner of a photo, as a share of the corner's distance from the centre;
+#: wide-angle lenses reach a quarter.
+MAX_DISTORTION = 0.35
+#: Where features are detected: whether inside the masks.
+_FEATURES = {False: "in whole photos", True: "inside the masks"}
 
 
 @dataclass(frozen=True)
@@ -70,7 +80,7 @@ class PoseSolver:
         names = sorted(e["name"] for e in self.entries)
         kind, evidence = choose_matching(self.options.matching, names)
         self.monitor.decide("matching", kind, evidence)
-        found = self._checked(self._attempt(kind, self._feature_masks()), kind)
+        found = self._best_attempt(kind)
         result = found.result
         count, missing = int(result["registered"]), list(result["missing"])
         if count < max(3, self.options.min_registered * len(names)):
@@ -79,8 +89,12 @@ class PoseSolver:
                 "that overlap by two thirds, with texture in view, remove those of other places, or try poses.matching=exhaustive and more "
                 "poses.max_features."
             )
+        if not all(map(is_plausible_lens, found.cameras)):
+            raise BadInputError(_tied_together(found.masked, any(e["mask"] or e.get("guess") for e in self.entries)))
         if missing:
             self.monitor.warn(f"{len(missing)} of {len(names)} photos could not be registered and were dropped ({shortlist(missing)}).")
+            if found.masked and len(missing) > (1 - MIN_PLACED_SHARE) * len(names):
+                self.monitor.warn("If they show the object in another position, too few of its features join both: bake each by itself.")
         error = f"reprojection error {result['reprojection_px']:.2f} px"
         self.monitor.decide("structure from motion", f"{count} of {len(names)} photos registered", error)
         figures = {
@@ -101,35 +115,64 @@ class PoseSolver:
             found.folder.rename(self.folder)
         return Solved(found.cameras, self.folder / "points.ply", figures)
 
-    def _attempt(self, matching: str, masks: Path | None) -> _Attempt:
-        """Structure from motion with features in whole photos, or inside `masks`; each has a database of its own."""
-        suffix = "" if masks is None else "_masked"
+    def _attempt(self, matching: str, masks: Path | None, trial: bool = False) -> _Attempt:
+        """Structure from motion with features in whole photos, or inside `masks`; each has a database of its own. A `trial` is coarse."""
+        suffix = "_trial" if trial else "" if masks is None else "_masked"
         folder = self.scratch / f"solve{suffix}"
         job = self._job("solve", self.entries, masks) | {"matching": matching, "mapper": self.options.mapper}
+        if trial:
+            size, features = min(TRIAL_SIZE, job["max_size"]), min(TRIAL_FEATURES, job["max_features"])
+            job |= {"max_size": size, "max_features": features, "fine": False}
         job["work"] = str(self.scratch / f"colmap{suffix}")
         result = self._run(job, folder)
         cameras = list(CameraSet.load(folder / "cameras.json").cameras) if result["registered"] else []
         return _Attempt(result, cameras, folder, masks is not None)
 
-    def _checked(self, found: _Attempt, matching: str) -> _Attempt:
-        """`found`, or a second attempt with features inside the masks where these contradict the first one and agree better with it."""
-        masks = {e["name"]: self.ingest / e["mask"] for e in self.entries if e["mask"]}
-        if found.masked or self.options.masked_features is False or len(masks) < len(self.entries):
-            return found
+    def _best_attempt(self, matching: str) -> _Attempt:
+        """The solution with features in whole photos or inside the masks, as set, or the one that the masks support better.
 
-        def agreement(attempt: _Attempt) -> float:
-            """Of all photos: those that are not registered agree with nothing."""
-            return mask_agreement(attempt.cameras, masks) * len(attempt.cameras) / len(self.entries) if attempt.cameras else 0.0
-
-        before = agreement(found)
-        if before >= MIN_AGREEMENT:
-            return found
-        other = self._attempt(matching, self._write_feature_masks())
-        after = agreement(other)
-        chosen = other if after > before else found
-        evidence = f"masks agree with the cameras to {before:.2f} with features of whole photos, {after:.2f} inside the masks"
-        self.monitor.decide("features", "inside the masks" if chosen.masked else "in whole photos", evidence)
+        Registration that looks complete is no evidence: a background that stays while the object turns registers just as well.
+        """
+        masks, setting = FeatureMasks(self.ingest, self.entries, self.scratch / "feature_masks"), self.options.masked_features
+        if setting != "auto" or not masks.complete:
+            return self._attempt(matching, masks.write() if setting is True and masks.files else None)
+        static, evidence = masks.background_is_static()
+        first = static
+        if not static and len(self.entries) > MAX_UNTRIED_PHOTOS:
+            first, evidence = self._try_small_photos(matching, masks)
+        self.monitor.decide("features", _FEATURES[first], evidence)
+        attempts = [self._attempt(matching, masks.write() if first else None)]
+        agreement = [self._agreement(attempts[0], masks)]
+        if (agreement[0] >= masks.min_agreement and not self._lost(attempts[0])) or (static and not masks.guessed):
+            return attempts[0]
+        attempts.append(self._attempt(matching, None if first else masks.write()))
+        agreement.append(self._agreement(attempts[1], masks))
+        # A right model of one position of the object is worth more than a wrong one of both.
+        score = [(a >= masks.min_agreement, a * len(found.cameras)) for a, found in zip(agreement, attempts, strict=True)]
+        chosen = attempts[int(score[1] > score[0])]
+        results = [
+            f"to {a:.2f} with {len(found.cameras)} of {len(self.entries)} photos registered by features {_FEATURES[found.masked]}"
+            for a, found in zip(agreement, attempts, strict=True)
+        ]
+        self.monitor.decide("features", _FEATURES[chosen.masked], f"masks agree with the cameras {results[0]}, {results[1]}")
         return chosen
+
+    def _try_small_photos(self, matching: str, masks: FeatureMasks) -> tuple[bool, str]:
+        """Whether features inside the masks are tried first, because a coarse solution of whole photos contradicts the masks."""
+        trial = self._attempt(matching, None, trial=True)
+        share = len(trial.cameras) / len(self.entries)
+        if share < MIN_TRIAL_SHARE:
+            return False, f"a trial on small photos registered only {len(trial.cameras)} of {len(self.entries)}"
+        agreement = self._agreement(trial, masks)
+        return agreement < masks.min_agreement, f"masks agree with the cameras of a trial on small photos to {agreement:.2f}"
+
+    def _lost(self, attempt: _Attempt) -> bool:
+        """Whether so many photos are missing that other features may place more of them."""
+        return len(attempt.cameras) < MIN_PLACED_SHARE * len(self.entries)
+
+    def _agreement(self, attempt: _Attempt, masks: FeatureMasks) -> float:
+        """Agreement of the registered cameras with the masks; 0 where their lens cannot exist."""
+        return masks.agreement(attempt.cameras) if all(map(is_plausible_lens, attempt.cameras)) else 0.0
 
     def triangulate(self) -> Solved:
         """Tie points for given poses, from the given model or triangulated. Raises BadInputError with fewer than 3 poses."""
@@ -196,30 +239,30 @@ class PoseSolver:
             raise InterruptedRun("Stopped on request.")
         return result
 
-    def _feature_masks(self) -> Path | None:
-        """Folder of masks under COLMAP's file names when features are detected inside the masks only, else None."""
-        masked = [e for e in self.entries if e["mask"]]
-        if self.options.masked_features is False or not masked:
-            return None
-        if self.options.masked_features == "auto":
-            if len(masked) < len(self.entries):
-                return None
-            static, evidence = is_background_static([(self.ingest / e["file"], self.ingest / e["mask"]) for e in self.entries])
-            self.monitor.decide("features", "inside the masks" if static else "in whole photos", evidence)
-            if not static:
-                return None
-        return self._write_feature_masks()
 
-    def _write_feature_masks(self) -> Path:
-        """Copy the masks under COLMAP's file names; their folder."""
-        folder = self.scratch / "feature_masks"
-        folder.mkdir(parents=True, exist_ok=True)
-        for entry in (e for e in self.entries if e["mask"]):
-            target = folder / f"{entry['name']}.png.png"
-            with suppress(FileNotFoundError):
-                target.unlink()
-            shutil.copyfile(self.ingest / entry["mask"], target)
-        return folder
+def is_plausible_lens(camera: Camera) -> bool:
+    """Whether a lens may have the distortion of `camera`.
+
+    Photos that show two things that move against each other, such as an object on a turntable and the room, have no common cameras; what is
+    left of the contradiction ends up in the distortion.
+    """
+    corner = np.array([camera.width / 2 / camera.fx, camera.height / 2 / camera.fy])
+    try:
+        pinhole_camera(camera)
+    except BadInputError:
+        return False
+    moved = distort(corner, camera.distortion or (0.0,))
+    return bool(np.linalg.norm(moved - corner) <= MAX_DISTORTION * np.linalg.norm(corner))
+
+
+def _tied_together(masked: bool, masks: bool) -> str:
+    """The message of a solution whose lens cannot exist."""
+    cause = "Structure from motion found no cameras that explain all photos: the object probably moved against its surroundings"
+    if masked:
+        return f"{cause}, or too little of it is sharp; remove the photos in which it lies otherwise, or add photos that overlap more."
+    how = "correct masks" if masks else "masks"
+    moved = "as on a turntable or when it is laid down otherwise"
+    return f"{cause}, {moved}; give {how} of the object with --masks, or bake each position by itself."
 
 
 def _database_is_intact(path: Path) -> bool:

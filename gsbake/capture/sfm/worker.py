@@ -6,9 +6,11 @@ COLMAP's long calls cannot be interrupted, but a process can be killed, and its 
 from __future__ import annotations
 
 import json
+import os
 import re
 import sys
 import time
+import traceback
 from collections.abc import Mapping
 from contextlib import closing
 from dataclasses import replace
@@ -133,6 +135,8 @@ def triangulate(job: Mapping[str, Any]) -> dict[str, Any]:
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads = 1  # with more, its sums depend on the order in which threads finish
     options.random_seed = pipeline.seed
+    # Given lenses are right: COLMAP would leave out photos of long lenses, whose coefficients are large at small angles.
+    options.max_extra_param = options.triangulation.max_extra_param = 1e6
     start = time.perf_counter()
     _report_progress("triangulation", 0, 1)
     model = pycolmap.triangulate_points(model, str(pipeline.database), str(pipeline.folder), str(out / "sparse"), True, options)
@@ -149,10 +153,13 @@ def main() -> None:
         result = solve(job) if job["task"] == "solve" else triangulate(job)
         (Path(job["out"]) / "result.json").write_text(json.dumps(result))
     except Exception as error:
-        if isinstance(error, OSError | MemoryError) or _PASSING_FAULT.search(str(error)):
-            sys.stderr.write(f"{' '.join(str(error).split())}\n")
-            sys.exit(InterruptedRun.exit_code)
-        raise
+        passing = isinstance(error, OSError | MemoryError) or bool(_PASSING_FAULT.search(str(error)))
+        try:
+            sys.stderr.write(f"{' '.join(str(error).split())}\n" if passing else traceback.format_exc())
+            sys.stderr.flush()
+        except OSError:  # the log is on the disk that failed
+            passing = True
+        os._exit(InterruptedRun.exit_code if passing else 1)  # the interpreter's own end would fail on what is left for stderr
 
 
 if __name__ == "__main__":

@@ -1,8 +1,9 @@
-"""Cameras that contradict the masks are recognised, and structure from motion is tried again inside the masks."""
+"""Cameras that contradict the masks are recognised, and structure from motion is tried again inside the masks; guesses
+serve as well."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,12 +13,14 @@ import numpy as np
 import pytest
 
 from gsbake.capture.sfm import solve
-from gsbake.capture.sfm.mask_agreement import mask_agreement
-from gsbake.capture.sfm.solve import MIN_AGREEMENT, PoseSolver
+from gsbake.capture.sfm.mask_agreement import MIN_AGREEMENT, mask_agreement
+from gsbake.capture.sfm.solve import PoseSolver, is_plausible_lens
 from gsbake.config.schema import Poses
+from gsbake.errors import BadInputError
 from gsbake.geometry.cameras import Camera, CameraSet
 from tests.support.cameras import look_at
 from tests.support.recorder import Recorder
+from tests.support.shapes import bar_masks
 
 COUNT = 16
 
@@ -29,62 +32,129 @@ def ring(turn: float = 1.0) -> list[Camera]:
     return [replace(look_at(c, size=160, focal=200), name=f"p{i:02}") for i, c in enumerate(centres)]
 
 
-def write_masks(folder: Path, cameras: list[Camera]) -> dict[str, Path]:
-    """Silhouettes of a curved bar: it looks different from every side."""
-    folder.mkdir(parents=True)
-    t = np.linspace(-1, 1, 60)
-    line = np.stack([0.8 * t, 0.5 * t**2, 0.4 * t], 1)
-    rng = np.random.default_rng(0)
-    points = (line[:, None] + 0.15 * rng.normal(size=(60, 200, 3)) / 2).reshape(-1, 3)
-    files = {}
-    for camera in cameras:
-        mask = np.zeros((camera.height, camera.width), np.uint8)
-        at = np.round(camera.project(points)[0]).astype(int)
-        mask[at[:, 1], at[:, 0]] = 255
-        files[camera.name] = folder / f"{camera.name}.png"
-        cv2.imwrite(str(files[camera.name]), cv2.morphologyEx(mask, cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8)))
-    return files
-
-
 def test_true_cameras_agree_and_wrong_ones_do_not(tmp_path: Path) -> None:
     cameras = ring()
-    masks = write_masks(tmp_path / "masks", cameras)
+    masks = bar_masks(tmp_path / "masks", cameras)
     assert mask_agreement(cameras, masks) > MIN_AGREEMENT
     assert mask_agreement(ring(0.3), masks) < 0.7  # a background that hardly turned
     broken = [replace(c, distortion=(-9.0, 0.0, 0.0, 0.0)) for c in cameras]
     assert mask_agreement(broken, masks) == 0
 
 
-@pytest.mark.parametrize(("setting", "attempts", "masked"), [("auto", 2, True), (False, 1, False)])
-def test_contradicted_solution_is_tried_again(
-    setting: Any, attempts: int, masked: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Whole photos are tied together by the background, features inside the masks find the true cameras."""
-    cameras, jobs = ring(), []
-    write_masks(tmp_path / "ingest" / "masks", cameras)
+def write_capture(folder: Path, cameras: list[Camera], kind: str) -> list[dict[str, Any]]:
+    """Photos whose background changes, as after the camera was moved, with masks under the key `kind` (mask or guess); their entries."""
     rng = np.random.default_rng(1)
-    (tmp_path / "ingest" / "photos").mkdir()
-    for camera in cameras:  # the background changes, as after the camera was moved
-        cv2.imwrite(str(tmp_path / "ingest" / "photos" / f"{camera.name}.png"), rng.integers(0, 255, (160, 160, 3)).astype(np.uint8))
-    entries = [
-        {"name": c.name, "file": f"photos/{c.name}.png", "mask": f"masks/{c.name}.png", "width": 160, "height": 160, "camera_model": None,
-         "focal_px": None}
+    bar_masks(folder / kind, cameras)
+    (folder / "photos").mkdir()
+    for camera in cameras:
+        cv2.imwrite(str(folder / "photos" / f"{camera.name}.png"), rng.integers(0, 255, (160, 160, 3)).astype(np.uint8))
+    return [
+        {"name": c.name, "file": f"photos/{c.name}.png", "mask": None, "guess": None, "width": 160, "height": 160, "camera_model": None,
+         "focal_px": None, kind: f"{kind}/{c.name}.png"}
         for c in cameras
     ]  # fmt: skip
 
-    def run_job(job: Mapping[str, Any], out: Path, *_: object) -> dict[str, Any]:
-        jobs.append(job)
-        out.mkdir(parents=True)
-        CameraSet(tuple(cameras if job["masks"] else ring(0.3)), poses="solved").save(out / "cameras.json")
-        figures = {"reprojection_px": 0.4, "points": 100, "track_length": 4.0, "fine_features": False, "seconds": {}}
-        return {"registered": COUNT, "missing": [], **figures}
 
-    monkeypatch.setattr(solve, "run_job", run_job)
-    solver = PoseSolver(tmp_path / "ingest", entries, tmp_path / "scratch", Poses(masked_features=setting), 0, 1, Recorder())
-    solved = solver.solve()
+Jobs = list[Mapping[str, Any]]
+
+
+@pytest.fixture
+def answers(monkeypatch: pytest.MonkeyPatch) -> Callable[[Callable[[Mapping[str, Any]], list[Camera]]], Jobs]:
+    """Puts cameras in the place of structure from motion; the jobs that were asked for."""
+
+    def install(cameras_of: Callable[[Mapping[str, Any]], list[Camera]]) -> Jobs:
+        jobs: Jobs = []
+
+        def run_job(job: Mapping[str, Any], out: Path, *_: object) -> dict[str, Any]:
+            jobs.append(job)
+            out.mkdir(parents=True)
+            cameras = cameras_of(job)
+            CameraSet(tuple(cameras), poses="solved").save(out / "cameras.json")
+            figures = {"reprojection_px": 0.4, "points": 100, "track_length": 4.0, "fine_features": False, "seconds": {}}
+            return {"registered": len(cameras), "missing": [], **figures}
+
+        monkeypatch.setattr(solve, "run_job", run_job)
+        return jobs
+
+    return install
+
+
+def solver(tmp_path: Path, entries: list[dict[str, Any]], setting: Any = "auto") -> PoseSolver:
+    return PoseSolver(tmp_path / "ingest", entries, tmp_path / "scratch", Poses(masked_features=setting), 0, 1, Recorder())
+
+
+@pytest.mark.parametrize("kind", ["mask", "guess"])
+@pytest.mark.parametrize(("setting", "attempts", "masked"), [("auto", 2, True), (False, 1, False)])
+def test_contradicted_solution_is_tried_again(
+    setting: Any, attempts: int, masked: bool, kind: str, tmp_path: Path, answers: Callable[..., Jobs]
+) -> None:
+    """Whole photos are tied together by the background, features inside the masks find the true cameras."""
+    cameras = ring()
+    entries = write_capture(tmp_path / "ingest", cameras, kind)
+    jobs = answers(lambda job: cameras if job["masks"] else ring(0.3))
+    run = solver(tmp_path, entries, setting)
+    solved = run.solve()
     assert len(jobs) == attempts and solved.figures["masked_features"] is masked
     assert len({job["work"] for job in jobs}) == attempts
     expected = cameras if masked else ring(0.3)
     np.testing.assert_allclose(solved.cameras[5].centre, expected[5].centre, atol=1e-9)
-    kept = CameraSet.load(solver.folder / "cameras.json").cameras
+    kept = CameraSet.load(run.folder / "cameras.json").cameras
     assert len(kept) == COUNT and kept[5].centre == pytest.approx(expected[5].centre)
+
+
+@pytest.mark.parametrize(("turn", "attempts"), [(0.3, ["_trial", "_masked"]), (1.0, ["_trial", ""])])
+def test_a_trial_on_small_photos_spares_the_wrong_attempt(
+    turn: float, attempts: list[str], tmp_path: Path, answers: Callable[..., Jobs], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(solve, "MAX_UNTRIED_PHOTOS", COUNT - 1)
+    entries = write_capture(tmp_path / "ingest", ring(), "guess")
+    jobs = answers(lambda job: ring() if job["masks"] else ring(turn))
+    solver(tmp_path, entries).solve()
+    assert [Path(job["work"]).name for job in jobs] == [f"colmap{suffix}" for suffix in attempts]
+    assert jobs[0]["max_size"] == solve.TRIAL_SIZE and not jobs[0]["fine"] and jobs[1]["max_size"] > solve.TRIAL_SIZE
+
+
+def test_a_trial_that_registers_little_decides_nothing(
+    tmp_path: Path, answers: Callable[..., Jobs], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(solve, "MAX_UNTRIED_PHOTOS", COUNT - 1)
+    entries = write_capture(tmp_path / "ingest", ring(), "guess")
+    jobs = answers(lambda job: ring()[:3] if job["work"].endswith("_trial") else ring())
+    run = solver(tmp_path, entries)
+    run.solve()
+    assert [bool(job["masks"]) for job in jobs] == [False, False]
+    assert "registered only 3 of 16" in run.monitor.line("features")  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize(("kind", "advice"), [("mask", "correct masks of the object"), (None, "give masks of the object")])
+def test_an_impossible_lens_is_explained_by_movement(
+    kind: str | None, advice: str, tmp_path: Path, answers: Callable[..., Jobs]
+) -> None:
+    """Cameras that tie a moving object to its surroundings end in a distortion that no lens has; the message is about the photos."""
+    warped = [replace(c, distortion=(1.9, 0.0, 0.0, 0.0)) for c in ring()]
+    entries = write_capture(tmp_path / "ingest", ring(), kind or "mask")
+    if kind is None:
+        entries = [{**e, "mask": None} for e in entries]
+    answers(lambda job: warped)
+    with pytest.raises(BadInputError, match="moved against its surroundings") as caught:
+        solver(tmp_path, entries).solve()
+    assert advice in str(caught.value) and "lens" not in str(caught.value) and "calibration" not in str(caught.value)
+
+
+def test_lenses() -> None:
+    """Wide-angle lenses distort by a quarter at most; what cannot be inverted is no lens."""
+    camera = replace(ring()[0], fx=100.0, fy=100.0)
+    assert is_plausible_lens(camera)
+    assert is_plausible_lens(replace(camera, distortion=(-0.1, 0.0, 0.0, 0.0)))
+    assert not is_plausible_lens(replace(camera, distortion=(0.4, 0.0, 0.0, 0.0)))
+    assert not is_plausible_lens(replace(camera, distortion=(-0.9, 0.0, 0.0, 0.0)))
+
+
+def test_a_right_model_of_one_position_beats_a_wrong_one_of_both(tmp_path: Path, answers: Callable[..., Jobs]) -> None:
+    """An object that was laid down otherwise: whole photos register all of them on the table, the masks only one position."""
+    entries = write_capture(tmp_path / "ingest", ring(), "guess")
+    answers(lambda job: ring()[::2] if job["masks"] else ring(0.3))
+    run = solver(tmp_path, entries)
+    solved = run.solve()
+    assert solved.figures["masked_features"] is True and len(solved.cameras) == COUNT // 2
+    assert "8 of 16 photos registered by features inside the masks" in run.monitor.line("features")  # type: ignore[attr-defined]

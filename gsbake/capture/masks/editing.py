@@ -1,0 +1,45 @@
+"""The masks that a run uses, as files that the user can edit and give back."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from gsbake.errors import BadInputError
+from gsbake.imaging.png import write_png
+
+
+def export_masks(ingest: Path, poses: Path | None, folder: Path, only: frozenset[str] | None = None) -> list[Path]:
+    """Write the masks in use into `folder`, one per photo, of its size and under its name; returns the files.
+
+    `ingest` and `poses` are artifact folders; without `poses` there are no automatic masks. `only` names the photos whose masks are
+    written; None writes all. Raises BadInputError when there are no masks, or a file exists already: it may have been edited.
+    """
+    entries: list[dict[str, Any]] = json.loads((ingest / "photos.json").read_text(encoding="utf-8"))["photos"]
+    files = {}
+    for entry in entries:
+        made = None if poses is None else poses / "photo_masks" / f"{entry['name']}.png"
+        if made is not None and made.exists():
+            files[entry["name"]] = made
+        elif entry["mask"]:
+            files[entry["name"]] = ingest / entry["mask"]
+    chosen = [entry for entry in entries if entry["name"] in files and (only is None or entry["name"] in only)]
+    if files and not chosen:
+        raise BadInputError("None of this run's masks is doubtful; without --doubtful all of them are written.")
+    if not chosen:
+        raise BadInputError("This run has no masks; give some with --masks, or install the mask network (`gsbake doctor` says how).")
+    targets = [(folder / entry["source"]).with_suffix(".png") for entry in chosen]
+    there = [target for target in targets if target.exists()]
+    if there:
+        raise BadInputError(f"'{there[0]}' exists already and may hold your edits; name another folder.")
+    for entry, target in zip(chosen, targets, strict=True):
+        mask: Any = cv2.imread(str(files[entry["name"]]), cv2.IMREAD_GRAYSCALE)
+        if mask is None:
+            raise FileNotFoundError(files[entry["name"]])
+        target.parent.mkdir(parents=True, exist_ok=True)
+        write_png(target, np.asarray(cv2.resize(mask, (entry["source_width"], entry["source_height"]), interpolation=cv2.INTER_LINEAR)))
+    return targets

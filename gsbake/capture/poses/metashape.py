@@ -1,0 +1,113 @@
+"""Cameras exported by Agisoft Metashape (PhotoScan) as XML: *Metashape User Manual*, appendix "Camera models".
+
+A point (X, Y, Z) of a camera's frame (x right, y down, z forward) with x = X/Z, y = Y/Z, r² = x² + y² is seen at
+
+    x' = x (1 + k1 r² + k2 r⁴ + k3 r⁶) + p1 (r² + 2x²) + 2 p2 xy
+    y' = y (1 + k1 r² + k2 r⁴ + k3 r⁶) + p2 (r² + 2y²) + 2 p1 xy
+    u = w/2 + cx + x' (f + b1) + y' b2,    v = h/2 + cy + y' f
+
+which is OpenCV's model with p1 and p2 exchanged. Files up to version 1.1 have fx, fy and the principal point from the corner instead. The
+matrix of a camera leads from its frame to that of its chunk; cameras without one are not aligned. A fourth radial coefficient, skew b2, and
+fisheye or spherical cameras are refused: Metashape's *Undistort Photos* removes them. Where the chunk has a scale, coordinates are
+multiplied by it (metres, where scale bars were set).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+
+from gsbake.capture.poses.frames import GivenPoses, PhotoSize, checked_rigid, match_cameras
+from gsbake.capture.poses.validation import MAX_FRAMES, check_file_size
+from gsbake.errors import BadInputError
+from gsbake.geometry.cameras import Camera
+
+#: Largest effect in pixels at which a coefficient that is not supported is ignored.
+NEGLIGIBLE_PIXELS = 0.1
+
+
+def read_metashape(path: Path, sizes: Mapping[str, PhotoSize]) -> GivenPoses:
+    """Poses of a cameras XML for the photos in `sizes`.
+
+    Raises BadInputError for an invalid file, a value that is not finite or out of bounds, a matrix that is no rigid motion, and for camera
+    models that are not supported.
+    """
+    document = _parse(path)
+    try:
+        sensors = {sensor.get("id", ""): sensor for sensor in document.iter("sensor")}
+        scale = float(document.findtext("chunk/transform/scale", "1"))
+        if not (math.isfinite(scale) and scale > 0):
+            raise BadInputError(f"The scale of the chunk in {path} is {scale}; export the cameras again.")
+        frames: list[tuple[str, Camera]] = []
+        for entry in document.iter("camera"):
+            matrix, name = entry.findtext("transform"), entry.get("label", "")
+            if matrix is None or not name:
+                continue
+            if len(frames) == MAX_FRAMES:
+                raise BadInputError(f"{path} has more than {MAX_FRAMES} cameras.")
+            pose = np.array(matrix.split(), float).reshape(4, 4)
+            rotation, centre = checked_rigid(pose[:3, :3], scale * pose[:3, 3], name, str(path))
+            inner = _intrinsics(sensors[entry.get("sensor_id", "")], name, path)
+            frames.append((name, Camera(name=name, R=rotation.T, t=-rotation.T @ centre, **inner)))
+    except (ValueError, KeyError, TypeError, OverflowError) as error:
+        reason = " ".join(repr(error).split())[:200]
+        raise BadInputError(f"{path} is not a valid file of Metashape cameras ({reason}); export the cameras again.") from error
+    if not frames:
+        raise BadInputError(f"{path} holds no aligned camera; align the photos in Metashape and export the cameras as Agisoft XML.")
+    cameras, missing = match_cameras(frames, sizes, str(path))
+    return GivenPoses(cameras, missing)
+
+
+def _parse(path: Path) -> ElementTree.Element:
+    check_file_size(path)
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise BadInputError(f"{path} cannot be read ({error.strerror}).") from error
+    if b"<!DOCTYPE" in content or b"<!ENTITY" in content:  # Metashape writes none; entities may expand without end
+        raise BadInputError(f"{path} declares XML entities, which no file of Metashape cameras does; export the cameras again.")
+    try:
+        document = ElementTree.fromstring(content)  # nosec B314: without entities
+    except (ElementTree.ParseError, ValueError, LookupError) as error:
+        raise BadInputError(f"{path} is not a valid XML file ({' '.join(str(error).split())[:200]}).") from error
+    if document.tag != "document" or document.find("chunk") is None:
+        raise BadInputError(f"{path} is no file of Metashape cameras; export the cameras as Agisoft XML.")
+    return document
+
+
+def _intrinsics(sensor: ElementTree.Element, name: str, path: Path) -> dict[str, Any]:
+    """Size, focal lengths, principal point and distortion of a camera with this sensor."""
+    found = sensor.findall("calibration")
+    calibration = next((c for c in found if c.get("class") == "adjusted"), found[0] if found else None)
+    if calibration is None:
+        raise BadInputError(f"The sensor of frame {name} in {path} has no calibration; export the cameras after alignment.")
+    kind = calibration.get("type", sensor.get("type", "frame"))
+    if kind != "frame":
+        raise BadInputError(f"The camera of frame {name} in {path} is of the type {kind}, not frame; undistort the photos first.")
+    resolution = calibration.find("resolution")
+    if resolution is None:
+        resolution = sensor.find("resolution")
+    if resolution is None:
+        raise BadInputError(f"The sensor of frame {name} in {path} has no resolution.")
+    width, height = int(resolution.get("width", "")), int(resolution.get("height", ""))
+    value = {child.tag: float(child.text or "") for child in calibration if child.tag != "resolution" and len(child) == 0}
+    if "f" in value:
+        fx, fy = value["f"] + value.get("b1", 0.0), value["f"]
+        cx, cy = width / 2 + value.get("cx", 0.0), height / 2 + value.get("cy", 0.0)
+    else:
+        fx, fy, cx, cy = value["fx"], value["fy"], value.get("cx", width / 2), value.get("cy", height / 2)
+    corner = math.hypot(width, height) / 2 / max(min(fx, fy), 1e-9)  # tangent of the angle to the corner
+    skew = value.get("b2", value.get("skew", 0.0))
+    for text, pixels in (("k4", value.get("k4", 0.0) * corner**9 * fx), ("b2", skew * corner)):
+        if not abs(pixels) < NEGLIGIBLE_PIXELS:
+            raise BadInputError(
+                f"The camera of frame {name} in {path} has a coefficient {text}, which is not supported; undistort the photos, or "
+                f"align them without {text}."
+            )
+    k = tuple(value.get(key, 0.0) for key in ("k1", "k2", "p2", "p1", "k3"))
+    return {"width": width, "height": height, "fx": fx, "fy": fy, "cx": cx, "cy": cy, "distortion": k if any(k) else ()}
