@@ -15,10 +15,9 @@ from numpy.typing import NDArray
 
 from gsbake.errors import BadInputError
 from gsbake.gltf.container import unpack_glb
+from gsbake.gltf.document import Document, texture_infos, texture_source
 
-COMPONENT_TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 WIDTHS = {"POSITION": 3, "NORMAL": 3, "TANGENT": 4, "TEXCOORD_0": 2}
-COMPONENT_COUNTS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 
 
 @dataclass(frozen=True)
@@ -58,17 +57,18 @@ def read_glb(path: Path) -> GltfAsset:
 def parse_glb(data: bytes, name: str) -> GltfAsset:
     """Parse the bytes of a GLB; `name` identifies it in errors. Raises BadInputError as `read_glb`."""
     document, binary = unpack_glb(data, name)
+    file = Document(document, [binary], name, None, len(data))
     try:
         primitive = document["meshes"][0]["primitives"][0]
-        attributes = {key: _accessor(document, binary, index) for key, index in primitive["attributes"].items()}
+        attributes = {key: file.accessor(index) for key, index in primitive["attributes"].items()}
         if "indices" in primitive:
-            corners = _accessor(document, binary, primitive["indices"])
+            corners = file.accessor(primitive["indices"])
             if corners.dtype.kind != "u":
                 raise ValueError(f"its indices are of the type {corners.dtype}")
             faces = corners.astype(np.int64).reshape(-1, 3)
         else:
             faces = np.arange(len(attributes["POSITION"])).reshape(-1, 3)
-        images = tuple(_buffer_view(document, binary, image["bufferView"]) for image in document.get("images", []))
+        images = tuple(file.view(image["bufferView"]) for image in document.get("images", []))
         material = document.get("materials", [{}])[primitive.get("material", 0)]
         roles = _roles(document, material)
         _check_shapes(attributes, roles, len(images))
@@ -91,38 +91,14 @@ def _check_shapes(attributes: dict[str, NDArray[Any]], roles: dict[str, int], im
             raise ValueError(f"the image of {role} does not exist")
 
 
-def _buffer_view(document: dict[str, Any], binary: bytes, index: int) -> bytes:
-    view = document["bufferViews"][index]
-    start = view.get("byteOffset", 0)
-    content = binary[start : start + view["byteLength"]]
-    if len(content) != view["byteLength"]:
-        raise ValueError(f"buffer view {index} exceeds the binary chunk")
-    return content
-
-
-def _accessor(document: dict[str, Any], binary: bytes, index: int) -> NDArray[Any]:
-    """Values of an accessor (count, width), or (count,) for scalars, also from interleaved buffer views."""
-    accessor = document["accessors"][index]
-    kind, width, count = np.dtype(COMPONENT_TYPES[accessor["componentType"]]), COMPONENT_COUNTS[accessor["type"]], accessor["count"]
-    content = _buffer_view(document, binary, accessor["bufferView"])
-    stride = document["bufferViews"][accessor["bufferView"]].get("byteStride", kind.itemsize * width)
-    start = accessor.get("byteOffset", 0)
-    if start < 0 or stride < kind.itemsize * width:  # rows that overlap would let a small file state any count
-        raise ValueError(f"accessor {index} has the offset {start} and the stride {stride}")
-    if start + stride * (count - 1) + kind.itemsize * width > len(content):
-        raise ValueError(f"accessor {index} exceeds its buffer view")
-    values = np.ndarray((count, width), kind, content, start, (stride, kind.itemsize)).copy()
-    return values[:, 0] if width == 1 else values
-
-
 def _roles(document: dict[str, Any], material: dict[str, Any]) -> dict[str, int]:
     """Image index of each texture role."""
-    surface = material.get("pbrMetallicRoughness", {})
-    found = {
-        "base_color": surface.get("baseColorTexture"),
-        "orm": surface.get("metallicRoughnessTexture"),
-        "occlusion": material.get("occlusionTexture"),
-        "normal": material.get("normalTexture"),
-        "emissive": material.get("emissiveTexture"),
-    }
-    return {role: document["textures"][texture["index"]]["source"] for role, texture in found.items() if texture is not None}
+    return {role: _image(document, texture["index"]) for role, texture in texture_infos(material).items()}
+
+
+def _image(document: dict[str, Any], texture: int) -> int:
+    """Index of the texture's image. Raises KeyError without one."""
+    found = texture_source(document, texture)
+    if found is None:
+        raise KeyError("source")
+    return found

@@ -1,0 +1,39 @@
+"""The light of renders of any file: a procedural environment of the report, or an equirectangular HDR image."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from gsbake.errors import BadInputError, UsageError
+from gsbake.report.lights import PROCEDURAL_LIGHTS, LitShader, procedural
+from gsbake.shading.environment import EnvironmentLight
+
+#: Texels along a face of the cube map made from an image.
+FACE_SIZE = 64
+#: Name of the light beside a file, as the export writes it.
+LIGHT_FILE = "light.hdr"
+
+
+def load_light(light: str, beside: Path) -> LitShader:
+    """Shader under `light`: "studio", "sunset", "hdr" (`light.hdr` in the folder `beside`) or the path of an HDR or EXR image.
+
+    Raises UsageError for an unknown name, BadInputError for an image that cannot be read.
+    """
+    named = {name.lower(): name for name in PROCEDURAL_LIGHTS}
+    if light.lower() in named:
+        return procedural(named[light.lower()])
+    path = beside / LIGHT_FILE if light == "hdr" else Path(light)
+    if not path.is_file():
+        if light == "hdr":
+            raise UsageError(f"There is no {LIGHT_FILE} in '{beside}'; name an HDR image with --light, or use --light studio.")
+        raise UsageError(f"The light '{light}' is neither {', '.join(named)} or hdr nor an image.")
+    import OpenImageIO as oiio
+
+    source = oiio.ImageInput.open(str(path))
+    pixels = None if source is None else source.read_image(oiio.FLOAT)
+    if source is None or pixels is None or pixels.ndim != 3 or pixels.shape[2] < 3 or not np.isfinite(pixels).all():
+        raise BadInputError(f"'{path}' is not a readable HDR image of three channels ({oiio.geterror().strip() or 'damaged'}).")
+    image = np.maximum(pixels[..., :3], 0).astype(np.float64)
+    return LitShader(EnvironmentLight.from_equirectangular(image, FACE_SIZE, convention="gltf"))

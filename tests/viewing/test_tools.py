@@ -1,0 +1,109 @@
+"""`gsbake inspect`, `compare` and `render` on files of other programs."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+
+from gsbake.cli import main
+from gsbake.gltf.scene import open_scene
+from gsbake.viewing.lights import load_light
+from gsbake.viewing.render import SceneRenderer
+from gsbake.viewing.turntable import orbit
+from tests.support.gltf_files import two_triangles, write_ball
+
+
+def call(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
+    """Exit code of a command."""
+    monkeypatch.setattr(sys, "argv", ["gsbake", *map(str, arguments)])
+    with pytest.raises(SystemExit) as end:
+        main()
+    return int(end.value.code or 0)
+
+
+def test_compare_measures_a_known_difference(
+    ball: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A ball of another colour and 1 % larger: Chamfer distance .01 of the radius, base colour as of the two colours, normals the same."""
+    other = write_ball(tmp_path / "other.glb", (60, 160, 60), radius=1.01)
+    options = "--sheet", tmp_path / "sheet.png", "--views", 2, "--size", 96, "--json"
+    assert call(monkeypatch, "compare", ball, other, *options) == 0
+    figures = json.loads(capsys.readouterr().out)
+    diagonal = 2 * np.sqrt(3)
+    assert figures["surface"]["chamfer"] == pytest.approx(0.01 / diagonal, rel=0.1)
+    assert figures["surface"]["normal_degrees"] < 2
+    red = (60 - 40) / 255
+    assert figures["images"]["base_color_psnr"] == pytest.approx(-10 * np.log10(red**2 / 3), abs=0.5)
+    assert figures["images"]["silhouette_iou"] == pytest.approx(1 / 1.01**2, abs=0.02)
+    with Image.open(tmp_path / "sheet.png") as sheet:
+        assert sheet.size == (3 * 96, 2 * 96)
+    assert call(monkeypatch, "compare", ball, ball, "--truth", ball, "--views", 1, "--size", 64, "--json") == 0
+    same = json.loads(capsys.readouterr().out)
+    assert same["surface"]["chamfer"] < 1e-6 and same["truth"]["surfaces"][0]["chamfer"] < 1e-6
+
+
+@pytest.mark.parametrize("name", ["turn.png", "turn.webp", "turn.mp4"])
+def test_turntables(ball: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], name: str) -> None:
+    """Four views in each format, read back by another library; the ball is green and in the middle."""
+    out = tmp_path / name
+    assert call(monkeypatch, "render", ball, "--turntable", out, "--views", 4, "--size", 64, "--samples", 1, "--json") == 0
+    assert json.loads(capsys.readouterr().out)["views"] == 4
+    if name.endswith("mp4"):
+        film = cv2.VideoCapture(str(out))
+        assert film.get(cv2.CAP_PROP_FRAME_COUNT) == 4
+        picture = film.read()[1][..., ::-1]
+    else:
+        with Image.open(out) as image:
+            assert getattr(image, "n_frames", 1) == (4 if name.endswith("webp") else 1)
+            picture = np.asarray(image.convert("RGB"))[:64, :64]
+    red, green, blue = picture[32, 32].astype(int)
+    assert green > red + 20 and green > blue + 20
+    assert not list(tmp_path.glob(".*partial*"))
+
+
+def test_alpha_lets_what_lies_behind_through(tmp_path: Path) -> None:
+    """A half transparent, unlit triangle: coverage .5 in its middle, nothing of a triangle whose alpha is cut off."""
+    for mode, expected in (("BLEND", 0.5), ("OPAQUE", 1.0), ("MASK", 0.0)):
+        material = {"alphaMode": mode, "alphaCutoff": 0.6, "doubleSided": True, "extensions": {"KHR_materials_unlit": {}}}
+        material["pbrMetallicRoughness"] = {"baseColorFactor": [0, 1, 0, 0.5]}
+        path = tmp_path / f"{mode}.gltf"
+        path.write_text(json.dumps(two_triangles(materials=[material], nodes=[{"mesh": 0}], scenes=[{"nodes": [0]}])))
+        renderer = SceneRenderer(open_scene(path))
+        camera = orbit(np.array([0.3, 0.3, 0.0]), 0.1, 1, 9, elevation=0.0)[0]
+        image = renderer.draw(camera, load_light("studio", tmp_path), 1)
+        assert image.alpha[4, 4] == pytest.approx(expected, abs=1e-5)
+        if expected:
+            np.testing.assert_allclose(image.linear[4, 4], [0, 1, 0], atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "message"),
+    [
+        (["inspect", "missing.glb"], 42, "cannot be read"),
+        (["render", "BALL", "--turntable", "x.avi"], 2, "not '.avi'"),
+        (["render", "BALL", "--turntable", "x.png", "--light", "moon"], 2, "neither"),
+        (["render", "BALL", "--turntable", "x.png", "--light", "hdr"], 2, "no light.hdr"),
+        (["compare", "BALL", "README.md"], 42, "README.md"),
+    ],
+)
+def test_errors_are_one_sentence(
+    ball: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    arguments: list[str],
+    code: int,
+    message: str,
+) -> None:
+    """Wrong files, formats and lights: the documented exit code and a sentence on stderr."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "README.md").write_text("text")
+    assert call(monkeypatch, *(ball if a == "BALL" else a for a in arguments)) == code
+    error = capsys.readouterr().err
+    assert message in error and "Traceback" not in error
