@@ -6,6 +6,7 @@ import os
 import time
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from gsbake.pipeline.lease import Lease, LeaseHolder
 from gsbake.pipeline.machine import host_info, versions
 from gsbake.pipeline.plan import Planner, Request, StageState
 from gsbake.pipeline.registry import Registry
+from gsbake.pipeline.shared_store import SharedStore, StoreUnreachableError
 from gsbake.pipeline.stage import Stage
 from gsbake.pipeline.store import Artifact, Store
 from gsbake.pipeline.supervise import Outcome, StageFailed, StopSignals, supervise
@@ -59,8 +61,11 @@ class Observer:
 class Engine:
     """Runs the stages of a registry for one request."""
 
-    def __init__(self, registry: Registry, request: Request, observer: Observer | None = None) -> None:
+    def __init__(
+        self, registry: Registry, request: Request, observer: Observer | None = None, shared: SharedStore | None = None
+    ) -> None:
         self.registry = registry
+        self.shared = shared
         self.request = request
         self.observer = observer or Observer()
         self.store = Store(request.out)
@@ -113,6 +118,7 @@ class Engine:
                 self.store.mark_used(state.artifact)
                 self.events.write("stage cached", stage=stage.name, folder=state.artifact.folder, replaced=state.artifact.replaced)
                 self.observer.stage_reused(state)
+                self._share(stage, state, stop)
             assert state.artifact is not None
             artifacts[stage.name] = state.artifact
             states.append(state)
@@ -147,9 +153,14 @@ class Engine:
             if current.artifact is not None:
                 self.observer.stage_reused(current)
                 return current
+            fetched = self._fetch(stage, state, cache_key, stop)
+            if fetched is not None:
+                self.observer.stage_reused(fetched)
+                return fetched
             self.events.write("stage started", stage=stage.name, key=cache_key.digest, reasons=list(state.reasons))
             self.observer.stage_started(state)
             artifact = self._execute(stage, state, cache_key, artifacts, stop, lease)
+            artifact = self._share(stage, replace(state, artifact=artifact), stop) or artifact
         done = StageState(stage.name, stage.title, "run", state.reasons, cache_key, artifact, state.settings)
         self.events.write(
             "stage finished", stage=stage.name, seconds=artifact.manifest["seconds"], peak_bytes=artifact.manifest["peak_bytes"],
@@ -157,6 +168,55 @@ class Engine:
         )  # fmt: skip
         self.observer.stage_finished(done)
         return done
+
+    def _fetch(self, stage: Stage, state: StageState, cache_key: CacheKey, stop: StopSignals) -> StageState | None:
+        """Take the artifact of a key from the shared store; None where it has none. The caller holds the lease."""
+        if self.shared is None:
+            return None
+        temporary = self.store.temporary(stage.name, cache_key.digest)
+        try:
+            damaged = len(self.shared.damaged)
+            manifest = self.shared.fetch(cache_key, temporary, stop.check)
+            for name in self.shared.damaged[damaged:]:
+                self._warn_of_store(stage.name, f"{name} was damaged and thrown away; the stage is computed again.")
+            if manifest is None:
+                return None
+            own = {name: value for name, value in manifest.items() if name not in ("files", "digest", "seal")}
+            artifact = self.store.publish(temporary, self.store.folder(stage.name, cache_key.digest), own)
+        except StoreUnreachableError as error:
+            self._give_store_up(stage.name, error)
+            return None
+        finally:
+            if temporary.exists():
+                remove_tree(temporary)
+        self.events.write("stage fetched", stage=stage.name, key=cache_key.digest, store=self.shared.url)
+        return StageState(stage.name, stage.title, "cached", ("from the shared store",), cache_key, artifact, state.settings)
+
+    def _share(self, stage: Stage, state: StageState, stop: StopSignals) -> Artifact | None:
+        """Put an artifact into the shared store. Where another machine has stored other bytes for the key meanwhile, theirs are taken and
+        returned, so that all machines go on from the same files."""
+        if self.shared is None or state.artifact is None or state.cache_key is None:
+            return None
+        try:
+            refused = self.shared.put(state.artifact, stop.check)
+            if refused == "full":
+                self._warn_of_store(stage.name, "it is full; the output stays on this machine. `gsbake cache gc --store` makes room.")
+            theirs = None if refused else self.shared.digest_of(state.cache_key, stop.check)
+            if state.status == "run" and theirs is not None and theirs != state.artifact.digest:
+                fetched = self._fetch(stage, state, state.cache_key, stop)
+                return None if fetched is None else fetched.artifact
+        except (StoreUnreachableError, PermissionError) as error:
+            self._give_store_up(stage.name, error)
+        return None
+
+    def _give_store_up(self, name: str, error: Exception) -> None:
+        self._warn_of_store(name, f"it does not answer ({error}); the run goes on without it.")
+        self.shared = None
+
+    def _warn_of_store(self, name: str, what: str) -> None:
+        text = printable(f"Shared store '{self.shared.url if self.shared is not None else ''}': {what}")
+        self.events.write("warning", stage=name, text=text)
+        self.observer.warning(name, text)
 
     def _execute(
         self, stage: Stage, state: StageState, cache_key: CacheKey, artifacts: Mapping[str, Artifact], stop: StopSignals, lease: Lease

@@ -255,9 +255,17 @@ def _unexpected(folder: Path, manifest: Mapping[str, Any]) -> list[str]:
 def read_manifest(folder: Path) -> dict[str, Any] | None:
     """The manifest of a folder; None when it is missing, damaged or modified (its `seal` is a digest of the other fields)."""
     try:
-        body = json.loads((folder / MANIFEST).read_text(encoding="utf-8"))
+        return parse_manifest((folder / MANIFEST).read_bytes())
+    except OSError:
+        return None
+
+
+def parse_manifest(content: bytes) -> dict[str, Any] | None:
+    """The manifest in the bytes of a file; None when it is damaged or modified."""
+    try:
+        body = json.loads(content.decode("utf-8"))
         intact = isinstance(body, dict) and body.get("seal") == _seal(body)
-    except (OSError, ValueError, RecursionError):
+    except (ValueError, RecursionError):
         return None
     return body if intact and _well_formed(body.get("files")) and isinstance(body.get("settings", {}), dict) else None
 

@@ -233,6 +233,9 @@ def _unexpected_exit(worker: Worker, log: Path, stop: StopSignals) -> GsbakeErro
     code = worker.process.returncode
     if stop.count:
         return InterruptedRun(_STOPPED)
+    if -code in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):  # before the worker handled them: it was just starting
+        name = signal.Signals(-code).name
+        return InterruptedRun(f"The stage's process was ended from outside by {name}; the same command resumes the run.")
     with suppress(OSError):
         tail = log.read_text(errors="replace")[-4000:]
         if code == -signal.SIGKILL:

@@ -184,6 +184,13 @@ def test_native_crash_raises_stage_failed(tmp_path: Path, photos: Path) -> None:
     assert "about to crash" in saved[0].read_text()
 
 
+def test_a_worker_ended_from_outside_can_be_run_again(tmp_path: Path, photos: Path) -> None:
+    """A signal that reaches a worker before it handles signals is no failure of the stage."""
+    with pytest.raises(InterruptedRun, match="ended from outside by SIGTERM") as caught:
+        engine(tmp_path / "out", photos, registry=only("terminated"))[0].run()
+    assert caught.value.exit_code == 75
+
+
 def test_unwritable_output(tmp_path: Path, photos: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(UsageError, match="a file of that name exists"):

@@ -104,6 +104,12 @@ def _crash(ctx: Context) -> dict[str, Any]:
     return {}
 
 
+def _terminated(ctx: Context) -> dict[str, Any]:
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)  # as in a worker that has just started
+    os.kill(os.getpid(), signal.SIGTERM)
+    return {}
+
+
 def _raise(ctx: Context) -> dict[str, Any]:
     kind = (ctx.inputs["photos"] / "kind.txt").read_text()
     if kind == "bad":
@@ -121,6 +127,7 @@ TELL = Stage("tell", 1, "Tell", _tell, needs=("sum",))
 UNDECLARED = Stage("undeclared", 1, "Peek", _undeclared, settings=("sum.steps",))
 STUBBORN = Stage("stubborn", 1, "Stubborn", _stubborn)
 CRASH = Stage("crash", 1, "Crash", _crash)
+TERMINATED = Stage("terminated", 1, "Terminated", _terminated)
 RAISE = Stage("raise", 1, "Raise", _raise, sources=("photos",))
 
 CHAIN = Registry({name: f"tests.pipeline.toy:{name.upper()}" for name in ("read", "sum", "tell")})

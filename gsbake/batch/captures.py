@@ -1,0 +1,152 @@
+"""The captures of a batch: their output folders, the states of their stages, and the number and size of their photos.
+
+A capture that cannot be planned (no photos, an unreadable file) becomes a failure with its sentence; the others are planned all the same.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from PIL import Image
+
+from gsbake.api import RunOptions, Session, open_session
+from gsbake.capture.sources import PHOTO_FOLDERS
+from gsbake.errors import BadInputError, GsbakeError, UsageError
+from gsbake.pipeline.plan import StageState
+from gsbake.pipeline.store import Store
+from gsbake.publish import RESULTS
+
+#: Megapixels assumed where no header can be read.
+_USUAL_MEGAPIXELS = 12.0
+
+
+@dataclass(frozen=True)
+class BatchOptions:
+    """Options that all captures of a batch share; `root` holds one output folder per capture, `store` is the shared store."""
+
+    root: Path
+    profile: str
+    overrides: Sequence[str] = ()
+    threads: int = 0
+    seed: int = 0
+    store: str | None = None
+
+    def absolute(self) -> BatchOptions:
+        """The options with absolute paths, which jobs in other folders need."""
+        profile = str(Path(self.profile).absolute()) if Path(self.profile).is_file() else self.profile
+        store = self.store if self.store is None or "://" in self.store else str(Path(self.store).absolute())
+        return replace(self, root=self.root.absolute(), profile=profile, store=store)
+
+
+@dataclass(frozen=True)
+class PhotoSet:
+    """Number of photos, and megapixels of one."""
+
+    count: int
+    megapixels: float
+
+
+@dataclass(frozen=True)
+class CapturePlan:
+    """A capture, its output folder, and the states of its stages; or the failure that keeps it from being planned."""
+
+    name: str
+    photos: Path
+    out: Path
+    states: tuple[StageState, ...] = ()
+    photo_set: PhotoSet = PhotoSet(0, _USUAL_MEGAPIXELS)
+    published: bool = False  # the results lie in the output folder
+    error: str = ""
+    exit_code: int = 0
+
+    @property
+    def to_run(self) -> tuple[StageState, ...]:
+        """The stages that are neither cached nor replaced."""
+        return tuple(state for state in self.states if state.artifact is None)
+
+    @property
+    def done(self) -> bool:
+        """Whether nothing is left to run or to publish."""
+        return not self.error and not self.to_run and self.published
+
+
+def plan_captures(captures: Sequence[Path], options: BatchOptions) -> list[CapturePlan]:
+    """Plans of the captures, in order. Raises UsageError when two captures have one name, or for a wrong profile or setting."""
+    named = {path: _name(path) for path in captures}
+    seen: dict[str, Path] = {}
+    for path, name in named.items():
+        if name in seen:
+            raise UsageError(f"'{seen[name]}' and '{path}' have the same name '{name}' and would share an output folder; rename one.")
+        seen[name] = path
+    return [plan_capture(path, options) for path in named]
+
+
+def plan_capture(photos: Path, options: BatchOptions) -> CapturePlan:
+    """The plan of one capture. Raises UsageError for a wrong profile or setting, which concerns all captures."""
+    out = (options.root / _name(photos)).absolute()
+    plan = CapturePlan(_name(photos), photos.absolute(), out)
+    try:
+        if not photos.is_dir():
+            raise BadInputError(f"'{photos}' is not a folder; name the folder of a capture.")
+        session = open_session(
+            RunOptions(photos, out, options.profile, options.overrides, threads=options.threads, seed=options.seed),
+        )
+        states = session.engine.plan()
+    except UsageError:
+        raise
+    except GsbakeError as error:
+        return CapturePlan(plan.name, plan.photos, out, error=str(error), exit_code=error.exit_code)
+    return CapturePlan(plan.name, plan.photos, out, tuple(states), _photo_set(session), published=_results_are_published(session, states))
+
+
+def photos_of_run(out: Path) -> PhotoSet | None:
+    """Number and size of the photos that the newest ingest in an output folder read; None when there is none."""
+    for folder, _ in Store(out).manifests("ingest"):
+        with suppress(OSError, ValueError, KeyError, TypeError, IndexError):
+            photos = json.loads((folder / "photos.json").read_text(encoding="utf-8"))["photos"]
+            pixels = sorted(int(p["source_width"]) * int(p["source_height"]) for p in photos)
+            return PhotoSet(len(pixels), pixels[len(pixels) // 2] / 1e6)
+    return None
+
+
+def _photo_set(session: Session) -> PhotoSet:
+    """Number of a capture's photos, and megapixels of the first one whose header can be read."""
+    request = session.engine.request
+    names = request.source_names.get("photos", ())
+    for name in names[:3]:
+        with suppress(Exception), Image.open(request.sources["photos"] / name) as image:  # only the header is read; a guess does too
+            return PhotoSet(len(names), image.width * image.height / 1e6)
+    return PhotoSet(len(names), _USUAL_MEGAPIXELS)
+
+
+def _results_are_published(session: Session, states: Sequence[StageState]) -> bool:
+    """Whether the results of the artifacts lie in the output folder."""
+    files = [name for s in states if s.artifact is not None for name in RESULTS.get(s.name, ()) if name in s.artifact.files]
+    return all((session.out / name).is_file() for name in files)
+
+
+def _name(photos: Path) -> str:
+    """Name of a capture, which is that of its output folder: the folder's, or its parent's for a folder such as images/."""
+    folder = photos.resolve()
+    name = folder.parent.name if folder.name in PHOTO_FOLDERS else folder.name
+    if not name:
+        raise UsageError(f"'{photos}' has no name for an output folder; name the folder of a capture.")
+    return name
+
+
+def identifier(index: int, name: str) -> str:
+    """An identifier of a capture for schedulers: letters, digits and underscores, and unique by its index."""
+    return f"c{index:04d}_{re.sub(r'[^A-Za-z0-9]+', '_', name)[:24].strip('_')}".rstrip("_")
+
+
+def plan_state_key(session: Session) -> str:
+    """Cache key of the first stage of a session that has to run; empty when none has, or where it cannot be known."""
+    with suppress(GsbakeError):
+        session.engine.planner.forget_sources()
+        return next((s.cache_key.digest for s in session.engine.plan() if s.artifact is None and s.cache_key is not None), "")
+    return ""

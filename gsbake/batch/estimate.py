@@ -1,0 +1,115 @@
+"""Estimates of a stage's time and memory from the photos and the settings, corrected by earlier runs.
+
+The formulas give the order of magnitude: seconds on two cores and resident megabytes, fitted to `gsbake run` with the profiles preview and
+relight on two captures of 40 and 48 small photos. What earlier runs in the same batch folder took corrects them: the median ratio of
+measured and estimated seconds, and the largest ratio of memory, per stage; runs with the same settings count alone where there are any.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+from gsbake.batch.captures import PhotoSet, photos_of_run
+from gsbake.pipeline.store import Store
+
+#: Exponent of the speed-up by threads: 2 threads are 1.74 times as fast as 1.
+_THREAD_EXPONENT = 0.8
+#: Threads on which the formulas were fitted.
+_FITTED_THREADS = 2
+#: Room above the largest memory that was measured, and above that of a formula.
+_MEMORY_MARGIN, _MEMORY_MARGIN_OF_FORMULA = 1.2, 1.5
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """Expected seconds, and megabytes of memory to reserve; `measured` is the number of earlier runs behind the correction."""
+
+    seconds: float
+    memory_mb: int
+    measured: int = 0
+
+
+def formula(stage: str, photos: PhotoSet, settings: Mapping[str, Any]) -> tuple[float, float]:
+    """Seconds on two cores and megabytes of a stage, from the photos and {"section.key": value}; 10 s and 500 MB for an unknown stage."""
+
+    def value(name: str, default: float) -> float:
+        found = settings.get(name, default)
+        return float(found) if isinstance(found, int | float) else default
+
+    def megapixels(name: str, default: float) -> float:
+        """Size of a photo whose longer side is limited by a setting; photos are taken as 4 : 3."""
+        return min(photos.megapixels, 0.75e-6 * value(name, default) ** 2)
+
+    count, texels = photos.count, 1e-6 * value("bake.size", 1024) ** 2
+    step = 0.012 + 0.15 * megapixels("train.max_size", 512)
+    matched = count * megapixels("stereo.max_size", 800)
+    fit = settings.get("bake.materials") == "fit"
+    match stage:
+        case "ingest":
+            return 0.5 + 0.12 * count * photos.megapixels, 130 + 40 * photos.megapixels
+        case "poses":
+            return 2 + 0.05 * count + 0.002 * count**2, 300 + 60 * megapixels("poses.max_size", 1600)
+        case "stereo":
+            return (1.0, 300.0) if settings.get("stereo.enabled") == "never" else (1 + 3 * matched, 350 + 50 * matched)
+        case "train":
+            return 3 + step * value("train.iterations", 3000), 500 + 0.004 * value("surfels.max_count", 60_000)
+        case "refine":
+            return 3 + step * value("refine.iterations", 300), 450 + 0.004 * value("surfels.max_count", 60_000)
+        case "mesh":
+            return 2 + 0.08 * value("mesh.max_resolution", 384), 450 + 0.8 * value("mesh.max_resolution", 384)
+        case "bake":
+            return 6 + (110 if fit else 8) * texels, 700 + (1100 if fit else 320) * texels
+        case "export":
+            return 2 + 4 * texels, 300 + 270 * texels
+        case "report":
+            return 7.0, 830.0
+    return 10.0, 500.0
+
+
+@dataclass
+class History:
+    """Ratios of measured and estimated seconds and memory of earlier runs: {stage: [(settings, seconds ratio, memory ratio)]}."""
+
+    ratios: dict[str, list[tuple[Mapping[str, Any], float, float]]] = field(default_factory=dict)
+
+    @staticmethod
+    def of_runs(outs: Iterable[Path], stages: Iterable[str]) -> History:
+        """The history of the output folders `outs`; folders without a finished ingest are left out."""
+        history, names = History(), list(stages)
+        for out in outs:
+            photos = photos_of_run(out)
+            if photos is not None:
+                for stage in names:
+                    for _, manifest in Store(out).manifests(stage):
+                        history.add(stage, photos, manifest)
+        return history
+
+    def add(self, stage: str, photos: PhotoSet, manifest: Mapping[str, Any]) -> None:
+        """Add one manifest. A resumed stage is left out: its time is that of the rest only."""
+        settings, seconds, peak = manifest.get("settings", {}), manifest.get("seconds"), manifest.get("peak_bytes")
+        threads = manifest.get("threads")
+        if manifest.get("resumed") or not isinstance(seconds, int | float) or not isinstance(peak, int) or not isinstance(threads, int):
+            return
+        expected, memory = formula(stage, photos, settings)
+        alone = seconds / at_threads(1.0, max(threads, 1))
+        self.ratios.setdefault(stage, []).append((settings, alone / expected, peak / 1e6 / memory))
+
+    def estimate(self, stage: str, photos: PhotoSet, settings: Mapping[str, Any], threads: int) -> Estimate:
+        """The estimate of a stage with the values of its `settings` (those it declares), on `threads` threads."""
+        seconds, memory = formula(stage, photos, settings)
+        known = self.ratios.get(stage, [])
+        known = [entry for entry in known if entry[0] == settings] or known
+        if not known:
+            return Estimate(at_threads(seconds, threads), math.ceil(memory * _MEMORY_MARGIN_OF_FORMULA))
+        speed, room = median(entry[1] for entry in known), max(entry[2] for entry in known)
+        return Estimate(at_threads(seconds * speed, threads), math.ceil(memory * room * _MEMORY_MARGIN), len(known))
+
+
+def at_threads(seconds: float, threads: int) -> float:
+    """Time on `threads` threads of what takes `seconds` on those of the formulas."""
+    return seconds * float((_FITTED_THREADS / threads) ** _THREAD_EXPONENT)

@@ -1,0 +1,96 @@
+"""Jobs of a batch: stages that have to run, packed so that small ones share a job, with dependencies and resources.
+
+A job brings its last stage up to date, and with it all before that. It may be run again at any time: what is cached is taken from the
+cache, and the lease of a stage keeps two jobs from computing it twice.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from gsbake.batch.captures import BatchOptions, CapturePlan, identifier
+from gsbake.batch.estimate import Estimate, History
+from gsbake.pipeline.plan import StageState
+
+#: Expected seconds below which a job takes the next stage too: starting a job costs some seconds.
+PACK_SECONDS = 120.0
+#: A job's time limit is this many times the expected time, and at least the minutes below.
+_LIMIT_FACTOR, _LEAST_MINUTES = 3.0, 10
+
+
+@dataclass(frozen=True)
+class Job:
+    """One job: the `stages` of a capture, the command, the jobs it `needs`, and resources; `minutes` is a limit, `seconds` expected."""
+
+    id: str
+    capture: str
+    photos: str
+    out: str
+    stages: tuple[str, ...]
+    command: tuple[str, ...]
+    needs: tuple[str, ...]
+    threads: int
+    memory_mb: int
+    seconds: float
+    minutes: int
+
+    def document(self) -> dict[str, Any]:
+        """The job as JSON."""
+        return asdict(self)
+
+
+def make_jobs(
+    plans: Sequence[CapturePlan], options: BatchOptions, history: History, threads: int, pack_seconds: float = PACK_SECONDS
+) -> list[Job]:
+    """The jobs of all captures that are neither done nor failed; a job's dependencies come before it."""
+    jobs: list[Job] = []
+    for index, plan in enumerate(plans):
+        if plan.error or plan.done:
+            continue
+        states = plan.to_run or plan.states[-1:]  # nothing to compute: the last stage publishes the results
+        estimates = {s.name: history.estimate(s.name, plan.photo_set, s.settings, threads) for s in states}
+        earlier: tuple[str, ...] = ()
+        for group in _pack(states, estimates, pack_seconds):
+            target = group[-1].name
+            seconds = sum(estimates[state.name].seconds for state in group)
+            job = Job(
+                id=f"{identifier(index, plan.name)}_{target}",
+                capture=plan.name,
+                photos=str(plan.photos),
+                out=str(plan.out),
+                stages=tuple(state.name for state in group),
+                command=stage_command(target, plan, options, threads),
+                needs=earlier,
+                threads=threads,
+                memory_mb=max(estimates[state.name].memory_mb for state in group),
+                seconds=round(seconds, 1),
+                minutes=max(_LEAST_MINUTES, math.ceil(_LIMIT_FACTOR * seconds / 60)),
+            )
+            jobs.append(job)
+            earlier = (job.id,)
+    return jobs
+
+
+def stage_command(target: str, plan: CapturePlan, options: BatchOptions, threads: int) -> tuple[str, ...]:
+    """The command that brings a capture's stages up to `target` up to date; every job names all options, so none depends on another."""
+    words = ["gsbake", target, str(plan.photos), "--out", str(plan.out), "--profile", options.profile, "--seed", str(options.seed)]
+    for override in options.overrides:
+        words += ["--set", override]
+    words += ["--threads", str(threads), "--quiet"]
+    return tuple(words + (["--store", options.store] if options.store else []))
+
+
+def _pack(states: Sequence[StageState], estimates: Mapping[str, Estimate], pack_seconds: float) -> list[list[StageState]]:
+    """Consecutive stages in groups: a group takes stages until it is expected to last `pack_seconds`; a short last group joins the one
+    before."""
+    groups: list[list[StageState]] = [[]]
+    for state in states:
+        if groups[-1] and sum(estimates[s.name].seconds for s in groups[-1]) >= pack_seconds:
+            groups.append([])
+        groups[-1].append(state)
+    if len(groups) > 1 and sum(estimates[s.name].seconds for s in groups[-1]) < pack_seconds:
+        groups[-2] += groups.pop()
+    return groups
