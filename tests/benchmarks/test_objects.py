@@ -1,14 +1,19 @@
-"""The procedural test models: textures hold the materials that the procedures define."""
+"""Objects with known materials: textures hold what the procedures define, the list is complete, rows are kept."""
 
 from __future__ import annotations
 
 import io
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
 
+from benchmarks.objects.__main__ import Row, markdown, read_rows, write_rows
+from benchmarks.objects.entries import read_entries
 from benchmarks.objects.models import MODELS, Material, model_glb
+from gsbake.errors import BadInputError
 from gsbake.imaging.srgb import decode
 
 
@@ -49,3 +54,53 @@ def test_models_have_valid_materials(name: str) -> None:
     assert material.roughness.min() >= 0.05 and material.roughness.max() <= 1
     assert material.metallic.min() >= 0 and material.metallic.max() <= 1
     assert mesh.is_winding_consistent and mesh.volume > 0
+
+
+def test_the_list_is_complete_and_reproducible(tmp_path: Path) -> None:
+    """Ten objects with the kinds of material that the fit must tell apart; what the photos depend on is in the key of a render."""
+    entries = read_entries()
+    assert len(entries) >= 10
+    metals = [entry.metal for entry in entries.values()]
+    assert metals.count("neutral") + metals.count("coloured") >= 3 and metals.count("none") >= 3
+    assert all(entry.model in MODELS or entry.sha256 for entry in entries.values())
+    vase = entries["brass_vase"]
+    assert replace(vase, seed=1).key != vase.key and replace(vase, light="forest").key != vase.key
+    assert replace(vase, licence="other").key == vase.key
+    (tmp_path / "assets").mkdir()
+    (tmp_path / vase.model).write_bytes(b"another file")
+    with pytest.raises(BadInputError, match="SHA-256"):
+        vase.model_bytes(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [('colour = "red"', "unknown key colour"), ('relight = ["city", "forest"]', "relit by the light of its photos"), ("", "not complete")],
+)
+def test_wrong_entries_are_named(tmp_path: Path, line: str, message: str) -> None:
+    """A key that is not known, an object relit by the light of its photos, and a missing key."""
+    listed = tmp_path / "objects.toml"
+    defaults = 'mode = "posed"\nviews = 4\nresolution = [8, 8]\nsamples = 1\ntest_views = 1\ntest_resolution = 8\nseed = 0\n'
+    own = 'model = "toy"\nlight = "city"\n' + ("" if message == "not complete" else 'metal = "none"\n')
+    own += line if line.startswith("relight") else f'relight = ["forest"]\n{line}'
+    listed.write_text(f"[defaults]\n{defaults}[objects.thing]\n{own}\n")
+    with pytest.raises(BadInputError, match=message):
+        read_entries(listed)
+
+
+def row(name: str, relit: float, commit: str = "a") -> Row:
+    return Row(name, "none", "relight", "", 0, commit, "cpu", 100.0, 0.1, 5.0, relit, relit + 1, 20.0, 21.0, 0.1, 0.2, "1.00 1.10 0.90")
+
+
+def test_rows_survive_the_file_and_replace_their_like(tmp_path: Path) -> None:
+    """A measured row replaces that of the same object and commit, and no other."""
+    path = tmp_path / "rows.csv"
+    write_rows(path, [row("toy", 20.0), row("vase", 22.0), row("toy", 24.0, "b"), row("toy", 26.0)])
+    found = read_rows(path)
+    assert sorted((r.object, r.commit, r.relit) for r in found) == [("toy", "a", 26.0), ("toy", "b", 24.0), ("vase", "a", 22.0)]
+    assert found[0].seed == 0 and found[0].gains == "1.00 1.10 0.90"
+
+
+def test_the_table_ends_with_medians() -> None:
+    """Three objects: the middle one's figure, not the mean."""
+    last = markdown([row("a", 10.0), row("b", 20.0), row("c", 60.0)]).splitlines()[-1]
+    assert "**median**" in last and "20.0 (21.0)" in last
