@@ -7,12 +7,14 @@ The output folder stores photos, profile and settings; later calls may give the 
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from gsbake.capture.sources import PHOTO_FOLDERS, discover, list_masks, list_photos
+from gsbake.capture.masks.weights import resolve_network
+from gsbake.capture.sources import PHOTO_FOLDERS, discover, list_masks, source_files
 from gsbake.config.load import DEFAULT, LoadedProfile, load_profile
 from gsbake.config.schema import Profile
 from gsbake.errors import BadInputError, UsageError
@@ -22,6 +24,8 @@ from gsbake.pipeline.files import disk_error
 from gsbake.pipeline.machine import default_threads, resolve_device
 from gsbake.pipeline.plan import Request, StageState
 from gsbake.pipeline.project import Project
+from gsbake.pipeline.registry import Registry
+from gsbake.pipeline.shared_store import open_shared_store
 from gsbake.pipeline.store import Store
 from gsbake.publish import publish_results
 from gsbake.stages import REGISTRY
@@ -38,6 +42,7 @@ class RunOptions:
     """Options of a run; None stands for the value stored in the output folder, else the default.
 
     `overrides` are settings as "section.key=value", added to the stored ones; `threads` = 0 uses the physical cores.
+    `store` names a shared store, a folder or URL, which is not stored; None takes the variable GSBAKE_STORE.
     """
 
     photos: Path | None = None
@@ -49,22 +54,25 @@ class RunOptions:
     device: str = "auto"
     threads: int = 0
     seed: int | None = None
+    store: str | None = None
 
 
 @dataclass(frozen=True)
 class Session:
-    """A run ready to start: the engine, the stored options (`project`), the profile and the output folder."""
+    """A run ready to start: the engine, the stored options (`project`), the profile, the output folder and the shared store."""
 
     engine: Engine
     project: Project
     profile: LoadedProfile
     out: Path
+    store: str | None = None  # shared store, a folder or URL
 
     def run(self, target: str | None = None) -> Result:
         """Bring the stages up to `target` (None: all) up to date and publish the results in the output folder.
 
         Raises what `Engine.run` raises.
         """
+        self.engine.shared = open_shared_store(self.store)
         try:
             states = self.engine.run(target, on_accepted=lambda: self.project.save(self.out))
             digests = self.engine.store.digests
@@ -113,6 +121,7 @@ def run(
     device: str = "auto",
     threads: int = 0,
     seed: int | None = None,
+    store: str | Path | None = None,
     observer: Observer | None = None,
 ) -> Result:
     """Bake an asset from a folder of photos, or bring an earlier run in `out` up to date; returns the results.
@@ -128,6 +137,7 @@ def run(
     device: "auto", "cpu" or "cuda".
     threads: number of threads, at most 512; 0 uses the physical cores.
     seed: seed of all random numbers, 0 to 2**31 − 1; default 0.
+    store: shared store, a folder or URL (file, s3, sftp); default: the environment variable GSBAKE_STORE, else none.
     observer: receives progress, decisions and warnings.
 
     Raises
@@ -135,12 +145,14 @@ def run(
     UsageError, BadInputError or InterruptedRun (`gsbake.errors`), each with one sentence that says what to do.
     """
     overrides = [f"{key}={value if isinstance(value, str) else json.dumps(value)}" for key, value in (settings or {}).items()]
-    options = RunOptions(_path(photos), _path(out), profile, overrides, _path(masks), _path(poses), device, threads, seed)
+    options = RunOptions(_path(photos), _path(out), profile, overrides, _path(masks), _path(poses), device, threads, seed, _store(store))
     return open_session(options, observer).run(target)
 
 
-def open_session(options: RunOptions, observer: Observer | None = None) -> Session:
+def open_session(options: RunOptions, observer: Observer | None = None, registry: Registry | None = None) -> Session:
     """Merge the options with those stored in the output folder; nothing is written.
+
+    `registry` holds other stages than gsbake's own.
 
     With `photos` the stored options are discarded; without it they hold and the given ones are added. Raises UsageError when photos are
     neither given nor stored, and for a seed or a number of threads out of range.
@@ -161,6 +173,8 @@ def open_session(options: RunOptions, observer: Observer | None = None) -> Sessi
     last = {text.partition("=")[0].strip(): text for text in [*project.overrides, *options.overrides]}
     name = next(name for name in (options.profile, project.profile, DEFAULT) if name is not None)
     profile = load_profile(name, list(last.values()))
+    if options.masks is not None and profile.profile.ingest.masks == "ignore":
+        raise UsageError("Masks are given, but ingest.masks is ignore, which uses none; set it to auto.")
     if Path(name).is_file():
         name = str(Path(name).resolve())
     seed = project.seed if options.seed is None else options.seed
@@ -179,7 +193,8 @@ def open_session(options: RunOptions, observer: Observer | None = None) -> Sessi
         threads=options.threads or default_threads(),
         source_names=_source_names(sources),
     )
-    return Session(Engine(REGISTRY, request, observer), project, profile, out)
+    store = options.store or os.environ.get("GSBAKE_STORE") or None
+    return Session(Engine(registry or REGISTRY, request, observer), project, profile, out, store)
 
 
 def open_store(out: Path | None) -> tuple[Store, tuple[str, ...]]:
@@ -191,14 +206,15 @@ def open_store(out: Path | None) -> tuple[Store, tuple[str, ...]]:
 
 
 def _with_resolved_tools(profile: Profile) -> Profile:
-    """The profile with the library that decimates here instead of "auto": an artifact's key must not hide what is installed."""
+    """The profile with what decimates and what makes masks here instead of "auto": an artifact's key must not hide what is installed."""
     mesh = profile.mesh.model_copy(update={"decimator": resolve_decimator(profile.mesh.decimator)})
-    return profile.model_copy(update={"mesh": mesh})
+    ingest = profile.ingest.model_copy(update={"mask_network": resolve_network(profile.ingest.mask_network)})
+    return profile.model_copy(update={"mesh": mesh, "ingest": ingest})
 
 
 def _source_names(sources: dict[str, Path]) -> dict[str, list[str]]:
     """Names of the input files in the folders of photos and masks."""
-    names = {"photos": [path.relative_to(sources["photos"]).as_posix() for path in list_photos(sources["photos"])]}
+    names = {"photos": source_files(sources["photos"])}
     if "masks" in sources and sources["masks"].is_dir():
         names["masks"] = list_masks(sources["masks"])
     return names
@@ -208,13 +224,19 @@ def _default_out(photos: Path | None) -> Path:
     """out/<name of photos>, or the only run in out/. Raises UsageError."""
     if photos is not None:
         folder = photos.resolve()
-        return Path("out") / (folder.parent.name if folder.name in PHOTO_FOLDERS else folder.name)
+        return Path("out") / (folder.parent.name if folder.name in PHOTO_FOLDERS else folder.stem if folder.is_file() else folder.name)
     runs = sorted(path.parent for path in Path("out").glob("*/project.json"))
     if len(runs) == 1:
         return runs[0]
     if not runs:
         raise UsageError("There is no run in ./out yet: give the folder of photos, or name the run with --out.")
     raise UsageError(f"There are {len(runs)} runs in ./out ({', '.join(p.name for p in runs[:5])}…): name one with --out.")
+
+
+def _store(store: str | Path | None) -> str | None:
+    if store == "":
+        raise UsageError("The shared store's name is empty.")
+    return None if store is None else str(store)
 
 
 def _text(path: Path | None) -> str | None:

@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 
 from gsbake import __version__
+from gsbake.cli.file_commands import file_app
 from gsbake.cli.options import (
     Device,
     DeviceOption,
@@ -24,6 +25,7 @@ from gsbake.cli.options import (
     QuietOption,
     SeedOption,
     SetOption,
+    StoreOption,
     ThreadsOption,
     VerboseOption,
     complete_profile,
@@ -87,6 +89,7 @@ def _pipeline_command(target: str | None) -> Callable[..., None]:
         device: DeviceOption = Device.auto,
         threads: ThreadsOption = 0,
         seed: SeedOption = None,
+        store: StoreOption = None,
         dry_run: DryRunOption = False,
         quiet: QuietOption = False,
         verbose: VerboseOption = False,
@@ -94,10 +97,11 @@ def _pipeline_command(target: str | None) -> Callable[..., None]:
     ) -> None:
         from gsbake.cli.run import run_pipeline
 
+        mask_settings = (*(masks.settings if masks else ()), *(INVERTED if invert_masks else ()))
         options = Options(
-            photos=photos, out=out, profile=profile, overrides=[*(overrides or []), *(INVERTED if invert_masks else ())], masks=masks,
-            poses=poses, device=device.value, threads=threads, seed=seed,
-            dry_run=dry_run, quiet=quiet, verbose=verbose, as_json=as_json,
+            photos=photos, out=out, profile=profile, overrides=[*(overrides or []), *mask_settings],
+            masks=masks.folder if masks else None, poses=poses, device=device.value, threads=threads, seed=seed,
+            dry_run=dry_run, quiet=quiet, verbose=verbose, as_json=as_json, store=store,
         )  # fmt: skip
         run_pipeline(options, target)
 
@@ -164,24 +168,119 @@ def replace_command(
     replace(Options(out=out, dry_run=dry_run, quiet=quiet, as_json=as_json), stage, files or [], undo)
 
 
+@app.command("masks")
+def masks_command(
+    folder: Annotated[Path, typer.Argument(parser=given_path, metavar="DIR", help="New folder for the masks.", show_default=False)],
+    doubtful: Annotated[bool, typer.Option("--doubtful", help="Only those that the other photos contradict.")] = False,
+    out: OutOption = None,
+    quiet: QuietOption = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Write the masks in use, to edit them and give them back with --masks."""
+    from gsbake.cli.masks import masks
+
+    masks(Options(out=out, quiet=quiet, as_json=as_json), folder, doubtful)
+
+
+CapturesArgument = Annotated[
+    list[Path], typer.Argument(parser=given_path, metavar="CAPTURES...", help="Folders of photos, or capture folders.", show_default=False)
+]
+RootOption = Annotated[
+    Path, typer.Option("--out", "-o", parser=given_path, metavar="DIR", help="Folder with one output folder per capture.")
+]
+BatchProfileOption = Annotated[
+    str, typer.Option("--profile", "-p", metavar="NAME|FILE", help="Profile of all captures.", autocompletion=complete_profile)
+]
+BatchSeedOption = Annotated[int, typer.Option("--seed", help="Seed of all random numbers, 0 to 2147483647.")]
+
+
+@app.command("plan")
+def plan_command(
+    captures: CapturesArgument,
+    out: RootOption = Path("out"),
+    profile: BatchProfileOption = "relight",
+    overrides: SetOption = None,
+    threads: ThreadsOption = 0,
+    seed: BatchSeedOption = 0,
+    store: StoreOption = None,
+    form: Annotated[
+        str | None,
+        typer.Option(
+            "--emit", metavar="FORMAT", help="Print the jobs for a scheduler: json, sh, snakemake, slurm, opencue or openjd.",
+            show_default=False,
+        ),
+    ] = None,
+) -> None:  # fmt: skip
+    """Show the jobs that bring captures up to date, with dependencies, time and memory; nothing is run."""
+    from gsbake.batch.captures import BatchOptions
+    from gsbake.cli.batch import plan
+
+    plan(captures, BatchOptions(out, profile, tuple(overrides or ()), threads, seed, store), form)
+
+
+@app.command("batch")
+def batch_command(
+    captures: Annotated[
+        list[Path],
+        typer.Argument(
+            parser=given_path, metavar="CAPTURES...|status", show_default=False,
+            help="Folders of photos, or capture folders; or the word status, which shows how far the batch in DIR is.",
+        ),
+    ],
+    out: RootOption = Path("out"),
+    profile: BatchProfileOption = "relight",
+    executor: Annotated[str, typer.Option("--executor", metavar="local|slurm", help="Where the jobs run.")] = "local",
+    overrides: SetOption = None,
+    threads: ThreadsOption = 0,
+    seed: BatchSeedOption = 0,
+    store: StoreOption = None,
+    jobs: Annotated[int, typer.Option("--jobs", min=1, max=100_000, help="Most jobs in Slurm's queue at a time.")] = 100,
+    retry_failed: Annotated[bool, typer.Option("--retry-failed", help="Run captures again that failed with the same input.")] = False,
+    quiet: QuietOption = False,
+    as_json: JsonOption = False,
+) -> None:  # fmt: skip
+    """Bake many captures on this machine or with Slurm, through Snakemake; the same command goes on where it stopped."""
+    from gsbake.batch.captures import BatchOptions
+    from gsbake.cli import batch
+
+    options = BatchOptions(out, profile, tuple(overrides or ()), threads, seed, store)
+    if captures == [Path("status")]:
+        batch.status(out, as_json)
+    else:
+        batch.batch(captures, options, executor, retry_failed=retry_failed, workers=jobs, quiet=quiet, as_json=as_json)
+
+
 cache_app = typer.Typer(
-    help="Check or clean the stored outputs of an output folder.", no_args_is_help=True, rich_markup_mode=None,
+    help="List, check or clean the stored outputs of an output folder or of a shared store.", no_args_is_help=True, rich_markup_mode=None,
     context_settings={"help_option_names": ["-h", "--help"]},
 )  # fmt: skip
 app.add_typer(cache_app, name="cache")
 
 
-@cache_app.command("verify")
-def cache_verify_command(out: OutOption = None, quiet: QuietOption = False, as_json: JsonOption = False) -> None:
-    """Read every stored file again and compare it with its digest."""
-    from gsbake.cli.cache import verify
+@cache_app.command("ls")
+def cache_ls_command(out: OutOption = None, store: StoreOption = None, as_json: JsonOption = False) -> None:
+    """List the stored outputs, least recently used first."""
+    from gsbake.cli import cache, shared_cache
 
-    verify(Options(out=out, quiet=quiet, as_json=as_json))
+    options = Options(out=out, store=store, as_json=as_json)
+    (cache if store is None else shared_cache).list_outputs(options)
+
+
+@cache_app.command("verify")
+def cache_verify_command(
+    out: OutOption = None, store: StoreOption = None, quiet: QuietOption = False, as_json: JsonOption = False
+) -> None:  # fmt: skip
+    """Read every stored file again and compare it with its digest."""
+    from gsbake.cli import cache, shared_cache
+
+    options = Options(out=out, store=store, quiet=quiet, as_json=as_json)
+    (cache if store is None else shared_cache).verify(options)
 
 
 @cache_app.command("gc")
 def cache_gc_command(
     out: OutOption = None,
+    store: StoreOption = None,
     keep: Annotated[
         str | None, typer.Option("--keep", metavar="SIZE", help="Keep at most this much, such as 20GB.", show_default=False)
     ] = None,
@@ -193,9 +292,23 @@ def cache_gc_command(
     as_json: JsonOption = False,
 ) -> None:
     """Delete outputs of old settings, checkpoints and files of killed runs; your replacements are kept."""
-    from gsbake.cli.cache import collect_garbage
+    from gsbake.cli import cache, shared_cache
 
-    collect_garbage(Options(out=out, dry_run=dry_run, quiet=quiet, as_json=as_json), keep, older)
+    options = Options(out=out, store=store, dry_run=dry_run, quiet=quiet, as_json=as_json)
+    (cache if store is None else shared_cache).collect_garbage(options, keep, older)
+
+
+@cache_app.command("quota")
+def cache_quota_command(
+    size: Annotated[str, typer.Argument(metavar="SIZE|none", help="Most bytes that machines may put into the store, such as 500GB.")],
+    store: StoreOption = None,
+    quiet: QuietOption = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Limit the size of a shared store; a machine that finds it full keeps its outputs to itself."""
+    from gsbake.cli.shared_cache import set_quota
+
+    set_quota(Options(store=store, quiet=quiet, as_json=as_json), size)
 
 
 @app.command("profiles")
@@ -244,3 +357,6 @@ def synth_command(
     from gsbake.cli.synth import synth
 
     synth(folder, views=views, size=size, seed=seed, poses=poses, background=background, dry_run=dry_run, quiet=quiet, as_json=as_json)
+
+
+app.add_typer(file_app)

@@ -1,11 +1,12 @@
-"""`gsbake cache verify` and `gsbake cache gc`: check stored artifacts and delete unused ones."""
+"""`gsbake cache ls`, `verify` and `gc` of an output folder: list and check stored artifacts and delete unused ones."""
 
 from __future__ import annotations
 
 import re
+import time
 
 from gsbake.cli.options import Options
-from gsbake.cli.output import print_json, print_text
+from gsbake.cli.output import print_json, print_table, print_text
 from gsbake.errors import BadInputError, UsageError
 from gsbake.text import size
 
@@ -27,6 +28,23 @@ def parse_age(text: str) -> float:
     if not found:
         raise UsageError(f"--older takes an age such as 12h, 30d or 2w, not '{text}'.")
     return float(found.group(1)) * _AGE_UNITS[found.group(2)]
+
+
+def list_outputs(options: Options) -> None:
+    """Print everything that the garbage collection may delete."""
+    from gsbake.api import open_store
+    from gsbake.pipeline.garbage import list_entries
+
+    store, stages = open_store(options.out)
+    entries = sorted(list_entries(store, stages), key=lambda e: e.used)
+    if options.as_json:
+        rows = [{"path": str(e.path), "stage": e.stage, "kind": e.kind, "bytes": e.size, "used": e.used} for e in entries]
+        print_json({"out": str(store.out), "entries": rows, "bytes": sum(e.size for e in entries)}, indent=None)
+        return
+    print_table(
+        ("stage", "kind", "name", "size", "last used"),
+        [(e.stage, e.kind, e.path.name, size(e.size), time.strftime("%Y-%m-%d %H:%M", time.localtime(e.used))) for e in entries],
+    )
 
 
 def verify(options: Options) -> None:

@@ -43,6 +43,10 @@ def complete_stage(incomplete: str) -> list[str]:
     return [name for name in REGISTRY.names if name.startswith(incomplete)]
 
 
+#: {choice of `--masks` that is no folder: ingest.masks}.
+MASK_CHOICES = {"auto": "auto", "none": "ignore"}
+
+
 def given_path(text: str) -> Path:
     """The path that an argument names. An empty one, such as an unset variable of a shell gives, is refused: for Python it is "."."""
     if not str(text):
@@ -50,12 +54,27 @@ def given_path(text: str) -> Path:
     return Path(text)
 
 
+@dataclass(frozen=True)
+class Masks:
+    """Value of `--masks`: a folder, or settings that say where masks come from."""
+
+    folder: Path | None = None
+    settings: tuple[str, ...] = ()
+
+
+def given_masks(text: str) -> Masks:
+    """The masks that an argument names; `./none` is a folder of that name."""
+    if text in MASK_CHOICES:
+        return Masks(settings=(f"ingest.masks={MASK_CHOICES[text]}",))
+    return Masks(given_path(text))
+
+
 PhotosArgument = Annotated[
     Path | None,
     typer.Argument(
         parser=given_path,
         metavar="PHOTOS",
-        help="Folder of photos, or a capture folder with images/, masks/ and poses. Needed in the first run only.",
+        help="Folder of photos, a capture folder with images/, masks/ and poses, or a video. Needed in the first run only.",
         show_default=False,
     ),
 ]
@@ -79,8 +98,14 @@ SetOption = Annotated[
     ),
 ]
 MasksOption = Annotated[
-    Path | None,
-    typer.Option("--masks", parser=given_path, metavar="DIR", help="Masks, one per photo, white on the object.", show_default=False),
+    Masks | None,
+    typer.Option(
+        "--masks",
+        parser=given_masks,
+        metavar="auto|none|DIR",
+        help="Masks, one per photo, white on the object. auto: those of the capture, the missing ones are made; none: use none.",
+        show_default=False,
+    ),
 ]
 PosesOption = Annotated[
     Path | None,
@@ -88,7 +113,7 @@ PosesOption = Annotated[
         "--poses",
         parser=given_path,
         metavar="PATH",
-        help="Known poses: transforms.json, a COLMAP model folder or poses_bounds.npy.",
+        help="Known poses: transforms.json, a COLMAP model folder, poses_bounds.npy, or Metashape's cameras as XML.",
         show_default=False,
     ),
 ]
@@ -100,6 +125,13 @@ ThreadsOption = Annotated[
 SeedOption = Annotated[
     int | None, typer.Option("--seed", help="Seed of all random numbers, 0 to 2147483647.  [default: 0]", show_default=False)
 ]
+StoreOption = Annotated[
+    str | None,
+    typer.Option(
+        "--store", metavar="DIR|URL", envvar="GSBAKE_STORE", help="Shared store beside the output folder: a folder, s3:// or sftp://.",
+        show_default=False, show_envvar=True,
+    ),
+]  # fmt: skip
 DryRunOption = Annotated[bool, typer.Option("--dry-run", "-n", help="Print what would run, and why; run nothing.")]
 QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="Print warnings and errors only.")]
 VerboseOption = Annotated[bool, typer.Option("--verbose", "-v", help="Print every decision with its evidence.")]
@@ -123,12 +155,14 @@ class Options:
     quiet: bool = False
     verbose: bool = False
     as_json: bool = False
+    store: str | None = None
 
     def session(self, observer: Observer | None = None) -> Session:
         """Session of the run that the options describe; nothing is written."""
         from gsbake.api import RunOptions, open_session
 
         run = RunOptions(
-            self.photos, self.out, self.profile, self.overrides, self.masks, self.poses, self.device, self.threads, self.seed
+            self.photos, self.out, self.profile, self.overrides, self.masks, self.poses, self.device, self.threads, self.seed,
+            self.store,
         )  # fmt: skip
         return open_session(run, observer)

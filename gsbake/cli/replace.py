@@ -39,7 +39,7 @@ def _replace(options: Options, session: Session, stage: str, paths: list[Path], 
             undo_replacement(store, stage)
         _print_result(options, {"stage": stage, "undone": True}, f"{stage}: its own output is used again")
         return
-    base = _current_output(session, stage)
+    base = current_output(session, stage)
     files = _replacement_files(stage, paths, base)
     if options.dry_run:
         _print_result(options, {"stage": stage, "would_replace": sorted(files)}, f"{stage}: would replace {', '.join(sorted(files))}")
@@ -52,7 +52,7 @@ def _replace(options: Options, session: Session, stage: str, paths: list[Path], 
     )
 
 
-def _current_output(session: Session, stage: str) -> Artifact | None:
+def current_output(session: Session, stage: str) -> Artifact | None:
     """The stage's present output: the replacement, else the cached artifact, else the newest one; None without any."""
     replacement = session.engine.store.replacement(stage)
     if replacement is not None:

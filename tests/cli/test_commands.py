@@ -210,6 +210,18 @@ def test_invert_masks_is_a_setting(run: Run, capture: Path, tmp_path: Path) -> N
     assert next((tmp_path / "o").glob("stages/ingest/*/photos.json")).read_text().endswith("TrueTrue")
 
 
+def test_masks_none_and_auto_are_settings(run: Run, capture: Path, tmp_path: Path) -> None:
+    (tmp_path / "none").mkdir()
+    for choice, setting in (("none", "ignore"), ("auto", "auto")):
+        run("ingest", capture, "--out", choice + "-out", "--masks", choice)
+        project = json.loads((tmp_path / f"{choice}-out" / "project.json").read_text())
+        assert project["overrides"] == [f"ingest.masks={setting}"] and project["masks"] == str(capture / "masks")
+    run("ingest", capture, "--out", "folder", "--masks", "./none")
+    assert json.loads((tmp_path / "folder" / "project.json").read_text())["masks"] == str(tmp_path / "none")
+    end = run("ingest", "--out", "none-out", "--masks", "./none")
+    assert end.code == 2 and "ingest.masks is ignore" in end.err
+
+
 def test_profiles_are_listed_and_shown(run: Run) -> None:
     assert set(run("profiles", "--json").json) == {"smoke", "preview", "relight", "quality", "scan"}
     shown = run("profiles", "smoke", "--set", "mesh.faces=123", "--json").json

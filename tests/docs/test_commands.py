@@ -16,6 +16,7 @@ import pytest
 
 from gsbake.cli import main
 from tests.docs import toy_stages
+from tests.support.gltf_files import write_ball
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = sorted(
@@ -66,6 +67,8 @@ def prepared(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with pytest.MonkeyPatch.context() as monkeypatch:
         monkeypatch.chdir(folder)
         assert _call(["run", "photos", "--out", "out/tankard", "--quiet"], monkeypatch) == 0
+    for name in ("asset.glb", "before.glb", "after.glb"):
+        write_ball(folder / name, (40, 160, 60))
     return folder
 
 
@@ -87,7 +90,7 @@ def check(line: str, gsbake: Run) -> str | None:
     words = shlex.split(line)
     program, arguments = words[0], words[1:]
     if program == "gsbake":
-        if arguments[0] == "synth":  # the pages' sizes take seconds
+        if arguments[0] in ("synth", "render", "compare"):  # the pages' sizes take seconds
             arguments = [*arguments, "--views", "3", "--size", "16"]
         code = gsbake(arguments)
         return None if code == 0 else f"exit code {code}"

@@ -2,19 +2,26 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
+
+from gsbake.imaging.png import write_png
 from gsbake.pipeline.registry import Registry
 from gsbake.pipeline.stage import Context
 from gsbake.stages import ORDER
 from gsbake.stages import REGISTRY as REAL
 
+#: What `gsbake masks` reads: one photo with an automatic mask.
+PHOTOS = {"photos": [{"name": "a", "source": "a.jpg", "source_width": 8, "source_height": 6, "mask": None}], "skipped": []}
+
 #: What each stage writes.
 FILES = {
     "ingest": ("photos.json",),
-    "poses": ("cameras.json", "points.ply"),
+    "poses": ("cameras.json", "points.ply", "photo_masks/a.png"),
     "stereo": ("points.ply",),
     "train": ("surfels.safetensors",),
     "refine": ("surfels.safetensors",),
@@ -29,8 +36,14 @@ def _toy(name: str) -> Callable[[Context], dict[str, Any]]:
     def run(ctx: Context) -> dict[str, Any]:
         for file in FILES[name]:
             head = "ply\n" if file.endswith(".ply") else ""
-            (ctx.out / file).write_text(f"{head}{name} {file}")
-        return {}
+            (ctx.out / file).parent.mkdir(exist_ok=True)
+            if file == "photos.json":
+                (ctx.out / file).write_text(json.dumps(PHOTOS))
+            elif file.endswith(".png"):
+                write_png(ctx.out / file, np.full((6, 8), 255, np.uint8))
+            else:
+                (ctx.out / file).write_text(f"{head}{name} {file}")
+        return {"doubtful_masks": ["a"]} if name == "poses" else {}
 
     return run
 
