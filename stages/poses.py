@@ -19,7 +19,7 @@ def run(ctx: Context) -> dict[str, Any]:
 
 STAGE = Stage(
     name="poses",
-    version=7,
+    version=8,
     title="Camera poses",
     run=run,
     summary="{registered} photos registered, {points} tie points, {reprojection_px:px} reprojection error",

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import re
 import selectors
 import signal
 import subprocess
@@ -18,6 +17,8 @@ from typing import Any
 from gsbake.errors import GsbakeError, InterruptedRun
 from gsbake.python_process import python_command, python_environment
 
+#: Work is split between pairs and photos, so the matrix library's own threads would only get in the way.
+_ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
 #: Seconds between checks for stop requests.
 _POLL_SECONDS = 0.2
 
@@ -61,11 +62,10 @@ class _LogProgress:
             text = file.read()
         text = text[: text.rfind(b"\n") + 1]
         self._offset += len(text)
-        if self._part == "features":
-            self._files += text.count(b"Processed file [")
-            return (self._part, min(self._files, self._total), self._total) if text else None
-        blocks = re.findall(rb"Processing block \[(\d+)/(\d+)\]", text) if self._part == "matching" else []
-        return (self._part, int(blocks[-1][0]) - 1, int(blocks[-1][1])) if blocks else None
+        if self._part != "features" or not text:
+            return None
+        self._files += text.count(b"Processed file [")
+        return self._part, min(self._files, self._total), self._total
 
 
 def _last_line(log: Path) -> str:
@@ -86,9 +86,10 @@ def run_job(job: Mapping[str, Any], out: Path, callbacks: JobCallbacks, limit: f
     log_progress = _LogProgress(log)
     deadline = None if limit is None else time.monotonic() + limit
     command = python_command("-m", "gsbake.capture.sfm.worker", str(job_file), str(os.getpid()))
+    environment = python_environment(_ONE_THREAD)
     with log.open("wb") as sink:
         child = subprocess.Popen(
-            command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=sink, env=python_environment(), start_new_session=True
+            command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=sink, env=environment, start_new_session=True
         )
     try:
         assert child.stdout is not None

@@ -1,8 +1,8 @@
 """Structure from motion with COLMAP (Schönberger, Frahm, *Structure-from-Motion Revisited*, CVPR 2016) on one database.
 
-Steps: SIFT features, pair selection, matching, mapping in two passes. The first pass uses strict thresholds; photos that it does not
-register are matched with all others and registered to its model under relaxed thresholds. Runs in the process of `sfm.worker`. The same
-photos and seed give the same bytes with any number of threads.
+Steps: SIFT features, pair selection, matching (`sfm.matching`), verification of matches by two-view geometry, mapping in two passes. The
+first pass uses strict thresholds; photos that it does not register are matched with all others and registered to its model under relaxed
+thresholds. Runs in the process of `sfm.worker`. The same photos and seed give the same bytes with any number of threads.
 """
 
 from __future__ import annotations
@@ -13,13 +13,16 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gsbake.capture.sfm import pairs as pairing
 from gsbake.capture.sfm.colmap import pycolmap
+from gsbake.capture.sfm.matching import match_pairs
 
 Tick = Callable[[str, int, int], None]
 
@@ -29,8 +32,8 @@ RELAXED_MIN_INLIERS, RELAXED_MIN_INLIER_RATIO = 15, 0.15
 RANKING_FEATURES = 256
 #: Median features per photo from which the finest octave is skipped, and the share of unregistered photos above which it is added again.
 ENOUGH_FEATURES, MAX_UNREGISTERED_SHARE = 1500, 0.05
-#: Pairs matched between two lines of COLMAP's log, from which progress is read.
-MATCHING_BLOCK = 64
+#: Photos whose descriptors are kept in memory while pairs are matched, about 1 MB each.
+CACHED_PHOTOS = 128
 
 
 @dataclass(frozen=True)
@@ -189,20 +192,25 @@ class SfmPipeline:
             return sorted({*pairing.sequential(count), *loops})
 
     def match(self, pairs: Sequence[pairing.Pair]) -> None:
-        """Match and geometrically verify pairs that are not in the database yet."""
+        """Match the pairs that are not in the database yet, and verify all that are not verified."""
         names = self.names
-        listing = self.work / "pairs.txt"
-        listing.write_text("".join(f"{names[i]}.png {names[j]}.png\n" for i, j in pairs))
-        options = pycolmap.FeatureMatchingOptions()
-        options.num_threads = self.threads
-        options.use_gpu = False
-        geometry = pycolmap.TwoViewGeometryOptions()
-        geometry.ransac.random_seed = self.seed
-        imported = pycolmap.ImportedPairingOptions()
-        imported.match_list_path = str(listing)
-        imported.block_size = MATCHING_BLOCK
-        with self._timed("matching", len(pairs)):
-            pycolmap.match_image_pairs(str(self.database), options, imported, geometry, pycolmap.Device.cpu)
+        with self._timed("matching", len(pairs)), closing(pycolmap.Database.open(str(self.database))) as base:
+            ids = {image.name: image.image_id for image in base.read_all_images()}
+            numbered = [(ids[f"{names[i]}.png"], ids[f"{names[j]}.png"]) for i, j in pairs]
+            missing = [pair for pair in numbered if not base.exists_matches(*pair)]
+
+            @lru_cache(maxsize=CACHED_PHOTOS)
+            def descriptors(image: int) -> NDArray[np.uint8]:
+                return np.asarray(base.read_descriptors(image).data)
+
+            for done, (pair, matches) in enumerate(match_pairs(missing, descriptors, self.threads), len(pairs) - len(missing) + 1):
+                base.write_matches(*pair, matches)
+                self.tick("matching", done, len(pairs))
+        with self._timed("verification", 1):
+            verifier, geometry = pycolmap.GeometricVerifierOptions(), pycolmap.TwoViewGeometryOptions()
+            verifier.num_threads = self.threads
+            geometry.ransac.random_seed = self.seed
+            pycolmap.geometric_verification(str(self.database), verifier, pycolmap.ExistingMatchedPairingOptions(), geometry)
 
     def _mapper(self, relaxed: bool) -> Any:
         options = pycolmap.IncrementalPipelineOptions()

@@ -70,7 +70,8 @@ def test_a_turntable_in_a_room_is_solved_from_the_object(tmp_path: Path) -> None
     assert solved.figures["masked_features"] is True and solved.figures["registered"] == len(true)
     assert monitor.decisions["features"][0] == "inside the masks"
     found = {camera.name: camera for camera in solved.cameras}
+    angles = []
     for first, second in zip(true, true[1:], strict=False):
         expected, got = first.R @ second.R.T, found[first.name].R @ found[second.name].R.T
-        angle = np.degrees(np.arccos(np.clip((np.trace(expected.T @ got) - 1) / 2, -1, 1)))
-        assert angle < 2.0, (first.name, second.name)
+        angles.append(np.degrees(np.arccos(np.clip((np.trace(expected.T @ got) - 1) / 2, -1, 1))))
+    assert np.median(angles) < 0.8 and max(angles) < 5  # of turns by 30°, from some 50 features a photo
