@@ -60,9 +60,9 @@ def estimate_poses(
     """Estimate the cameras of the photos in the artifact folder `ingest`, write the posed capture into `out`; return the figures.
 
     Written: `cameras.json` (`CameraSet`, unit frame), `photos/`, `masks/` (pinhole), `points.ply` (tie points, unit frame; may be absent),
-    `photo_masks/` (masks that were guessed, as the photos show them), `sparse/` (COLMAP binary model, input frame). `scratch` holds the
-    database of COLMAP, from which an interrupted run resumes. Raises BadInputError when too few photos register, or required poses are
-    missing.
+    `photo_masks/` (masks that were guessed, as the photos show them), `photo_cameras.json` (cameras of the photos before undistortion,
+    world frame), `sparse/` (COLMAP binary model, input frame). `scratch` holds the database of COLMAP, from which an interrupted run
+    resumes. Raises BadInputError when too few photos register, or required poses are missing.
     """
     if scratch is None:
         with tempfile.TemporaryDirectory(prefix="gsbake-poses-") as folder:
@@ -90,6 +90,7 @@ class _Estimation:
         solver = PoseSolver(self.ingest, entries, self.scratch, self.options.poses, self.seed, self.threads, monitor)
         given = self._use_given(len(entries))
         solved = solver.triangulate() if given else solver.solve()
+        CameraSet(tuple(solved.cameras), poses="given" if given else "solved").save(self.out / "photo_cameras.json")
         points, colours = read_cloud(solved.cloud) if solved.cloud.exists() else (None, None)
         with monitor.part("automatic masks"):
             automatic = self._write_automatic_masks(entries, solved.cameras)

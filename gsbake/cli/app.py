@@ -16,6 +16,8 @@ from gsbake.cli.options import (
     DryRunOption,
     InvertOption,
     JsonOption,
+    KnownDistanceOption,
+    MarkerSizeOption,
     MasksOption,
     Options,
     OutOption,
@@ -31,6 +33,7 @@ from gsbake.cli.options import (
     complete_profile,
     complete_stage,
     given_path,
+    scale_settings,
 )
 
 app = typer.Typer(
@@ -86,6 +89,8 @@ def _pipeline_command(target: str | None) -> Callable[..., None]:
         masks: MasksOption = None,
         poses: PosesOption = None,
         invert_masks: InvertOption = False,
+        known_distances: KnownDistanceOption = None,
+        marker_size: MarkerSizeOption = None,
         device: DeviceOption = Device.auto,
         threads: ThreadsOption = 0,
         seed: SeedOption = None,
@@ -98,8 +103,9 @@ def _pipeline_command(target: str | None) -> Callable[..., None]:
         from gsbake.cli.run import run_pipeline
 
         mask_settings = (*(masks.settings if masks else ()), *(INVERTED if invert_masks else ()))
+        settings = [*(overrides or []), *mask_settings, *scale_settings(known_distances, marker_size)]
         options = Options(
-            photos=photos, out=out, profile=profile, overrides=[*(overrides or []), *mask_settings],
+            photos=photos, out=out, profile=profile, overrides=settings,
             masks=masks.folder if masks else None, poses=poses, device=device.value, threads=threads, seed=seed,
             dry_run=dry_run, quiet=quiet, verbose=verbose, as_json=as_json, store=store,
         )  # fmt: skip

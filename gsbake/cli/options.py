@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass, field
 from enum import StrEnum
 from pathlib import Path
@@ -69,6 +70,32 @@ def given_masks(text: str) -> Masks:
     return Masks(given_path(text))
 
 
+def given_distance(text: str) -> str:
+    """A known distance that can be parsed."""
+    from gsbake.config.lengths import parse_known_distance
+
+    try:
+        return parse_known_distance(text).text
+    except ValueError as error:
+        raise typer.BadParameter(f"{error}.") from error
+
+
+def given_length(text: str) -> float:
+    """Metres of the length that an argument names."""
+    from gsbake.config.lengths import parse_length
+
+    try:
+        return parse_length(text)
+    except ValueError as error:
+        raise typer.BadParameter(f"{error}.") from error
+
+
+def scale_settings(known_distances: list[str] | None, marker_size: float | None) -> tuple[str, ...]:
+    """Settings of `--known-distance` and `--marker-size`."""
+    distances = (f"scale.known_distances={json.dumps(known_distances, ensure_ascii=False)}",) if known_distances else ()
+    return (*distances, *(() if marker_size is None else (f"scale.marker_size={marker_size!r}",)))
+
+
 PhotosArgument = Annotated[
     Path | None,
     typer.Argument(
@@ -104,6 +131,26 @@ MasksOption = Annotated[
         parser=given_masks,
         metavar="auto|none|DIR",
         help="Masks, one per photo, white on the object. auto: those of the capture, the missing ones are made; none: use none.",
+        show_default=False,
+    ),
+]
+KnownDistanceOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--known-distance",
+        parser=given_distance,
+        metavar="'PHOTO:X,Y PHOTO:X,Y LENGTH'",
+        help="Length between two points of the photos, as in 'A.jpg:120,80 B.jpg:640,410 8cm': the asset is in metres. Repeatable.",
+        show_default=False,
+    ),
+]
+MarkerSizeOption = Annotated[
+    float | None,
+    typer.Option(
+        "--marker-size",
+        parser=given_length,
+        metavar="LENGTH",
+        help="Edge of the printed ArUco or AprilTag markers in the photos, as in 5cm: the asset is in metres.",
         show_default=False,
     ),
 ]

@@ -39,7 +39,7 @@ def run_pipeline(options: Options, target: str | None) -> None:
 
 
 def summary_lines(result: Result, seconds: float) -> list[tuple[str, str]]:
-    """Summary lines (name, text) of a run: asset, image metrics, warnings, report and time, as far as they exist."""
+    """Summary lines (name, text) of a run: asset, size, image metrics, warnings, report and time, as far as they exist."""
     lines = []
     figures = {state.name: state.artifact.manifest.get("results", {}) for state in result.stages if state.artifact is not None}
     asset, export, report = result.files.get("asset.glb"), figures.get("export", {}), figures.get("report", {})
@@ -49,6 +49,9 @@ def summary_lines(result: Result, seconds: float) -> list[tuple[str, str]]:
         lines.append(("Asset", f"{asset}  ({size(asset.stat().st_size)}{triangles}{texture})"))
     elif result.stages and result.stages[-1].artifact is not None:
         lines.append(("Output", str(result.stages[-1].artifact.folder)))
+    if "size_metres" in export:
+        edges = " × ".join(f"{edge:.4g}" for edge in export["size_metres"])
+        lines.append(("Size", f"{edges} m (± {100 * export['scale_relative_error']:.2g} %)"))
     if report.get("psnr") is not None:
         photos = "test photos" if report.get("held_out") else "training photos"
         lines.append(("Quality", f"{report['psnr']:.1f} dB PSNR, SSIM {report['ssim']:.3f} on {report['compared']} {photos}"))

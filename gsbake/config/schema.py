@@ -11,6 +11,7 @@ from typing import Annotated, Literal
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
+from gsbake.config.lengths import parse_known_distance
 from gsbake.monitor import Rule
 
 Fraction = Annotated[float, Field(ge=0, le=1)]
@@ -29,6 +30,15 @@ def _not_every_photo(every: int) -> int:
 
 #: Every n-th photo is held out.
 HeldOut = Annotated[int, Field(ge=0, le=1000), AfterValidator(_not_every_photo)]
+
+
+def _known_distance(text: str) -> str:
+    parse_known_distance(text)
+    return text
+
+
+#: A known distance that can be parsed.
+KnownDistanceText = Annotated[str, AfterValidator(_known_distance)]
 Pruning = Literal["visibility", "sdf", "gsdf", "gaussianroom", "gs-ror2"]
 
 
@@ -180,6 +190,14 @@ class Bake(Section):
     default_roughness: Fraction = Field(0.8, description="Roughness where none is fitted (bake.materials = none or delight).")
 
 
+class Scale(Section):
+    """Metric scale of the asset."""
+
+    known_distances: tuple[KnownDistanceText, ...] = Field((), max_length=100, description="Distances between two points of the photos, as in \"A.jpg:120,80 B.jpg:640,410 8cm\": file and pixel of each point. A point that is not on the object is given in two photos or more, as in \"A.jpg:120,80+C.jpg:131,77\".")
+    marker_size: float = Field(0.0, ge=0, le=100, description="Edge length in metres of the printed ArUco or AprilTag markers in the photos; 0 looks for none.")
+    marker_dictionary: Literal["auto", "aruco-4x4", "aruco-5x5", "aruco-6x6", "aruco-7x7", "aruco-original", "apriltag-16h5", "apriltag-25h9", "apriltag-36h11"] = Field("auto", description="Dictionary of the markers; auto: the one of which most are seen.")
+
+
 class Export(Section):
     """GLB and the files beside it."""
 
@@ -226,6 +244,7 @@ class Profile(Section):
     refine: Refine = Refine()
     mesh: Mesh = Mesh()
     bake: Bake = Bake()
+    scale: Scale = Scale()
     export: Export = Export()
     report: Report = Report()
     skip: Skip = Skip()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePath
 from typing import Any
 
@@ -16,9 +16,10 @@ from safetensors.numpy import load_file
 
 from gsbake import __version__
 from gsbake.capture.posed_photos import PosedPhotos
-from gsbake.config.schema import Export
+from gsbake.config.schema import Export, Scale
 from gsbake.errors import BadInputError
 from gsbake.geometry.cameras import CameraSet, Similarity
+from gsbake.geometry.raycast import RayCaster
 from gsbake.gltf.audit import as_json, audit, failed
 from gsbake.gltf.encode import TextureMaps, encode_within_budget, quantise
 from gsbake.gltf.frame import asset_frame, transforms_json
@@ -26,6 +27,7 @@ from gsbake.gltf.write import GltfMesh, build_glb
 from gsbake.imaging.exr import read_exr, write_hdr
 from gsbake.imaging.png import encode_png
 from gsbake.monitor import SILENT, Monitor
+from gsbake.scale.measure import MetricScale, measure_scale
 
 #: Height of the exported environment map in pixels.
 LIGHT_HEIGHT = 256
@@ -42,6 +44,7 @@ class ExportOptions:
     export: Export = Export()
     materials: str = "none"
     texture_size: int = 1024
+    scale: Scale = Scale()
 
 
 def export_asset(
@@ -63,6 +66,12 @@ def export_asset(
     settings = options.export
     cameras = PosedPhotos.open(poses, surfels).cameras
     arrays = _load_mesh_arrays(baked / "mesh.safetensors")
+    with monitor.part("scale"):
+        surface = RayCaster(arrays["position"], arrays["faces"])
+        scale = measure_scale(ingest, poses, options.scale, surface, cameras.to_world, monitor=monitor)
+    if scale is not None:
+        to_world = cameras.to_world.then(Similarity(scale.metres))
+        cameras = replace(cameras, to_world=to_world, metric=True)
     frame = asset_frame(cameras, arrays["position"])
     mesh = _to_asset_frame(arrays, frame)
     if not np.isfinite(mesh.position).all():
@@ -74,7 +83,7 @@ def export_asset(
         images, level = encode_within_budget(maps, int(settings.max_megabytes * 1e6) - geometry)
     monitor.check_stop()
     with monitor.part("write"):
-        extras = _extras(options, cameras, mesh, maps)
+        extras = _extras(options, cameras, mesh, maps, scale)
         data = build_glb(mesh, images, "asset", f"gsbake {__version__}", settings.copyright, extras, maps.factors)
         (out / "asset.glb").write_bytes(data)
         (out / "cameras.json").write_text(json.dumps(transforms_json(cameras, frame, _source_file_names(ingest)), indent=1))
@@ -94,9 +103,16 @@ def export_asset(
         "image_bytes": {name: len(content or b"") for name, content in vars(images).items()},
         "precision": level.text,
         "scale": extras["scale"],
+        **({} if scale is None else _size(mesh, scale)),
         "audit_passed": passed,
         "audit_rules": rules,
     }
+
+
+def _size(mesh: GltfMesh, scale: MetricScale) -> dict[str, Any]:
+    """Figures of an asset in metres."""
+    extent = mesh.position.max(0) - mesh.position.min(0)
+    return {"size_metres": [round(float(edge), 6) for edge in extent], "scale_relative_error": scale.relative_error}
 
 
 def _audit(data: bytes, out: Path, settings: Export, monitor: Monitor) -> tuple[int, int]:
@@ -168,7 +184,7 @@ def _to_asset_frame(arrays: dict[str, NDArray[Any]], frame: Similarity) -> GltfM
     )
 
 
-def _extras(options: ExportOptions, cameras: CameraSet, mesh: GltfMesh, maps: TextureMaps) -> dict[str, Any]:
+def _extras(options: ExportOptions, cameras: CameraSet, mesh: GltfMesh, maps: TextureMaps, scale: MetricScale | None) -> dict[str, Any]:
     """The asset's extras: settings, scale, digests of its content."""
     factors = None if maps.factors is None else np.array(maps.factors, "<f8")
 
@@ -182,6 +198,7 @@ def _extras(options: ExportOptions, cameras: CameraSet, mesh: GltfMesh, maps: Te
     return {
         "profile": {"materials": options.materials, "texture_size": options.texture_size, "normal_map": maps.normal is not None},
         "scale": "metres" if cameras.metric else "unknown",
+        **({} if scale is None else {"scale_relative_error": scale.relative_error}),
         "poses": cameras.poses,
         "digests": {
             "mesh": digest(mesh.position, mesh.normal, mesh.tangent, mesh.uv, mesh.faces),

@@ -14,7 +14,7 @@ import trimesh
 from safetensors.numpy import load_file
 from scipy.spatial import cKDTree
 
-from gsbake.config.schema import Bake, Export
+from gsbake.config.schema import Bake, Export, Scale
 from gsbake.errors import BadInputError
 from gsbake.geometry.cameras import Camera, CameraSet, Similarity
 from gsbake.geometry.ply import write_mesh
@@ -104,6 +104,35 @@ def unit_points(asset: GltfAsset) -> tuple[np.ndarray, Any, np.ndarray]:
     p = texels.interpolate(asset.attributes["POSITION"], asset.faces).astype(float)
     world = np.stack([p[:, 0], -p[:, 2], p[:, 1]], 1)
     return TO_WORLD.inverse().apply(world), texels, uv
+
+
+def test_a_known_distance_makes_metres(run: Path, asset: GltfAsset, tmp_path: Path) -> None:
+    """One photo shows two points of the object, whose distance is 3 m: the asset grows by as much."""
+    cameras = CameraSet.load(run / "poses/cameras.json").cameras
+    CameraSet(tuple(c.moved(TO_WORLD) for c in cameras)).save(tmp_path / "photo_cameras.json")
+    photos = [{"name": c.name, "source": f"{c.name}.jpg", "source_width": PHOTO, "source_height": PHOTO} for c in cameras]
+    (tmp_path / "photos.json").write_text(json.dumps({"photos": photos}))
+    (tmp_path / "photos").symlink_to(run / "poses/photos")
+    CameraSet(cameras, TO_WORLD, "solved").save(tmp_path / "cameras.json")
+    camera = cameras[3]
+    points = np.stack(
+        [
+            radius(d[None])[0] * d
+            for d in (v / np.linalg.norm(v) for v in (camera.centre - 0.8 * camera.R[0], camera.centre + 0.9 * camera.R[1]))
+        ]
+    )
+    pixels, _ = camera.project(points)
+    picks = " ".join(f"{camera.name}.jpg:{x:.4f},{y:.4f}" for x, y in pixels)
+    options = ExportOptions(Export(), "none", SIZE, Scale(known_distances=(f"{picks} 3m",)))
+    (tmp_path / "out").mkdir()
+    result = export_asset(tmp_path, tmp_path, run / "refine", run / "bake", tmp_path / "out", options)
+    assert result["scale"] == "metres" and 0 < result["scale_relative_error"] < 0.05
+    factor = 3 / np.linalg.norm(TO_WORLD.scale * (points[0] - points[1]))
+    scaled = read_glb(tmp_path / "out/asset.glb")
+    extent = np.ptp(asset.attributes["POSITION"], axis=0) * factor
+    assert np.allclose(np.ptp(scaled.attributes["POSITION"], axis=0), extent, rtol=5e-3)
+    assert np.allclose(result["size_metres"], extent, rtol=5e-3)
+    assert json.loads((tmp_path / "out/cameras.json").read_text())["scale"] == "metres"
 
 
 def test_files(run: Path) -> None:

@@ -1,0 +1,1 @@
+"""Metric scale: how many metres a unit of the photos' world is."""

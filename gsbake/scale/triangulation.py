@@ -1,0 +1,109 @@
+"""Points from pixel positions in photos: least squares over viewing rays, with covariance (Hartley & Zisserman, ch. 12)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from gsbake.capture.photos.undistortion import undistort_points
+from gsbake.config.lengths import PixelPosition
+from gsbake.errors import BadInputError
+from gsbake.geometry.cameras import Array, Camera
+from gsbake.text import shortlist
+
+#: Assumed standard deviation of a pixel position that a person picked, in pixels of the working photo.
+PICK_NOISE = 1.0
+#: Smallest angle in degrees between two rays that determine a point.
+MIN_ANGLE = 2.0
+_STEPS = 10
+
+
+@dataclass(frozen=True)
+class Ray:
+    """A viewing ray: origin (3,), unit direction (3,), and the angle in radians that one pixel of the photo covers."""
+
+    origin: Array
+    direction: Array
+    pixel_angle: float
+
+
+@dataclass(frozen=True)
+class Point:
+    """A point (3,), its covariance (3, 3), and the residuals (n,) of its rays in pixels."""
+
+    position: Array
+    covariance: Array
+    residuals: Array
+
+
+def camera_rays(camera: Camera, pixels: Array) -> list[Ray]:
+    """Rays through `pixels` (n, 2) of the photo of `camera`, in the frame of its pose.
+
+    Raises BadInputError where the distortion has no inverse.
+    """
+    plane = (np.asarray(pixels, np.float64) - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
+    if any(camera.distortion):
+        plane = undistort_points(plane, camera.distortion)
+    if not np.isfinite(plane).all():
+        raise BadInputError(f"The lens distortion of photo {camera.name} cannot be inverted at a point that is measured there.")
+    directions = np.column_stack([plane, np.ones(len(plane))]) @ camera.R
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    return [Ray(camera.centre, direction, 1 / camera.fx) for direction in directions]
+
+
+@dataclass(frozen=True)
+class PickedPhotos:
+    """Cameras of the working photos by name, with distortion, and the `entries` of photos.json, which know the user's files."""
+
+    cameras: Mapping[str, Camera]
+    entries: Sequence[Mapping[str, Any]]
+
+    def ray(self, position: PixelPosition) -> Ray:
+        """The ray of a pixel position in the user's file. Raises BadInputError for a photo without a camera or a pixel outside of it."""
+        entry = self._entry(position.photo)
+        width, height = entry["source_width"], entry["source_height"]
+        if not (0 <= position.x <= width and 0 <= position.y <= height):
+            pixel, pixels = f"{position.x:g},{position.y:g}", f"{width} × {height} pixels"
+            raise BadInputError(f"The pixel {pixel} of a known distance lies outside the photo {position.photo} ({pixels}).")
+        camera = self.cameras.get(entry["name"])
+        if camera is None:
+            raise BadInputError(f"The photo {position.photo} of a known distance was not registered and has no camera; use another photo.")
+        return camera_rays(camera, np.array([[position.x * camera.width / width, position.y * camera.height / height]]))[0]
+
+    def _entry(self, photo: str) -> Mapping[str, Any]:
+        """The entry whose file has this path, file name, or name without suffix."""
+        for key in (lambda e: e["source"], lambda e: e["source"].rsplit("/", 1)[-1], lambda e: e["name"]):
+            found = [entry for entry in self.entries if key(entry) == photo]
+            if len(found) == 1:
+                return found[0]
+        names = shortlist([entry["source"] for entry in self.entries])
+        raise BadInputError(f"A known distance names the photo '{photo}', which is none of the photos ({names}).")
+
+
+def triangulate(rays: Sequence[Ray], noise: float = PICK_NOISE) -> Point | None:
+    """The point nearest to `rays` in angle, weighted by their pixels; None where their directions differ by less than MIN_ANGLE.
+
+    Distances to the rays are minimised with weights that turn them into angles, which are updated in every step. `noise` is the standard
+    deviation of the pixel positions; residuals larger than it raise the covariance.
+    """
+    directions = np.stack([ray.direction for ray in rays])
+    origins = np.stack([ray.origin for ray in rays])
+    cosine = np.clip(directions @ directions.T, -1, 1).min()
+    if np.degrees(np.arccos(cosine)) < MIN_ANGLE:
+        return None
+    across = np.eye(3) - directions[:, :, None] * directions[:, None, :]
+    weight = np.ones(len(rays))
+    position = np.zeros(3)
+    for _ in range(_STEPS):
+        normal = np.einsum("n,nij->ij", weight, across)
+        position = np.linalg.solve(normal, np.einsum("n,nij,nj->i", weight, across, origins))
+        depth = np.maximum(np.linalg.norm(position - origins, axis=1), 1e-12)
+        angle = np.array([ray.pixel_angle for ray in rays])
+        weight = 1 / (depth * angle) ** 2
+    off = np.linalg.norm(np.einsum("nij,nj->ni", across, position - origins), axis=1) / (depth * angle)
+    spare = 2 * len(rays) - 3
+    variance = max(noise**2, float((off**2).sum()) / spare)
+    return Point(position, variance * np.linalg.inv(np.einsum("n,nij->ij", weight, across)), off)
