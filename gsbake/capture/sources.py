@@ -9,10 +9,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+from gsbake.capture.photos.heic_and_raw import HEIC_SUFFIXES, RAW_SUFFIXES
 from gsbake.errors import BadInputError
 
-#: File name suffixes of photos.
-PHOTO_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".exr", ".webp"})
+#: File name suffixes of images, which masks are as well, and of photos.
+IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".exr", ".webp"})
+PHOTO_SUFFIXES = IMAGE_SUFFIXES | HEIC_SUFFIXES | RAW_SUFFIXES
 #: File name suffixes of videos.
 VIDEO_SUFFIXES = frozenset({".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm"})
 #: Sub-folders of a capture folder that hold its photos, in order of precedence.
@@ -47,6 +49,7 @@ def source_files(source: Path) -> list[str]:
 def list_photos(folder: Path) -> list[Path]:
     """Photos of a folder, sorted by path; including sub-folders when the folder is called `images` or `photos`.
 
+    Of a photo that a camera wrote both as RAW and as an image, the image is taken.
     Raises BadInputError when the folder does not exist or holds no photo.
     """
     if not folder.is_dir():
@@ -62,14 +65,15 @@ def list_photos(folder: Path) -> list[Path]:
         and path.is_file()
     ]
     if not found:
-        kinds = ", ".join(sorted(s[1:] for s in PHOTO_SUFFIXES))
+        kinds = ", ".join(sorted(s[1:] for s in IMAGE_SUFFIXES | HEIC_SUFFIXES)) + " or a camera's RAW"
         raise BadInputError(f"The folder {folder} holds no photos ({kinds}); give the folder that holds them.")
-    return sorted(found)
+    images = {path.with_suffix("") for path in found if path.suffix.lower() not in RAW_SUFFIXES}
+    return sorted(path for path in found if path.suffix.lower() not in RAW_SUFFIXES or path.with_suffix("") not in images)
 
 
 def list_masks(folder: Path) -> list[str]:
     """Images of a mask folder as sorted relative POSIX names, those of sub-folders included; links to folders are not followed."""
-    found = (path.relative_to(folder) for path in folder.rglob("*") if path.suffix.lower() in PHOTO_SUFFIXES and path.is_file())
+    found = (path.relative_to(folder) for path in folder.rglob("*") if path.suffix.lower() in IMAGE_SUFFIXES and path.is_file())
     return sorted(name.as_posix() for name in found if not any(part.startswith(".") for part in name.parts))
 
 

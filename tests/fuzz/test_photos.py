@@ -1,4 +1,4 @@
-"""Photos of strangers through the limited reader: headers and bodies of PNG, JPEG, TIFF, EXR and WebP, EXIF, colour profiles."""
+"""Photos of strangers through the limited reader: headers and bodies of PNG, JPEG, TIFF, EXR, WebP, HEIC and DNG, EXIF, colour profiles."""
 
 from __future__ import annotations
 
@@ -18,7 +18,9 @@ from gsbake.capture.photos.conversion import Conversion, ConvertedPhoto
 from gsbake.capture.photos.decode import UnreadablePhotoError
 from gsbake.capture.photos.reader_pool import ReaderPool
 from gsbake.errors import BadInputError
+from tests.capture.photos.test_heic_and_raw import TELEPHONE
 from tests.fuzz.harness import damaged, edges, fuzz, numbers_of_bytes, outcome
+from tests.support.dng import write_dng
 
 #: Largest edge of a working photo, and most megapixels: a damaged header must not cost seconds.
 MAX_SIZE, MEGAPIXELS = 16, 0.25
@@ -53,6 +55,11 @@ def with_checksums(data: bytes) -> bytes:
         out += data[at : at + 4] + chunk + zlib.crc32(chunk).to_bytes(4, "big")
         at += 12 + size
     return bytes(out)
+
+
+def dng(path: Path) -> bytes:
+    write_dng(path, np.tile(pixels(3, np.float64) / 255, (3, 3, 1)))  # LibRaw takes smaller ones for damaged
+    return path.read_bytes()
 
 
 @pytest.fixture
@@ -91,7 +98,7 @@ def test_png(tmp_path: Path, pool: ReaderPool, capsys: pytest.CaptureFixture[str
     fuzz_photos(capsys, "PNG", tmp_path, pool, "png", st.one_of(files, files.map(with_checksums)))
 
 
-@pytest.mark.parametrize("suffix", ["jpg", "tif", "exr", "webp"])
+@pytest.mark.parametrize("suffix", ["jpg", "tif", "exr", "webp", "heic", "dng"])
 def test_other_formats(tmp_path: Path, pool: ReaderPool, capsys: pytest.CaptureFixture[str], suffix: str) -> None:
     seeds = {
         "jpg": lambda: [encoded(tmp_path, "jpg", pixels(3), Orientation=6, Make="m"), encoded(tmp_path, "jpg", pixels(1))],
@@ -101,6 +108,8 @@ def test_other_formats(tmp_path: Path, pool: ReaderPool, capsys: pytest.CaptureF
             encoded(tmp_path, "exr", pixels(3, np.float32), compression="piz"),
         ],
         "webp": lambda: [encoded(tmp_path, "webp", pixels(3))],
+        "heic": lambda: [TELEPHONE.read_bytes()],
+        "dng": lambda: [dng(tmp_path / "seed.dng")],
     }[suffix]()
     fuzz_photos(capsys, suffix.upper(), tmp_path, pool, suffix, st.one_of(damaged(seeds), damaged(seeds), st.binary(max_size=100)))
 

@@ -1,8 +1,9 @@
 """Decoding of a photo in any supported format to upright 8-bit sRGB at the working size.
 
-OpenImageIO reads JPEG, PNG, TIFF, EXR and WebP in 8 bit, 16 bit and float. Integer files are sRGB-coded, or converted from their embedded
-ICC profile; float files (EXR, float TIFF) are linear. Downsampling is an area filter on linear values (IEC 61966-2-1 curve), weighted
-with alpha, because the mean of coded values is not the radiance that a larger sensor cell measures.
+OpenImageIO reads JPEG, PNG, TIFF, EXR and WebP in 8 bit, 16 bit and float; `heic_and_raw` reads HEIC and RAW. Integer files are
+sRGB-coded, or converted from their embedded ICC profile; float files (EXR, float TIFF) and RAW are linear. Downsampling is an area filter
+on linear values (IEC 61966-2-1 curve), weighted with alpha, because the mean of coded values is not the radiance that a larger sensor
+cell measures.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ import numpy as np
 import OpenImageIO as oiio
 from numpy.typing import NDArray
 
+from gsbake.capture.photos import heic_and_raw
 from gsbake.imaging.srgb import decode_bytes, encode_bytes
 
 Bytes = NDArray[np.uint8]
@@ -97,6 +99,8 @@ def _failures_as_unreadable() -> Iterator[None]:
         yield
     except UnreadablePhotoError:
         raise
+    except heic_and_raw.MissingReaderError as error:
+        raise UnreadablePhotoError(str(error)) from None
     except MemoryError:
         raise UnreadablePhotoError("decoding it takes too much memory") from None
     except Exception as error:
@@ -106,6 +110,8 @@ def _failures_as_unreadable() -> Iterator[None]:
 def read_header(path: Path, max_megapixels: float = MAX_MEGAPIXELS) -> ImageHeader:
     """The header of an image file; no pixel is decoded. Raises UnreadablePhotoError, also for more than `max_megapixels`."""
     with _failures_as_unreadable():
+        if _is_developed(path):
+            return _checked(ImageHeader(*heic_and_raw.upright_size(path)), max_megapixels)
         handle = _open(path)
         try:
             return _header(handle.spec(), max_megapixels)
@@ -113,10 +119,19 @@ def read_header(path: Path, max_megapixels: float = MAX_MEGAPIXELS) -> ImageHead
             handle.close()
 
 
+def _is_developed(path: Path) -> bool:
+    return path.suffix.lower() in heic_and_raw.SUFFIXES
+
+
 def _header(spec: oiio.ImageSpec, max_megapixels: float) -> ImageHeader:
-    if not (0 < spec.width <= _MAX_EDGE and 0 < spec.height <= _MAX_EDGE and 0 < spec.nchannels <= _MAX_CHANNELS and spec.depth <= 1):
-        raise UnreadablePhotoError(f"it has {spec.width}x{spec.height} pixels of {spec.nchannels} channels")
-    header = ImageHeader(spec.width, spec.height, spec.nchannels, 1 if spec.format == oiio.UINT8 else 4)
+    if spec.depth > 1:
+        raise UnreadablePhotoError(f"it is a volume of {spec.depth} layers")
+    return _checked(ImageHeader(spec.width, spec.height, spec.nchannels, 1 if spec.format == oiio.UINT8 else 4), max_megapixels)
+
+
+def _checked(header: ImageHeader, max_megapixels: float) -> ImageHeader:
+    if not (0 < header.width <= _MAX_EDGE and 0 < header.height <= _MAX_EDGE and 0 < header.channels <= _MAX_CHANNELS):
+        raise UnreadablePhotoError(f"it has {header.width}x{header.height} pixels of {header.channels} channels")
     if header.megapixels > max_megapixels:
         raise UnreadablePhotoError(
             f"it has {header.megapixels:.0f} megapixels, more than ingest.max_megapixels = {max_megapixels:g}; raise that setting"
@@ -173,7 +188,7 @@ def read_photo(path: Path, max_megapixels: float = MAX_MEGAPIXELS) -> RawPhoto:
     Raises UnreadablePhotoError when the file is broken, truncated, larger than `max_megapixels`, or holds NaN or infinite values.
     """
     with _failures_as_unreadable():
-        return _read_photo(path, max_megapixels)
+        return _read_developed(path, max_megapixels) if _is_developed(path) else _read_photo(path, max_megapixels)
 
 
 def _tags(spec: oiio.ImageSpec) -> dict[str, Any]:
@@ -193,6 +208,18 @@ def _orientation(value: object) -> int:
     except (TypeError, ValueError, OverflowError):
         return 1
     return number if 1 <= number <= 8 else 1
+
+
+def _read_developed(path: Path, max_megapixels: float) -> RawPhoto:
+    _checked(ImageHeader(*heic_and_raw.upright_size(path)), max_megapixels)
+    photo = heic_and_raw.develop(path)
+    pixels: Any = photo.pixels if photo.pixels.ndim == 3 else photo.pixels[..., None]
+    colour: Any = np.ascontiguousarray(pixels[..., :3] if pixels.shape[2] >= 3 else np.repeat(pixels[..., :1], 3, 2))
+    alpha = pixels[..., 3] if pixels.shape[2] == 4 and pixels[..., 3].min() < 255 else None
+    if photo.icc_profile:
+        profile = {"ICCProfile": np.frombuffer(photo.icc_profile, np.uint8), "ICCProfile:color_space": "RGB"}
+        colour = _convert_icc_profile(colour, profile)
+    return RawPhoto(colour, alpha, 1, photo.tags)
 
 
 def _read_photo(path: Path, max_megapixels: float) -> RawPhoto:

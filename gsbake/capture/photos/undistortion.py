@@ -24,9 +24,7 @@ def distort(points: Array, coefficients: tuple[float, ...]) -> Array:
     x, y = points[..., 0], points[..., 1]
     r2 = x * x + y * y
     radial = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
-    return np.stack(
-        [x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x), y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y], -1
-    )
+    return np.stack([x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x), y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y], -1)
 
 
 def undistort_points(points: Array, coefficients: tuple[float, ...], steps: int = 50) -> Array:
@@ -70,9 +68,7 @@ def pinhole_camera(camera: Camera) -> Camera:
     width, height = np.floor(bounds[1] - bounds[0] + 1e-6), np.floor(bounds[3] - bounds[2] + 1e-6)
     if not np.isfinite(bounds).all() or not (0.25 * w < width < 4 * w and 0.25 * h < height < 4 * h):
         raise BadInputError(f"The lens distortion {camera.distortion} of photo {camera.name} cannot be inverted; check the calibration.")
-    return replace(
-        camera, width=int(width), height=int(height), cx=float(-bounds[0]), cy=float(-bounds[2]), distortion=()
-    )
+    return replace(camera, width=int(width), height=int(height), cx=float(-bounds[0]), cy=float(-bounds[2]), distortion=())
 
 
 def remap_tables(source: Camera, target: Camera) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
