@@ -174,6 +174,23 @@ def replace_command(
     replace(Options(out=out, dry_run=dry_run, quiet=quiet, as_json=as_json), stage, files or [], undo)
 
 
+@app.command("check")
+def check_command(
+    photos: Annotated[
+        Path,
+        typer.Argument(parser=given_path, metavar="PHOTOS", help="Folder of photos, a capture folder, or a video.", show_default=False),
+    ],
+    masks: MasksOption = None,
+    poses: PosesOption = None,
+    threads: ThreadsOption = 0,
+    as_json: JsonOption = False,
+) -> None:
+    """Say what will go wrong with photos before they are baked, and what to do about it."""
+    from gsbake.cli.check import check
+
+    check(photos, masks.folder if masks else None, poses, threads, as_json)
+
+
 @app.command("masks")
 def masks_command(
     folder: Annotated[Path, typer.Argument(parser=given_path, metavar="DIR", help="New folder for the masks.", show_default=False)],

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import shlex
 import signal
@@ -11,11 +12,14 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
+import cv2
+import numpy as np
 import psutil
 import pytest
 
 from gsbake.cli import main
 from tests.docs import toy_stages
+from tests.support.cameras import look_at
 from tests.support.gltf_files import write_ball
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -58,10 +62,12 @@ def _call(arguments: list[str], monkeypatch: pytest.MonkeyPatch) -> int:
 def prepared(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with what the pages assume to be there: photos, masks, an edited mesh, a profile and finished runs."""
     folder = tmp_path_factory.mktemp("pages")
-    for name in ("photos/a.jpg", "photos/b.jpg", "photos/c.jpg", "photos/d.jpg", "masks/a.png"):
+    for number, name in enumerate(("photos/a.jpg", "photos/b.jpg", "photos/c.jpg", "photos/d.jpg", "masks/a.png")):
         (folder / name).parent.mkdir(exist_ok=True)
-        (folder / name).write_text(name)
-    (folder / "transforms.json").write_text("{}")
+        cv2.imwrite(str(folder / name), np.full((48, 64, 3), 40 * number, np.uint8))  # `gsbake check` reads them
+    poses = [look_at((3, i, 1)).camera_to_world_opengl().tolist() for i in range(4)]
+    frames = [{"file_path": f"photos/{name}.jpg", "transform_matrix": pose} for name, pose in zip("abcd", poses, strict=True)]
+    (folder / "transforms.json").write_text(json.dumps({"fl_x": 60, "cx": 32, "cy": 24, "w": 64, "h": 48, "frames": frames}))
     (folder / "edited.ply").write_text("ply\n")
     (folder / "mine.toml").write_text('extends = "relight"\n[mesh]\nfaces = 10000\n')
     with pytest.MonkeyPatch.context() as monkeypatch:
