@@ -170,7 +170,7 @@ def _masks(folder: Path, entries: Sequence[dict[str, Any]]) -> list[Finding]:
 
 def _cameras(work: Path, entries: list[dict[str, Any]], threads: int, monitor: Monitor) -> tuple[list[Finding], dict[str, Any]]:
     """Whether the photos can be registered, and from where they look."""
-    settings = Poses(max_size=CHECK_SIZE, max_features=CHECK_FEATURES, fine_features=False, min_registered=0)
+    settings = Poses(max_size=CHECK_SIZE, max_features=CHECK_FEATURES, min_registered=0)
     solver = PoseSolver(work / "ingest", entries, work / "poses", settings, 0, threads, monitor)
     given = (work / "ingest/poses/cameras.json").exists()
     try:
@@ -193,7 +193,8 @@ def _cameras(work: Path, entries: list[dict[str, Any]], threads: int, monitor: M
     if solved.figures.get("masked_features"):
         text = "the object moves against its surroundings; features inside its masks place the cameras"
         findings.append(Finding("good", "background", text))
-    findings += coverage(solved.cameras)
+    if share >= FAILED_SHARE:  # a few cameras say nothing about the others
+        findings += coverage(solved.cameras)
     return findings, {key: value for key, value in solved.figures.items() if key != "seconds"}
 
 
