@@ -54,7 +54,9 @@ def summary_lines(result: Result, seconds: float) -> list[tuple[str, str]]:
         lines.append(("Size", f"{edges} m (± {100 * export['scale_relative_error']:.2g} %)"))
     if report.get("psnr") is not None:
         photos = "test photos" if report.get("held_out") else "training photos"
-        lines.append(("Quality", f"{report['psnr']:.1f} dB PSNR, SSIM {report['ssim']:.3f} on {report['compared']} {photos}"))
+        equalised = report.get("exposed_psnr") or 0.0
+        exposed = f", {equalised:.1f} dB with the exposure of each photo" if equalised > report["psnr"] + 1 else ""
+        lines.append(("Quality", f"{report['psnr']:.1f} dB PSNR{exposed}, SSIM {report['ssim']:.3f} on {report['compared']} {photos}"))
     if result.warnings:
         lines.append(("Warnings", f"{len(result.warnings)}, listed above and in the report"))
     if "report.html" in result.files:

@@ -22,6 +22,8 @@ from gsbake.text import duration, number, size
 
 Array = NDArray[np.float64]
 
+#: Gain in dB from which the PSNR with the exposure of each photo is shown too.
+EXPOSURE_DECIBELS = 1.0
 #: Half the field of view (radians) of the cameras that show the whole asset.
 HALF_ANGLE = math.radians(15)
 
@@ -129,9 +131,12 @@ def headline(manifests: Manifests, asset: Asset, bytes_: int, scored: Sequence[V
     """Figures at the top of the page; `photos` = number of registered and of ingested photos."""
     kind = "test photos" if scored and scored[0].held_out else "training photos"
     psnr, ssim = mean([s.metrics.psnr for s in scored]), mean([s.metrics.ssim for s in scored])
+    exposed = mean([s.metrics.exposed_psnr for s in scored])
     out = []
-    if psnr is not None and ssim is not None:
+    if psnr is not None and ssim is not None and exposed is not None:
         out = [Figure("PSNR", f"{psnr:.2f} dB", f"on {len(scored)} {kind}"), Figure("SSIM", f"{ssim:.3f}")]
+        if exposed > psnr + EXPOSURE_DECIBELS:
+            out.insert(1, Figure("PSNR", f"{exposed:.2f} dB", "with the exposure of each photo"))
     height, width = asset.base_color.shape[:2]
     memory, stage = peak(manifests)
     out += [

@@ -80,7 +80,10 @@ class _ReportWriter:
         with self.monitor.part("page"):
             figures = self._figures(renders)
             text = render_page(self._page(renders))
-            views = [{"name": s.name, "psnr": s.metrics.psnr, "ssim": s.metrics.ssim} for s in renders.scored]
+            views = [
+                {"name": s.name, "psnr": s.metrics.psnr, "exposed_psnr": s.metrics.exposed_psnr, "ssim": s.metrics.ssim}
+                for s in renders.scored
+            ]
             (self.out / "report.html").write_text(text, encoding="utf-8")
             (self.out / "report.json").write_text(json.dumps(figures | {"views": views}, indent=1))
         return figures | {"page_bytes": len(text)}
@@ -120,6 +123,7 @@ class _ReportWriter:
         """The figures of `report.json`."""
         return {
             "psnr": compose.mean([s.metrics.psnr for s in renders.scored]),
+            "exposed_psnr": compose.mean([s.metrics.exposed_psnr for s in renders.scored]),
             "ssim": compose.mean([s.metrics.ssim for s in renders.scored]),
             "held_out": renders.held_out,
             "compared": len(renders.scored),

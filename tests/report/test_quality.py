@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,8 +14,8 @@ from gsbake.capture.posed_photos import View
 from gsbake.errors import BadInputError
 from gsbake.geometry.cameras import Camera
 from gsbake.imaging.metrics import MAX_PSNR, psnr, ssim
-from gsbake.imaging.srgb import decode
-from gsbake.report.quality import GREY, asset_cameras, compare, select_views
+from gsbake.imaging.srgb import decode, encode_bytes
+from gsbake.report.quality import GREY, asset_cameras, compare, exposure_gain, select_views
 from gsbake.report.render import RenderedImage
 from tests.report.shapes import front_camera
 
@@ -69,6 +70,18 @@ def test_missing_and_superfluous_parts_have_the_same_error() -> None:
     extra = compare(view(51, box(8, 16)), picture(0.2, box(8, 20)))
     assert missing.psnr == pytest.approx(-10 * math.log10(0.09 / 3), abs=1e-3)
     assert extra.psnr == pytest.approx(missing.psnr, abs=1e-3)
+
+
+def test_the_exposure_of_the_photo_is_given_to_the_render() -> None:
+    mask = box(8, 24)
+    rng = np.random.default_rng(0)
+    linear = rng.uniform(0.05, 0.3, (SIZE, SIZE, 3)).astype(np.float32)
+    dark = View(CAMERA, encode_bytes(linear / 3), (255 * mask).astype(np.uint8))
+    found = compare(dark, replace(picture(0.2, mask), linear=linear))
+    assert found.psnr < 16 and found.exposed_psnr > 45
+    same = compare(View(CAMERA, encode_bytes(linear), (255 * mask).astype(np.uint8)), replace(picture(0.2, mask), linear=linear))
+    assert same.exposed_psnr >= same.psnr > 45
+    assert exposure_gain(np.ones((4, 3), np.float32), np.full((4, 3), 0.5, np.float32)) == 1  # all clipped
 
 
 def test_partial_coverage_matches_on_both_sides() -> None:
