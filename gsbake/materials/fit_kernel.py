@@ -150,6 +150,7 @@ def shade_and_differentiate(
             b00, b01, b10, b11 = lut[row, col, 1], lut[row, col + _U1, 1], lut[row + _U1, col, 1], lut[row + _U1, col + _U1, 1]
             scale = (_1 - fy) * (a00 + fx * (a01 - a00)) + fy * (a10 + fx * (a11 - a10))
             bias = (_1 - fy) * (b00 + fx * (b01 - b00)) + fy * (b10 + fx * (b11 - b10))
+            transmitted = _1 - _F0 * scale - bias
             mirror, mirror_slope = _mirror_weight(rough)
             coeff = _1 + mirror * (_2 * c - _1)
             rx = coeff * nx - mirror * vx
@@ -180,7 +181,7 @@ def shade_and_differentiate(
                 bounced = incident * transport[hit, np.uint64(8 + ch)]
                 reflectance = f0 * scale + bias
                 diffuse = visible * irradiance + local[2 + ch]
-                linear = albedo * diffuse + (visible_s * light + bounced) * reflectance + local[5 + ch]
+                linear = albedo * transmitted * diffuse + (visible_s * light + bounced) * reflectance + local[5 + ch]
                 encoded, slope = srgb_and_slope(min(max(linear, _0), _1))
                 error = encoded - colour[i, ch]
                 squares += error * error
@@ -190,10 +191,10 @@ def shade_and_differentiate(
                 if _0 <= linear <= _1:
                     g = third * w * error / length * slope
                 g_s = g * visible_s
-                gradient[i, ch] = g * diffuse
+                gradient[i, ch] = g * transmitted * diffuse
                 gradient[i, 3 + ch] = (g_s * light + g * bounced) * scale
-                g_scale += g_s * light * f0
-                g_bias += g_s * light
+                g_scale += g_s * light * f0 - _F0 * g * albedo * diffuse
+                g_bias += g_s * light - g * albedo * diffuse
                 g_light = g_s * reflectance
                 g_t += g_light * (upper - lower)
                 du, dv = _bilinear_backward(table, table_grad, base0, stride0, fx0, fy0, ch, g_light * (_1 - t_level))
@@ -202,7 +203,7 @@ def shade_and_differentiate(
                 du, dv = _bilinear_backward(table, table_grad, base1, stride1, fx1, fy1, ch, g_light * t_level)
                 g_u += du * half1
                 g_v += dv * half1
-                du, dv = _bilinear_backward(table, table_grad, base2, stride2, fx2, fy2, ch, g * visible * albedo)
+                du, dv = _bilinear_backward(table, table_grad, base2, stride2, fx2, fy2, ch, g * visible * albedo * transmitted)
                 g_un += du * half2
                 g_vn += dv * half2
             loss_sum += w * residual_weight * loss

@@ -16,7 +16,7 @@ from gsbake.imaging.srgb_torch import linear_to_srgb
 from gsbake.materials.photo_batch import EMISSION, INDIRECT, OCCLUSION, OUTGOING, VISIBILITY
 from gsbake.materials.pixels import Pixels
 from gsbake.shading.light_tables import LightTables
-from gsbake.shading.split_sum import mirror_reflection, shade, traced_specular_visibility
+from gsbake.shading.split_sum import mirror_reflection, shade, traced_specular_visibility, transmitted_share
 
 
 @dataclass(frozen=True)
@@ -90,7 +90,8 @@ class Batch:
         if transport.rows is not None and transport.outgoing is not None:
             at, outgoing = transport.rows, transport.outgoing
             lit = lit.index_add(0, at, mirror_reflection(normal[at], view[at], albedo[at], roughness[at], metallic[at], outgoing))
-        return lit + (1 - metallic)[:, None] * albedo * local[:, INDIRECT] + local[:, EMISSION]
+        transmitted = transmitted_share(normal, view, roughness)
+        return lit + ((1 - metallic) * transmitted)[:, None] * albedo * local[:, INDIRECT] + local[:, EMISSION]
 
 
 def _interpolate(values: Tensor, texel: Tensor, bilinear: Tensor) -> Tensor:

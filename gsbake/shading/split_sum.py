@@ -1,7 +1,7 @@
 """Deferred split-sum shading of G-buffers under a prefiltered environment light.
 
     F0  = .04 (1 − metallic) + metallic · albedo
-    out = (1 − metallic) · albedo · E(n) + L(d, roughness) · (F0 · A(n·v, roughness) + B(n·v, roughness))
+    out = (1 − metallic) · albedo · (1 − .04 A − B) · E(n) + L(d, roughness) · (F0 · A(n·v, roughness) + B(n·v, roughness))
 
 (METHOD §6; Karis, *Real Shading in Unreal Engine 4*, 2013; Munkberg et al., nvdiffrec, CVPR 2022.) On the CPU in float32, forward and
 backward pass are one Numba kernel each; other devices and float64 use PyTorch. Shadowing and inter-reflection enter through the occlusion
@@ -97,6 +97,13 @@ def mirror_reflection(
     return incident * (f0 * scale.unsqueeze(1) + bias.unsqueeze(1))
 
 
+def transmitted_share(normal: torch.Tensor, view: torch.Tensor, roughness: torch.Tensor) -> torch.Tensor:
+    """Share (n,) of diffuse reflection that a dielectric's specular layer lets through, 1 − (.04 A + B); constant for gradients."""
+    with torch.no_grad():
+        scale, bias = brdf.scale_and_bias(_soft_cosine((_unit(normal) * view).sum(dim=1)), roughness)
+    return 1.0 - 0.04 * scale - bias
+
+
 def _unit(normal: torch.Tensor) -> torch.Tensor:
     squared = (normal * normal).sum(dim=1, keepdim=True)
     unit = normal * squared.clamp_min(float(kernels.MIN_SQUARED_LENGTH)).rsqrt()
@@ -140,7 +147,8 @@ def _reference(
     scale, bias = brdf.scale_and_bias(_soft_cosine(cosine.squeeze(1)), roughness)
     metal = metallic.unsqueeze(1)
     f0 = 0.04 * (1.0 - metal) + metal * albedo
-    diffuse = (1.0 - metal) * albedo * tables.diffuse(unit)
+    transmitted = 1.0 - 0.04 * scale.unsqueeze(1) - bias.unsqueeze(1)
+    diffuse = (1.0 - metal) * albedo * transmitted * tables.diffuse(unit)
     specular = tables.specular(dominant, roughness) * (f0 * scale.unsqueeze(1) + bias.unsqueeze(1))
     return visibility_d.unsqueeze(1) * diffuse + visibility_s.unsqueeze(1) * specular
 

@@ -172,6 +172,7 @@ def forward(
             b1 = lut[row + _U1, col, 1] + fx * (lut[row + _U1, col + _U1, 1] - lut[row + _U1, col, 1])
             scale = a0 + fy * (a1 - a0)
             bias = b0 + fy * (b1 - b0)
+            transmitted = _1 - _F0 * scale - bias
 
             mirror, _ = _mirror_weight(roughness[i])
             coeff = _1 + mirror * (_2 * c - _1)
@@ -189,7 +190,7 @@ def forward(
                 irradiance = _bilinear(table, base2, stride2, fx2, fy2, ch)
                 f0 = _F0 * (_1 - metal) + metal * albedo[i, ch]
                 light = lower + t * (upper - lower)
-                out[i, ch] = visibility_d[i] * (_1 - metal) * albedo[i, ch] * irradiance + visibility_s[i] * light * (f0 * scale + bias)
+                out[i, ch] = visibility_d[i] * (_1 - metal) * albedo[i, ch] * transmitted * irradiance + visibility_s[i] * light * (f0 * scale + bias)
 
 
 @njit(parallel=True, **_FLAGS)
@@ -212,6 +213,7 @@ def backward(
             b00, b01, b10, b11 = lut[row, col, 1], lut[row, col + _U1, 1], lut[row + _U1, col, 1], lut[row + _U1, col + _U1, 1]
             scale = (_1 - fy) * (a00 + fx * (a01 - a00)) + fy * (a10 + fx * (a11 - a10))
             bias = (_1 - fy) * (b00 + fx * (b01 - b00)) + fy * (b10 + fx * (b11 - b10))
+            transmitted = _1 - _F0 * scale - bias
 
             mirror, mirror_slope = _mirror_weight(roughness[i])
             coeff = _1 + mirror * (_2 * c - _1)
@@ -240,14 +242,15 @@ def backward(
                 f0 = _F0 * (_1 - metal) + metal * base
                 light = lower + t * (upper - lower)
                 reflectance = f0 * scale + bias
-                g_d = g * visibility_d[i]
+                diffuse = g * (_1 - metal) * base * irradiance  # gradient of visibility and transmittance together
+                g_d = g * visibility_d[i] * transmitted
                 g_s = g * visibility_s[i]
-                g_vd += g * (_1 - metal) * base * irradiance
+                g_vd += diffuse * transmitted
                 g_vs += g * light * reflectance
                 g_albedo[i, ch] = g_d * (_1 - metal) * irradiance + g_s * light * scale * metal
                 g_metal += g_s * light * scale * (base - _F0) - g_d * base * irradiance
-                g_scale += g_s * light * f0
-                g_bias += g_s * light
+                g_scale += g_s * light * f0 - _F0 * visibility_d[i] * diffuse
+                g_bias += g_s * light - visibility_d[i] * diffuse
                 g_light = g_s * reflectance
                 g_t += g_light * (upper - lower)
                 du, dv = _bilinear_backward(table, table_grad, base0, stride0, fx0, fy0, ch, g_light * (_1 - t))
