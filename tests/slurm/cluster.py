@@ -115,7 +115,7 @@ class Cluster:
             f"--log-file={munge}/log", f"--seed-file={munge}/seed",
         )  # fmt: skip
         self._wait(lambda: (munge / "socket").exists(), "munged does not start")
-        self._start("slurmctld", "slurmctld", "-D", "-f", str(self.config))
+        self.start_controller()
         for node in self.nodes:
             self.start_node(node)
         self._wait(lambda: set(self.node_states().values()) == {"idle"}, "the nodes do not become idle")
@@ -152,9 +152,13 @@ class Cluster:
         if daemon is not None:
             daemon.wait()
 
-    def kill_daemon(self, node: str) -> None:
-        """Kill the slurmd of a node only; its jobs go on."""
-        daemon = self._daemons.pop(node)
+    def start_controller(self) -> None:
+        """Start slurmctld, which reads the state that an earlier one saved."""
+        self._start("slurmctld", "slurmctld", "-D", "-f", str(self.config))
+
+    def kill_controller(self) -> None:
+        """Kill slurmctld; the jobs go on."""
+        daemon = self._daemons.pop("slurmctld")
         daemon.kill()
         daemon.wait()
 
