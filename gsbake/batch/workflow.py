@@ -1,8 +1,8 @@
 """Runs the jobs of a batch with Snakemake, and ends it when nothing is left to wait for.
 
 Snakemake's own records are thrown away before each run: what is done is what gsbake's stores say. Snakemake may lose sight of jobs in
-Slurm's queue (when slurmctld does not answer for a while, its plugin forgets them and waits for ever); so this module watches the queue too,
-and ends a Snakemake that waits although no job of the batch is left. The caller then plans anew.
+Slurm's queue: when slurmctld does not answer for a while, its plugin forgets them and waits for ever. So this module watches the queue
+too, and ends a Snakemake that waits although no job of the batch is left. The caller then plans anew.
 """
 
 from __future__ import annotations

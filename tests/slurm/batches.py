@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import subprocess
 import sys
 import time
@@ -23,29 +22,25 @@ SETTINGS = (
 TIMEOUT = 3000.0
 
 
-def gsbake(*words: object, environment: Mapping[str, str] | None = None) -> subprocess.Popen[str]:
-    """A running command of gsbake."""
-    return subprocess.Popen(
-        [sys.executable, "-m", "gsbake", *map(str, words)], env=dict(environment or os.environ), stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT, text=True, errors="replace", start_new_session=True,
-    )  # fmt: skip
+def gsbake(*words: object) -> None:
+    """Run a command of gsbake. Raises AssertionError when it fails."""
+    command = [sys.executable, "-m", "gsbake", *map(str, words)]
+    done = subprocess.run(command, capture_output=True, text=True, errors="replace", timeout=TIMEOUT, check=False)
+    assert done.returncode == 0, done.stdout[-1000:] + done.stderr[-2000:]
 
 
 def write_captures(folder: Path, count: int, views: int = 12, size: int = 96) -> list[Path]:
     """Built-in captures with different seeds."""
     made = [folder / f"object{seed}" for seed in range(count)]
     for seed, path in enumerate(made):
-        process = gsbake("synth", path, "--views", views, "--size", size, "--seed", seed, "--quiet")
-        assert process.wait(TIMEOUT) == 0, process.stdout and process.stdout.read()
+        gsbake("synth", path, "--views", views, "--size", size, "--seed", seed, "--quiet")
     return made
 
 
 def plain_runs(captures: Sequence[Path], root: Path, settings: Sequence[str] = SETTINGS) -> dict[str, dict[str, str]]:
     """{capture: digests} of one plain run after another."""
     for path in captures:
-        process = gsbake("run", path, "--out", root / path.name, *_options(settings), "--quiet")
-        text, _ = process.communicate(timeout=TIMEOUT)
-        assert process.returncode == 0, text[-2000:]
+        gsbake("run", path, "--out", root / path.name, *_options(settings), "--quiet")
     return {path.name: digests(root / path.name) for path in captures}
 
 
@@ -77,29 +72,30 @@ def stages(out: Path, event: str) -> list[str]:
 
 @dataclass(frozen=True)
 class Batch:
-    """A running `gsbake batch` with its folder."""
+    """A running `gsbake batch` with its folder; it writes into the file `log`."""
 
-    process: subprocess.Popen[str]
+    process: subprocess.Popen[bytes]
     captures: tuple[Path, ...]
     root: Path
+    log: Path
 
     def finish(self) -> str:
         """Wait for its end; returns its output. Raises AssertionError unless all captures are done."""
-        text, _ = self.process.communicate(timeout=TIMEOUT)
+        self.process.wait(TIMEOUT)
         log = self.root / ".batch" / "snakemake.log"
-        assert self.process.returncode == 0, f"{text[-2000:]}\n{log.read_text()[-3000:] if log.exists() else ''}"
-        return text
+        assert self.process.returncode == 0, f"{self.output()}\n{log.read_text()[-3000:] if log.exists() else ''}"
+        return self.output()
 
     def wait_until(self, what: str, ready: Callable[[], bool]) -> None:
         """Wait for a moment in the batch. Raises AssertionError when it does not come."""
         deadline = time.monotonic() + TIMEOUT
         while not ready():
-            assert self.process.poll() is None and time.monotonic() < deadline, f"{what} did not happen: {self.output()[-2000:]}"
+            assert self.process.poll() is None and time.monotonic() < deadline, f"{what} did not happen: {self.output()}"
             time.sleep(0.2)
 
     def output(self) -> str:
-        """What the command has printed, once it has ended."""
-        return self.process.stdout.read() if self.process.poll() is not None and self.process.stdout else ""
+        """The end of what the command has printed."""
+        return self.log.read_text(errors="replace")[-3000:]
 
     def runs(self, capture: Path, stage: str) -> bool:
         """Whether a stage of a capture has been started and not finished."""
@@ -111,8 +107,8 @@ class Batch:
         lost = 0
         for path in self.captures:
             out = self.root / path.name
-            found = digests(out)
-            different = sorted(name for name in expected[path.name].keys() | found.keys() if expected[path.name].get(name) != found.get(name))
+            found, wanted = digests(out), expected[path.name]
+            different = sorted(name for name in wanted.keys() | found.keys() if wanted.get(name) != found.get(name))
             assert not different, f"{path.name}: other bytes in {different[:5]}"
             finished = Counter(stages(out, "stage finished"))
             assert all(count == 1 for count in finished.values()), f"{path.name}: computed twice: {finished}"
@@ -125,4 +121,11 @@ def start_batch(
 ) -> Batch:
     """Start a batch with Slurm, one thread a job."""
     words = ("batch", *captures, "--out", root, "--executor", "slurm", *_options(settings), *more)
-    return Batch(gsbake(*words, environment=environment), tuple(captures), root)
+    root.mkdir(parents=True, exist_ok=True)
+    log = root.with_name(f"{root.name}.log")
+    with log.open("ab") as sink:
+        process = subprocess.Popen(
+            [sys.executable, "-m", "gsbake", *map(str, words)], env=dict(environment), stdin=subprocess.DEVNULL, stdout=sink, stderr=sink,
+            start_new_session=True,
+        )  # fmt: skip
+    return Batch(process, tuple(captures), root, log)

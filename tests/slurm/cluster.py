@@ -144,7 +144,7 @@ class Cluster:
         self._start(node, "unshare", "--mount", "sh", "-e", "-c", "\n".join(lines), mark=node)
 
     def kill_node(self, node: str) -> None:
-        """Kill everything that runs on a node at once, as a power failure does."""
+        """Kill everything that runs on a node at once, as a power failure does: slurmd and its steps first, so that none reports an end."""
         for process in self._processes(node):
             with suppress(psutil.NoSuchProcess):
                 process.kill()
@@ -169,7 +169,8 @@ class Cluster:
     def node_states(self) -> dict[str, str]:
         """{node: state}, such as idle, mixed, allocated, down; empty while slurmctld does not answer."""
         with suppress(subprocess.SubprocessError):
-            return dict(line.split() for line in self.call("sinfo", "--noheader", "--Node", "--partition=farm", "--format=%N %T").splitlines())
+            rows = self.call("sinfo", "--noheader", "--Node", "--partition=farm", "--format=%N %T").splitlines()
+            return dict(row.split() for row in rows)
         return {}
 
     def jobs(self) -> list[tuple[str, str, str, int]]:
@@ -188,15 +189,16 @@ class Cluster:
         return 0
 
     def _processes(self, node: str) -> list[psutil.Process]:
-        """slurmd and its steps (by this test's mark), and the jobs' processes (by Slurm's variables)."""
-        found = []
+        """slurmd and its steps (by this test's mark), then the jobs' processes (by Slurm's variables)."""
+        daemons, jobs = [], []
         for process in psutil.process_iter():
             with suppress(psutil.Error):
                 environment = process.environ()
-                own = environment.get("SLURM_CONF") == str(self.config)
-                if environment.get(_MARK) == f"{self.folder}:{node}" or (own and environment.get("SLURMD_NODENAME") == node):
-                    found.append(process)
-        return found
+                if environment.get(_MARK) == f"{self.folder}:{node}":
+                    daemons.append(process)
+                elif environment.get("SLURM_CONF") == str(self.config) and environment.get("SLURMD_NODENAME") == node:
+                    jobs.append(process)
+        return daemons + jobs
 
     def _start(self, name: str, *command: str, mark: str | None = None) -> None:
         environment = dict(self.environment)

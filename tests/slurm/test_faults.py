@@ -1,5 +1,7 @@
-"""`gsbake batch --executor slurm` on a real Slurm, with faults: all captures end with the bytes of plain runs, and nothing that was finished
-is computed again."""
+"""`gsbake batch --executor slurm` on a real Slurm, with faults.
+
+All captures end with the bytes of plain runs, and nothing that was finished is computed again.
+"""
 
 from __future__ import annotations
 
@@ -49,7 +51,9 @@ def test_a_node_is_killed(cluster: Cluster, captures: list[Path], plain: Plain, 
     tell(capsys, f"node killed: {batch.check(plain)} stages lost")
 
 
-def test_a_job_is_preempted(cluster: Cluster, captures: list[Path], plain: Plain, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_job_is_preempted(
+    cluster: Cluster, captures: list[Path], plain: Plain, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     batch = start_batch(captures, tmp_path / "out", cluster.environment)
     capture = wait_for_training(batch)
     for node in cluster.nodes:
@@ -136,4 +140,3 @@ def test_the_controller_is_killed(cluster: Cluster, captures: list[Path], plain:
     cluster.start_controller()
     batch.finish()
     batch.check(plain)
-

@@ -18,8 +18,8 @@ from contextlib import suppress
 from pathlib import Path
 
 _CONFIG_FOLDER = Path("/etc/swift")
-_PROGRAMS = ("swift-proxy-server", "swift-account-server", "swift-container-server", "swift-object-server", "swift-ring-builder", "memcached")
 _STORAGE = ("account", "container", "object")
+_PROGRAMS = ("swift-proxy-server", *(f"swift-{name}-server" for name in _STORAGE), "swift-ring-builder", "memcached")
 _START_TIMEOUT = 90.0
 _STORAGE_CONFIG = """\
 [DEFAULT]
@@ -93,7 +93,8 @@ class SwiftServer:
     def __enter__(self) -> SwiftServer:
         missing = [name for name in _PROGRAMS if shutil.which(name) is None]
         if missing:
-            raise ServerUnavailable(f"{missing[0]} not found (Debian: swift-proxy, swift-account, swift-container, swift-object, memcached)")
+            packages = ", ".join(("swift-proxy", *(f"swift-{name}" for name in _STORAGE), "memcached"))
+            raise ServerUnavailable(f"{missing[0]} not found (Debian: {packages})")
         if os.geteuid() != 0 or subprocess.run(["unshare", "--mount", "true"], capture_output=True, check=False).returncode:
             raise ServerUnavailable("Swift needs root and mount namespaces")
         self._configure()
