@@ -7,7 +7,9 @@ its memory: the threads of the running jobs add up to at most the cores, their m
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -22,6 +24,7 @@ from gsbake.batch.slurm import SlurmOptions, ask_cluster
 from gsbake.batch.workflow import Execution, end_orphan, require_snakemake, run_workflow
 from gsbake.errors import InterruptedRun
 from gsbake.pipeline.files import ensure_output_folder
+from gsbake.pipeline.lease import HEARTBEAT_TIMEOUT, LeaseHolder
 from gsbake.pipeline.machine import default_threads
 from gsbake.pipeline.supervise import StopSignals
 
@@ -33,7 +36,8 @@ _ROUNDS = 10
 
 @dataclass(frozen=True)
 class Outcome:
-    """End of a capture in a batch: `state` is done, cached, failed (will not help to retry) or unfinished (the same command goes on)."""
+    """End of a capture in a batch: `state` is done, cached, failed (will not help to retry), unfinished (the same command goes on), or
+    running while the batch does."""
 
     plan: CapturePlan
     state: str
@@ -120,7 +124,21 @@ def _stages_left(plans: Sequence[CapturePlan]) -> int:
 def outcomes_now(captures: Sequence[Path], options: BatchOptions) -> list[Outcome]:
     """How far each capture of a batch is, from the stores and the records; nothing is run."""
     plans = plan_captures(captures, options)
-    return _outcomes(plans, earlier_failures(options.root, plans), set(), options.root)
+    found = _outcomes(plans, earlier_failures(options.root, plans), set(), options.root)
+    return [_with_running_stage(outcome) if outcome.state == "unfinished" else outcome for outcome in found]
+
+
+def _with_running_stage(outcome: Outcome) -> Outcome:
+    """The outcome, or state running and the stage with its process where one computes."""
+    for state in outcome.plan.to_run:
+        for path in sorted(outcome.plan.out.glob(f"stages/{state.name}/*.lease")):
+            holder = LeaseHolder.read(path)
+            if holder is None or holder.alive() is False:
+                continue
+            with suppress(OSError):
+                if holder.alive() or time.time() - path.stat().st_mtime < HEARTBEAT_TIMEOUT:
+                    return replace(outcome, state="running", message=f"{state.title}: {holder}.")
+    return outcome
 
 
 def _outcomes(plans: Sequence[CapturePlan], failures: dict[str, Record], ran: set[str], root: Path) -> list[Outcome]:

@@ -23,7 +23,7 @@ from gsbake.errors import BadInputError, InterruptedRun, UsageError
 from gsbake.pipeline.machine import default_threads
 from gsbake.text import duration, size
 
-_STYLES = {"done": "green", "cached": "green", "failed": "red", "unfinished": "yellow"}
+_STYLES = {"done": "green", "cached": "green", "failed": "red", "unfinished": "yellow", "running": "cyan"}
 
 
 def plan(captures: Sequence[Path], options: BatchOptions, form: str | None) -> None:
