@@ -28,8 +28,10 @@ from gsbake.pipeline.lease import HEARTBEAT_TIMEOUT, LeaseHolder
 from gsbake.pipeline.machine import default_threads
 from gsbake.pipeline.supervise import StopSignals
 
-#: Threads of a job with Slurm where the user names none.
+#: Most threads of a job with Slurm where the user names none: more are used ever less.
 _SLURM_THREADS = 4
+#: Jobs in Slurm's queue, of those that it can run at once, and at least.
+_QUEUE_FACTOR, _LEAST_QUEUE = 2, 100
 #: Times that what is left is planned anew, after a Snakemake that stalled or jobs that were interrupted too often for it.
 _ROUNDS = 10
 
@@ -51,19 +53,22 @@ def run_batch(
     executor: str = "local",
     *,
     retry_failed: bool = False,
-    workers: int = 100,
+    workers: int = 0,
     slurm: SlurmOptions = SlurmOptions(),  # noqa: B008 (immutable)
     on_record: Callable[[Record], None] = lambda record: None,
 ) -> list[Outcome]:
     """Bring all captures up to date; returns how each one ended, in order.
 
-    `workers` is the number of jobs in Slurm's queue at a time; `on_record` is called at the end of each job. Raises UsageError when an
-    executor is unknown or not installed, InterruptedRun when another batch works in the same folder, or on a stop request.
+    `workers` is the number of jobs in Slurm's queue at a time (0: two for each core); `on_record` is called at the end of each job.
+    Raises UsageError when an executor is unknown or not installed, InterruptedRun when another batch works in the same folder, or on a
+    stop request.
     """
     require_snakemake(executor)
     if executor == "slurm":
-        ask_cluster(slurm)
-        options = replace(options, threads=options.threads or _SLURM_THREADS)
+        cluster = ask_cluster(slurm)
+        execution = Execution(cluster.cores, cluster, slurm, workers or max(_LEAST_QUEUE, _QUEUE_FACTOR * cluster.cores))
+    else:
+        execution = Execution(options.threads or default_threads())
     options = options.absolute()
     root = options.root
     ensure_output_folder(root)
@@ -79,7 +84,6 @@ def run_batch(
         save_batch(captures, options)
         failures = {} if retry_failed else earlier_failures(root, plans)
         forget_records(root, list(failures.values()))
-        execution = Execution(executor, options.threads or default_threads(), workers, slurm)
         ran: set[str] = set()
         with StopSignals() as stop:
             reader = RecordReader(root)
@@ -107,7 +111,9 @@ def _run_round(
     on_record: Callable[[Record], None],
 ) -> bool:
     """Run the jobs of the pending captures; False when Snakemake stalled."""
-    threads = max(1, execution.cores // len(pending)) if execution.local else execution.cores
+    threads = max(1, execution.cores // len(pending))
+    if execution.cluster is not None:
+        threads = options.threads or min(threads, _SLURM_THREADS)
     outs = sorted(path.parent for path in options.root.glob("*/project.json"))
     chosen = {plan.name for plan in pending}
     jobs = make_jobs(

@@ -30,11 +30,13 @@ class SlurmOptions:
 
 @dataclass(frozen=True)
 class Cluster:
-    """What is asked once: the command that knows the states of ended jobs, the number of nodes and the memory of the largest in MB."""
+    """What is asked once: the command that knows the states of ended jobs, the number of nodes, the memory of the largest in MB, and all
+    their cores."""
 
     status_command: str
     nodes: int
     largest_mb: int
+    cores: int
 
 
 def ask_cluster(options: SlurmOptions) -> Cluster:
@@ -45,15 +47,16 @@ def ask_cluster(options: SlurmOptions) -> Cluster:
         )
     config = _ask("scontrol", "show", "config")
     chosen = ("--partition", options.partition) if options.partition is not None else ()
-    rows = _ask("sinfo", "--noheader", "--Node", "--format=%N %m", *chosen)
+    rows = _ask("sinfo", "--noheader", "--Node", "--format=%N %m %c", *chosen)
     if config is None or rows is None:
         raise UsageError("Slurm does not answer (`scontrol show config`); look whether slurmctld runs, or use --executor local.")
-    memory = {line.split()[0]: int(re.sub(r"\D", "", line.split()[1]) or 0) for line in rows.splitlines() if len(line.split()) == 2}
-    if not memory:
+    nodes = {words[0]: (_number(words[1]), _number(words[2])) for line in rows.splitlines() if len(words := line.split()) == 3}
+    if not nodes:
         raise UsageError(f"Slurm has no nodes{f' in the partition {options.partition}' if options.partition else ''}; name another.")
     # Without accounting, sacct only fails, and Snakemake would wait for ever.
     accounted = re.search(r"^AccountingStorageType\s*=\s*(?!accounting_storage/none|\(null\))\S", config, re.MULTILINE)
-    return Cluster("sacct" if accounted and shutil.which("sacct") else "squeue", len(memory), max(memory.values()))
+    status_command = "sacct" if accounted and shutil.which("sacct") else "squeue"
+    return Cluster(status_command, len(nodes), max(mb for mb, _ in nodes.values()), sum(cores for _, cores in nodes.values()))
 
 
 def job_prefix(root: Path) -> str:
@@ -92,6 +95,11 @@ def snakemake_arguments(cluster: Cluster, prefix: str) -> Sequence[str]:
 def node_name() -> str:
     """Slurm's name of the node that this process runs on; empty outside of Slurm."""
     return os.environ.get("SLURMD_NODENAME", "")
+
+
+def _number(text: str) -> int:
+    """The number of "24000+"."""
+    return int(re.sub(r"\D", "", text) or 0)
 
 
 def _ask(*command: str) -> str | None:

@@ -47,17 +47,18 @@ STALL_TIMEOUT = 60.0
 
 @dataclass(frozen=True)
 class Execution:
-    """Where the jobs run: executor, cores of this machine, most jobs in Slurm's queue, and the user's choices for Slurm."""
+    """Where the jobs run: `cores` that they may fill together and, with Slurm, its cluster, the user's choices, and most jobs in the
+    queue."""
 
-    executor: str
     cores: int
-    workers: int
+    cluster: slurm.Cluster | None = None
     slurm: slurm.SlurmOptions = slurm.SlurmOptions()
+    workers: int = 0
 
     @property
-    def local(self) -> bool:
-        """Whether the jobs run on this machine."""
-        return self.executor == "local"
+    def executor(self) -> str:
+        """Snakemake's name of the executor."""
+        return "local" if self.cluster is None else "slurm"
 
 
 def require_snakemake(executor: str) -> None:
@@ -91,7 +92,7 @@ def run_workflow(
     prefix = slurm.job_prefix(options.root)
     arguments = _prepare(jobs, options, execution, work, prefix)
     progress = _Progress(jobs)
-    queue = None if execution.local else _Queue(prefix)
+    queue = None if execution.cluster is None else _Queue(prefix)
     with (options.root / FOLDER / "snakemake.log").open("wb") as log:
         process = subprocess.Popen(
             python_command("-m", "snakemake", *arguments),
@@ -184,8 +185,8 @@ def _prepare(jobs: Sequence[Job], options: BatchOptions, execution: Execution, w
     path = work / "jobs.json"
     memory, nodes, chosen = max(512, int(_MEMORY_SHARE * psutil.virtual_memory().available / 1e6)), 1, {}
     extra = ["--cores", str(execution.cores), "--resources", f"mem_mb={memory}"]
-    if not execution.local:
-        cluster = slurm.ask_cluster(execution.slurm)
+    cluster = execution.cluster
+    if cluster is not None:
         memory, nodes = cluster.largest_mb, cluster.nodes
         choice = {"slurm_partition": execution.slurm.partition, "slurm_account": execution.slurm.account}
         chosen = {name: value for name, value in choice.items() if value is not None}
@@ -200,7 +201,7 @@ def _prepare(jobs: Sequence[Job], options: BatchOptions, execution: Execution, w
     ]  # fmt: skip
     document = {
         "root": str(options.root), "profile": options.profile, "overrides": list(options.overrides), "seed": options.seed,
-        "store": options.store, "stages": api.REGISTRY.references, "grow": not execution.local, "most_memory_mb": memory, "nodes": nodes,
+        "store": options.store, "stages": api.REGISTRY.references, "grow": cluster is not None, "most_memory_mb": memory, "nodes": nodes,
         "records": str(options.root / FOLDER / "records"), "resources": chosen, "jobs": rows,
     }  # fmt: skip
     write_atomic(path, json.dumps(document))

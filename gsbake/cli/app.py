@@ -257,7 +257,13 @@ def batch_command(
     threads: ThreadsOption = 0,
     seed: BatchSeedOption = 0,
     store: StoreOption = None,
-    jobs: Annotated[int, typer.Option("--jobs", min=1, max=100_000, help="Most jobs in Slurm's queue at a time.")] = 100,
+    jobs: Annotated[
+        int,
+        typer.Option(
+            "--jobs", min=0, max=100_000, help="Most jobs in Slurm's queue at a time; 0: two for each core, at least 100.",
+            show_default=False,
+        ),
+    ] = 0,
     partition: Annotated[str | None, typer.Option("--partition", help="Slurm's partition.  [default: Slurm's]", show_default=False)] = None,
     account: Annotated[str | None, typer.Option("--account", help="Slurm's account.  [default: the user's]", show_default=False)] = None,
     retry_failed: Annotated[bool, typer.Option("--retry-failed", help="Run captures again that failed with the same input.")] = False,
