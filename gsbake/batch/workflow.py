@@ -19,6 +19,7 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import psutil
 
@@ -98,7 +99,8 @@ def run_workflow(
             python_command("-m", "snakemake", *arguments),
             cwd=work, stdin=subprocess.DEVNULL, stdout=log, stderr=log, env=python_environment(), start_new_session=True,
         )  # fmt: skip
-        _process_file(options.root).write_text(json.dumps({"pid": process.pid, "started": psutil.Process(process.pid).create_time()}))
+        started = psutil.Process(process.pid).create_time()
+        _process_file(options.root).write_text(json.dumps({"pid": process.pid, "started": started, "executor": execution.executor}))
         stalled = False
         try:
             while process.poll() is None and not stalled:
@@ -121,7 +123,8 @@ def run_workflow(
 
 
 def end_orphan(root: Path) -> None:
-    """Stop the Snakemake of a coordinator that was killed, and its jobs, on this machine and in Slurm's queue; they write checkpoints."""
+    """Stop the Snakemake of a coordinator that was killed, and its jobs, on this machine or in Slurm's queue; they write checkpoints."""
+    body: dict[str, Any] = {}
     with suppress(OSError, ValueError, KeyError, TypeError, psutil.Error):
         body = json.loads(_process_file(root).read_text())
         process = psutil.Process(int(body["pid"]))
@@ -131,9 +134,9 @@ def end_orphan(root: Path) -> None:
                 process.wait(_STOP_TIMEOUT)
             with suppress(ProcessLookupError):
                 os.killpg(process.pid, signal.SIGKILL)
-    _process_file(root).unlink(missing_ok=True)
-    if shutil.which("squeue") is not None:
+    if body.get("executor") == "slurm":
         slurm.cancel_jobs(slurm.job_prefix(root))
+    _process_file(root).unlink(missing_ok=True)
 
 
 class _Progress:

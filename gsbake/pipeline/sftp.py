@@ -20,7 +20,7 @@ _TIMEOUT = 30.0
 _SYSTEM_KEYS = Path("/etc/ssh/ssh_known_hosts")
 
 
-class _KnownHostsOnly(paramiko.MissingHostKeyPolicy):
+class _KnownHostsOnly(paramiko.MissingHostKeyPolicy):  # type: ignore[misc]  # paramiko has no types
     """Refuses a server whose key is not known, with what to do."""
 
     def missing_host_key(self, client: Any, hostname: str, key: Any) -> None:

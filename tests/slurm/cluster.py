@@ -27,7 +27,7 @@ _CONFIG_FOLDER = Path("/etc/slurm")
 #: Variable by which the processes of a node's slurmd are found.
 _MARK = "GSBAKE_TEST_NODE"
 #: Seconds until a node that does not answer counts as lost, and until the daemons must be ready.
-NODE_TIMEOUT, START_TIMEOUT = 10, 60.0
+NODE_TIMEOUT, START_TIMEOUT = 60, 300.0
 _CONFIG = """\
 ClusterName=gsbake
 SlurmctldHost={host}(127.0.0.1)
@@ -52,6 +52,7 @@ SwitchType=switch/none
 ReturnToService=2
 SlurmdTimeout={node_timeout}
 KillWait=30
+OverTimeLimit=UNLIMITED
 SchedulerParameters=sched_interval=5,bf_interval=5,batch_sched_delay=0,sched_min_interval=0
 SelectType=select/cons_tres
 SelectTypeParameters=CR_Core_Memory

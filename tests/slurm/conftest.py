@@ -1,7 +1,11 @@
-"""The cluster, small captures, and the bytes of their plain runs."""
+"""The cluster, small captures, and the bytes of their plain runs.
+
+GSBAKE_SLURM_REFERENCE names a folder that keeps captures and plain runs between test sessions.
+"""
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -26,12 +30,19 @@ def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
 
 
 @pytest.fixture(scope="session")
-def captures(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
-    """Two built-in captures."""
-    return write_captures(tmp_path_factory.mktemp("captures"), 2)
+def reference(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder of captures and plain runs."""
+    kept = os.environ.get("GSBAKE_SLURM_REFERENCE")
+    return Path(kept) if kept else tmp_path_factory.mktemp("reference")
 
 
 @pytest.fixture(scope="session")
-def plain(captures: list[Path], tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict[str, str]]:
+def captures(reference: Path) -> list[Path]:
+    """Two built-in captures."""
+    return write_captures(reference / "captures", 2)
+
+
+@pytest.fixture(scope="session")
+def plain(captures: list[Path], reference: Path) -> dict[str, dict[str, str]]:
     """{capture: digests} of plain runs."""
-    return plain_runs(captures, tmp_path_factory.mktemp("plain"))
+    return plain_runs(captures, reference / "plain")

@@ -10,7 +10,8 @@ import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,7 +22,7 @@ from tests.pipeline.test_shared_store import plant_damage
 from tests.slurm.batches import PROFILE, Batch, digests, events, gsbake, stages, start_batch, write_captures
 from tests.slurm.cluster import Cluster
 
-pytestmark = [pytest.mark.stress, pytest.mark.timeout(6 * 3600)]
+pytestmark = [pytest.mark.stress, pytest.mark.timeout(12 * 3600)]
 COUNT, DAMAGED = 12, 50
 
 
@@ -36,16 +37,19 @@ class Farm:
 
 
 @pytest.fixture(scope="module")
-def farm(tmp_path_factory: pytest.TempPathFactory) -> Farm:
-    root = tmp_path_factory.mktemp("farm")
+def farm(reference: Path) -> Farm:
+    root = reference / "twelve"
     captures = write_captures(root / "captures", COUNT)
-    poses = captures[0] / "transforms.json"
-    body = json.loads(poses.read_text())
-    (root / "full.json").write_text(poses.read_text())
+    full = root / "full.json"
+    if not full.exists():
+        full.write_text((captures[0] / "transforms.json").read_text())
+    body = json.loads(full.read_text())
     left_out = body["frames"].pop()
-    poses.write_text(json.dumps(body))
     later = root / Path(left_out["file_path"]).name
-    (captures[0] / left_out["file_path"]).rename(later)
+    if not later.exists():
+        (captures[0] / left_out["file_path"]).rename(later)
+    (captures[0] / left_out["file_path"]).unlink(missing_ok=True)
+    (captures[0] / "transforms.json").write_text(json.dumps(body))
     for path in captures:
         plain_run(path, root / "plain" / path.name, "--store", root / "store")
     return Farm(captures, {path.name: digests(root / "plain" / path.name) for path in captures}, root / "store", later)
@@ -77,18 +81,29 @@ def test_twelve_captures_through_slurm(farm: Farm, cluster: Cluster, tmp_path: P
     tell(capsys, f"the same batch again: {time.perf_counter() - begin:.1f} s, {again.output().strip().splitlines()[-1]}")
     assert started(again, farm.captures) == before
 
-    shutil.copy(farm.later, farm.captures[0] / "images")
-    shutil.copy(farm.later.with_name("full.json"), farm.captures[0] / "transforms.json")
-    more = start_batch(farm.captures, batch.root, cluster.environment, settings=())
-    more.finish()
+    with one_photo_more(farm):
+        more = start_batch(farm.captures, batch.root, cluster.environment, settings=())
+        more.finish()
+        plain_run(farm.captures[0], tmp_path / "plain")
     after = started(more, farm.captures)
     tell(capsys, f"one photo more: stages run by capture {[after[p.name] - before[p.name] for p in farm.captures]}")
     assert after[farm.captures[0].name] > before[farm.captures[0].name]
     assert {name: count for name, count in after.items() if name != farm.captures[0].name} == {
         name: count for name, count in before.items() if name != farm.captures[0].name
     }
-    plain_run(farm.captures[0], tmp_path / "plain")
     assert set(digests(tmp_path / "plain").values()) <= set(digests(batch.root / farm.captures[0].name).values())
+
+
+@contextmanager
+def one_photo_more(farm: Farm) -> Iterator[None]:
+    """The first capture with the photo that it lacks, and its pose."""
+    photo, poses = farm.captures[0] / "images" / farm.later.name, farm.captures[0] / "transforms.json"
+    before = poses.read_text()
+    shutil.copy(farm.later, photo)
+    shutil.copy(farm.later.with_name("full.json"), poses)
+    yield
+    photo.unlink()
+    poses.write_text(before)
 
 
 def started(batch: Batch, captures: Sequence[Path]) -> dict[str, int]:
@@ -97,12 +112,6 @@ def started(batch: Batch, captures: Sequence[Path]) -> dict[str, int]:
 
 def test_fifty_corruptions(farm: Farm, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Found by `gsbake cache verify`, and by a batch, which computes the damaged stages again and no others."""
-    poses, photo = farm.captures[0] / "transforms.json", farm.captures[0] / "images" / farm.later.name
-    if photo.exists():  # the capture as it was for the plain runs
-        photo.unlink()
-        body = json.loads(poses.read_text())
-        body["frames"] = [frame for frame in body["frames"] if Path(frame["file_path"]).name != farm.later.name]
-        poses.write_text(json.dumps(body))
     shared = tmp_path / "store"
     shutil.copytree(farm.store, shared)
     rng = random.Random(11)

@@ -20,7 +20,7 @@ import pytest
 from tests.slurm.batches import Batch, events, stages, start_batch
 from tests.slurm.cluster import Cluster
 
-pytestmark = [pytest.mark.stress, pytest.mark.timeout(5400)]
+pytestmark = [pytest.mark.stress, pytest.mark.timeout(6 * 3600)]
 Plain = dict[str, dict[str, str]]
 
 
