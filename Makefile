@@ -63,7 +63,7 @@ check: setup ## Lint and types
 test: check node ## Lint, types and the quick tests, with the share of lines they run
 	$(BIN)/pytest -m "not slow and not stress" --cov --cov-report=term:skip-covered
 
-stress: setup node ## The slow tests: hostile input at length, kills at random moments, poses of a development capture where present
+stress: setup node ## The slow tests: hostile input at length, kills at random moments, faults on a Slurm cluster and on servers where installed, poses of a development capture where present
 	GSBAKE_FUZZ_INPUTS=$(FUZZ_INPUTS) $(BIN)/pytest -m "slow or stress"
 
 bench: setup ## Measure kernels, error against time (beside other tools) and growth, about two idle hours: PARTS="table timeline growth" ARGS=…

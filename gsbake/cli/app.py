@@ -257,20 +257,30 @@ def batch_command(
     threads: ThreadsOption = 0,
     seed: BatchSeedOption = 0,
     store: StoreOption = None,
-    jobs: Annotated[int, typer.Option("--jobs", min=1, max=100_000, help="Most jobs in Slurm's queue at a time.")] = 100,
+    jobs: Annotated[
+        int,
+        typer.Option(
+            "--jobs", min=0, max=100_000, help="Most jobs in Slurm's queue at a time; 0: two for each core, at least 100.",
+            show_default=False,
+        ),
+    ] = 0,
+    partition: Annotated[str | None, typer.Option("--partition", help="Slurm's partition.  [default: Slurm's]", show_default=False)] = None,
+    account: Annotated[str | None, typer.Option("--account", help="Slurm's account.  [default: the user's]", show_default=False)] = None,
     retry_failed: Annotated[bool, typer.Option("--retry-failed", help="Run captures again that failed with the same input.")] = False,
     quiet: QuietOption = False,
     as_json: JsonOption = False,
 ) -> None:  # fmt: skip
     """Bake many captures on this machine or with Slurm, through Snakemake; the same command goes on where it stopped."""
     from gsbake.batch.captures import BatchOptions
+    from gsbake.batch.slurm import SlurmOptions
     from gsbake.cli import batch
 
     options = BatchOptions(out, profile, tuple(overrides or ()), threads, seed, store)
     if captures == [Path("status")]:
         batch.status(out, as_json)
     else:
-        batch.batch(captures, options, executor, retry_failed=retry_failed, workers=jobs, quiet=quiet, as_json=as_json)
+        slurm = SlurmOptions(partition, account)
+        batch.batch(captures, options, executor, retry_failed=retry_failed, workers=jobs, slurm=slurm, quiet=quiet, as_json=as_json)
 
 
 cache_app = typer.Typer(
