@@ -1,6 +1,6 @@
 """Builder of a GLB's binary chunk: buffer views and accessors, plain or compressed by meshoptimizer.
 
-EXT_meshopt_compression: a compressed view lies in the binary chunk and stands for one in a second buffer without data, which no reader needs.
+EXT_meshopt_compression: a compressed view lies in the binary chunk and stands for one in a second buffer, which has no data.
 glTF 2.0 specification, section 3.6 (buffers, accessors).
 """
 
@@ -47,7 +47,7 @@ class Buffer:
         rows = np.zeros((count, stride // size), values.dtype)
         rows[:, :width] = values
         entry: dict[str, Any] = {
-            "bufferView": self._encoded(rows, ARRAY_BUFFER, "ATTRIBUTES", None if stride == width * size and not self.compressed else stride),
+            "bufferView": self._encoded(rows, ARRAY_BUFFER, "ATTRIBUTES", stride if self.compressed or stride > width * size else None),
             "componentType": COMPONENTS[values.dtype.str[1:]],
             "count": count,
             "type": KINDS[width],
@@ -90,9 +90,8 @@ class Buffer:
         index = self.view(content)
         stored = self.views[index]
         size = rows.nbytes // len(rows)
-        extension = {
-            "buffer": 0, "byteOffset": stored["byteOffset"], "byteLength": len(content), "byteStride": size, "count": len(rows), "mode": mode,
-        }  # fmt: skip
+        place = {"buffer": 0, "byteOffset": stored["byteOffset"], "byteLength": len(content)}
+        extension = {**place, "byteStride": size, "count": len(rows), "mode": mode}
         self.fallback += -self.fallback % 4
         entry = {"buffer": 1, "byteOffset": self.fallback, "byteLength": rows.nbytes, "target": target, "extensions": {MESHOPT: extension}}
         if stride is not None:

@@ -43,8 +43,8 @@ class GltfMesh:
 
 @dataclass(frozen=True)
 class GltfTextures:
-    """Encoded images, PNG, JPEG, WebP or KTX2: base colour (sRGB), occlusion-roughness-metallic (ORM) and normal map (both linear), emissive (sRGB); the last
-    two may be absent. With constant roughness and metallic, `orm` is occlusion only."""
+    """Encoded images, PNG, JPEG, WebP or KTX2: base colour (sRGB), occlusion-roughness-metallic (ORM) and normal map (both linear),
+    emissive (sRGB); the last two may be absent. With constant roughness and metallic, `orm` is occlusion only."""
 
     base_color: bytes
     orm: bytes

@@ -13,12 +13,13 @@ from gsbake import __version__
 from gsbake.capture.posed_photos import PosedPhotos
 from gsbake.config.schema import Report
 from gsbake.errors import BadInputError
+from gsbake.gltf.frame import read_transforms_json
 from gsbake.monitor import SILENT, Monitor
 from gsbake.report import compose, manifests
 from gsbake.report.asset import open_asset
 from gsbake.report.html import Light, Page, Panel, render_page
 from gsbake.report.masks import mask_panels
-from gsbake.report.quality import asset_cameras, select_views
+from gsbake.report.quality import select_views
 from gsbake.report.render import Asset, Renderer, Shader, unlit
 from gsbake.report.sheets import map_panels
 from gsbake.surfels.training.views import test_photos
@@ -95,7 +96,7 @@ class _ReportWriter:
         posed = PosedPhotos.open(self.folders["poses"], self.folders["refine"])
         with monitor.part("open"):
             asset = open_asset(self.glb, unlit=not light.exists())
-            cameras = asset_cameras(self.folders["export"] / "cameras.json")
+            cameras = read_transforms_json(self.folders["export"] / "cameras.json")
             if len(cameras) != len(posed):
                 raise BadInputError(
                     f"The asset's cameras.json lists {len(cameras)} cameras for {len(posed)} photos; export the asset again."

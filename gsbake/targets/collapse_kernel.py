@@ -1,7 +1,7 @@
 """Edge collapses in order of cost, with texture coordinates and seams kept (Numba).
 
-Vertices inside a chart move to the point of least error in position and texture. Vertices of a crease (a seam or a border) collapse along it
-onto a neighbour, on all their wedges at once; ends and crossings of creases stay. A collapse is refused that changes the topology (link
+Vertices inside a chart move to the point of least error in position and texture. Vertices of a crease (a seam or a border) collapse along
+it onto a neighbour, on all their wedges at once; ends and crossings of creases stay. A collapse is refused that changes the topology (link
 condition: Dey et al., *Topology preserving edge contraction*, 1999), turns a triangle over on the surface or in the texture, makes a
 sliver, or moves a seam in the texture by more than a tolerance.
 
@@ -23,7 +23,7 @@ MIN_COSINE, MIN_QUALITY = 0.2, 0.02
 #: Weight of the pull to the middle of an edge, which makes the least point unique on flat surfaces; share of the quadric's weight.
 PULL = 1e-3
 
-_JIT = {"cache": True, "error_model": "numpy", "nogil": True}
+_JIT: dict[str, Any] = {"cache": True, "error_model": "numpy", "nogil": True}
 
 
 @nb.njit(**_JIT)
@@ -181,7 +181,7 @@ def _segment_distance(p: Any, a: Any, b: Any) -> float:
 
 @nb.njit(**_JIT)
 def _previous_on_crease(a: int, b: int, w: int, head: Any, following: Any, faces: Any, vertex: Any, alive: Any, found: Any) -> int:
-    """The wedge at the other end of the second crease edge of vertex a, beside wedge w; -1 where there is none. `found` is scratch (2, 3)."""
+    """The wedge at the other end of the second crease edge of vertex a, beside wedge w; -1: none. `found` is scratch (2, 3)."""
     corner = head[a]
     while corner >= 0:
         face, k = corner // 3, corner % 3
@@ -203,7 +203,7 @@ def _plan(
 ) -> tuple[float, float]:
     """Cost of collapsing vertex a onto b, inf where it is refused, and the accumulated drift of the seam.
 
-    `wedges` (2, 2) becomes the pairs (wedge of a, wedge of b), `to` (2, 5) where b's wedges go. Both ends inside: they meet at the least point.
+    `wedges` (2, 2) becomes the pairs (wedge of a, wedge of b), `to` (2, 5) where b's wedges go: the least point where both are inside.
     """  # fmt: skip
     found = np.empty((2, 3), np.int64)
     none = np.inf
@@ -218,10 +218,8 @@ def _plan(
     if _linked(a, b, ring, head, following, faces, vertex, alive, mark) != count:
         return none, 0.0
     sides = 1 if count == 1 or (found[0, 0] == found[1, 0] and found[0, 1] == found[1, 1]) else 2
-    if sides == 2 and (found[0, 0] == found[1, 0]) != (found[0, 1] == found[1, 1]) and kind[a] == CREASE:
-        # a seam that ends at b: both wedges of a go to the one of b
-        if found[0, 0] == found[1, 0]:
-            return none, 0.0
+    if sides == 2 and found[0, 0] == found[1, 0]:  # the seam ends at a
+        return none, 0.0
     wedges[:] = -1
     for side in range(sides):
         wedges[side, 0], wedges[side, 1] = found[side, 0], found[side, 1]
@@ -283,7 +281,9 @@ def collapse(
             a, b = vertex[faces[face, k]], vertex[faces[face, (k + 1) % 3]]
             for start, end in ((a, b), (b, a)):
                 ring += 2
-                cost, _ = _plan(start, end, ring, kind, quadric, head, following, faces, vertex, alive, point, mark, drift, tolerance, to, wedges)
+                cost, _ = _plan(
+                    start, end, ring, kind, quadric, head, following, faces, vertex, alive, point, mark, drift, tolerance, to, wedges
+                )
                 if cost <= max_cost:
                     heap.append((cost, start, end, 0, 0))
     heapq.heapify(heap)
@@ -340,8 +340,9 @@ def collapse(
                         for start, end in ((v, b), (b, v)):
                             ring += 2
                             cost, _ = _plan(
-                                start, end, ring, kind, quadric, head, following, faces, vertex, alive, point, mark, drift, tolerance, to, wedges
-                            )
+                                start, end, ring, kind, quadric, head, following, faces, vertex, alive, point, mark, drift, tolerance,
+                                to, wedges,
+                            )  # fmt: skip
                             if cost <= max_cost:
                                 heapq.heappush(heap, (cost, start, end, version[start], version[end]))
             corner = following[corner]

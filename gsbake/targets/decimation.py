@@ -84,14 +84,6 @@ class WedgeMesh:
         return GltfMesh(place[source], normal[source], frames.tangent, uv[source], frames.faces)
 
 
-@dataclass(frozen=True)
-class Decimated:
-    """A decimated mesh and its measured deviation from the one that it was made of, in units of the mesh."""
-
-    mesh: GltfMesh
-    deviation: Deviation
-
-
 def decimate_to_count(mesh: WedgeMesh, target: int) -> WedgeMesh:
     """The mesh with at most `target` triangles, or as few as seams and the largest error allow."""
     limit = (MAX_ERROR * float(np.linalg.norm(np.ptp(mesh.position, axis=0)))) ** 2
@@ -111,7 +103,7 @@ def decimate_to_count(mesh: WedgeMesh, target: int) -> WedgeMesh:
 
 
 def decimate_to_cost(mesh: WedgeMesh, max_cost: float, target: int = 0, tolerance: float = SEAM_TOLERANCE) -> WedgeMesh:
-    """The mesh after all collapses of at most `max_cost` (squared units), or with `target` triangles; seams move by at most `tolerance` (UV)."""
+    """The mesh after all collapses of at most `max_cost` (squared units), or with `target` triangles; seams move by `tolerance` (UV)."""
     scale = TEXTURE_WEIGHT * _length_per_uv(mesh)
     point = points(mesh.position, mesh.uv, mesh.vertex, scale)
     quadric = triangle_quadrics(point, mesh.faces)
@@ -126,11 +118,8 @@ def decimate_to_cost(mesh: WedgeMesh, max_cost: float, target: int = 0, toleranc
     return WedgeMesh(position, point[:, 3:] / scale, mesh.vertex, faces, kind, creases)
 
 
-def decimate_to_bound(mesh: WedgeMesh, max_triangles: int, bound: float) -> tuple[WedgeMesh, Deviation]:
-    """The mesh with the fewest triangles found whose deviation is at most `bound` (units of the mesh).
-
-    Where that takes more than `max_triangles` it has as many, and the deviation exceeds the bound.
-    """
+def decimate_to_bound(mesh: WedgeMesh, bound: float) -> tuple[WedgeMesh, Deviation]:
+    """The mesh with the fewest triangles found whose deviation is at most `bound` (units of the mesh); itself where there is none."""
     best: tuple[WedgeMesh, Deviation] = mesh, Deviation(0.0, 0.0)
     cost = (bound / 3) ** 2  # the quadrics' mean is well below the 99.9 % quantile
     for _ in range(MAX_TRIES if bound > 0 else 0):
@@ -142,9 +131,6 @@ def decimate_to_bound(mesh: WedgeMesh, max_triangles: int, bound: float) -> tupl
             if deviation.quantile >= CLOSE_ENOUGH * bound:
                 break
         cost *= np.clip(0.85 * bound / max(deviation.quantile, 1e-30), 0.2, 3.0) ** 2
-    if len(best[0].faces) > max_triangles:
-        tried = decimate_to_count(mesh, max_triangles)
-        best = tried, surface_deviation(mesh.surface, tried.surface)
     return best
 
 

@@ -1,7 +1,7 @@
 """Quadrics of a textured surface: squared distances in the space of position and texture coordinates.
 
 A point of a wedge is (x, y, z, l·u, l·v), where `l` turns texture units into lengths, so that texture that slides over the surface counts
-as an error of shape. The quadric of a triangle is the squared distance to its plane in these five dimensions, weighted by its area; a crease
+as an error of shape. A triangle's quadric is the squared distance to its plane in these five dimensions, weighted by its area; a crease
 (seam or border) adds, per side, the squared distance to the plane through the edge across the surface, and to its line in the texture.
 
 A quadric is a row of 22 numbers: the upper triangle of A (15), b (5), c, weight; its value at x is xᵀAx + 2 b·x + c.
