@@ -3,14 +3,13 @@
 Images are (h, 2h, 3) with the zenith in row 0; the centre of pixel (i, j) (row, column) is at u = (j + ½)/2h from left to right and
 v = 1 − (i + ½)/h from bottom to top. Two conventions map (u, v) to directions; both show the world from inside, not mirrored:
 
-`blender`, Z-up (Cycles' equirectangular mapping):   u = atan2(y, −x)/2π + ½,   v = atan2(z, √(x² + y²))/π + ½
-    centre of the image −X, at u = ¼ −Y, at u = ¾ +Y, at the left and right edges +X.
+`blender`, Z-up (Cycles' equirectangular mapping):   u = ½ − atan2(y, x)/2π,   v = atan2(z, √(x² + y²))/π + ½
+    centre of the image +X, at u = ¼ +Y, at u = ¾ −Y, at the left and right edges −X.
 
 `gltf`, Y-up (three.js and the Khronos sample viewer):   u = atan2(z, x)/2π + ½,   v = asin(y)/π + ½
     centre of the image +X, at u = ¼ −Z, at u = ¾ +Z, at the edges −X.
 
-glTF's (x, y, z) is Blender's (x, −z, y), so the centre of a file is at −X in Blender and at +X in a glTF viewer: a file for one has to be
-rotated by 180° (columns rolled by h) for the other. Blender's importer converts the axes of meshes only.
+glTF's (x, y, z) is Blender's (x, −z, y), as its importer converts meshes: both conventions are the same, and one file serves both.
 """
 
 from __future__ import annotations
@@ -34,14 +33,14 @@ def directions(height: int, convention: Convention = "blender", subdivide: int =
     azimuth = 2.0 * np.pi * ((np.arange(2 * rows) + 0.5) / (2 * rows) - 0.5)[None, :]
     forward, right, up = np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)
     up = np.broadcast_to(up, forward.shape)
-    return np.stack([-forward, right, up] if convention == "blender" else [forward, up, right], axis=-1)
+    return np.stack([forward, -right, up] if convention == "blender" else [forward, up, right], axis=-1)
 
 
 def coordinates(dirs: Array, convention: Convention = "blender") -> tuple[Array, Array]:
     """u from left to right and v from bottom to top, (n,) each in [0, 1], of directions (n, 3)."""
     x, y, z = dirs.T
     if convention == "blender":
-        forward, right, up = -x, y, z
+        forward, right, up = x, -y, z
     else:
         forward, right, up = x, z, y
     return np.arctan2(right, forward) / (2.0 * np.pi) + 0.5, np.arctan2(up, np.hypot(forward, right)) / np.pi + 0.5

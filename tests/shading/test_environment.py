@@ -23,10 +23,11 @@ def sun_light(sun: np.ndarray, size: int = 64) -> EnvironmentLight:
 @pytest.mark.parametrize(
     ("convention", "row", "column", "direction"),
     [
-        ("blender", 0.5, 0.5, (-1, 0, 0)),
-        ("blender", 0.5, 0.25, (0, -1, 0)),
-        ("blender", 0.5, 0.75, (0, 1, 0)),
-        ("blender", 0.5, 0.0, (1, 0, 0)),
+        # As a Cycles camera sees an image with one colour per column (Blender 4.5).
+        ("blender", 0.5, 0.5, (1, 0, 0)),
+        ("blender", 0.5, 0.25, (0, 1, 0)),
+        ("blender", 0.5, 0.75, (0, -1, 0)),
+        ("blender", 0.5, 0.0, (-1, 0, 0)),
         ("blender", 0.0, 0.5, (0, 0, 1)),
         ("gltf", 0.5, 0.5, (1, 0, 0)),
         ("gltf", 0.5, 0.25, (0, 0, -1)),
@@ -43,15 +44,15 @@ def test_conventions(convention: panorama.Convention, row: float, column: float,
 def test_pixels_match_the_viewers_formulas() -> None:
     blender = panorama.directions(16, "blender")
     x, y, z = np.moveaxis(blender, -1, 0)
-    u, v = np.arctan2(y, -x) / (2 * math.pi) + 0.5, np.arctan2(z, np.hypot(x, y)) / math.pi + 0.5
+    u, v = (0.5 - np.arctan2(y, x) / (2 * math.pi)) % 1, np.arctan2(z, np.hypot(x, y)) / math.pi + 0.5
     np.testing.assert_allclose(u, np.broadcast_to((np.arange(32) + 0.5) / 32, u.shape), atol=1e-12)
     np.testing.assert_allclose(v, np.broadcast_to(1 - (np.arange(16)[:, None] + 0.5) / 16, v.shape), atol=1e-12)
     x, y, z = np.moveaxis(panorama.directions(16, "gltf"), -1, 0)
     np.testing.assert_allclose(np.arctan2(z, x) / (2 * math.pi) + 0.5, u, atol=1e-12)
     np.testing.assert_allclose(np.arcsin(y) / math.pi + 0.5, v, atol=1e-12)
-    # Turning Z-up into Y-up, (x, y, z) → (x, z, −y), shifts the image by half its width.
+    # Turning Z-up into Y-up, (x, y, z) → (x, z, −y), leaves the image as it is.
     turned = blender @ np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
-    np.testing.assert_allclose(np.roll(panorama.directions(16, "gltf"), 16, axis=1), turned, atol=1e-12)
+    np.testing.assert_allclose(panorama.directions(16, "gltf"), turned, atol=1e-12)
 
 
 @pytest.mark.parametrize("convention", ["blender", "gltf"])
