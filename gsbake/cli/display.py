@@ -20,6 +20,7 @@ from gsbake.text import duration, figures, number, printable
 
 #: Seconds between progress lines without a terminal.
 PROGRESS_INTERVAL = 30.0
+_PREPARED = "kernels: compiled"
 _REUSED = {"cached": "cached", "replaced": "replaced by the user"}
 
 
@@ -32,6 +33,10 @@ class QuietDisplay(Observer):
     def warning(self, name: str, text: str) -> None:
         """Print a warning."""
         self.errors.print(cell(f"gsbake: warning ({name}): {text}"))
+
+
+    def preparing(self, done: int, total: int, text: str) -> None:
+        """Kernels are compiled, at stage `done` of `total`; `text` names the stage, empty at the end."""
 
 
 class PlainDisplay(QuietDisplay):
@@ -49,6 +54,10 @@ class PlainDisplay(QuietDisplay):
     def line(self, text: str) -> None:
         """Print a line with the time since the start of the run."""
         self.console.print(cell(f"{_clock(time.monotonic() - self._begin)}  {text}"))
+
+    def preparing(self, done: int, total: int, text: str) -> None:
+        """Print a line per stage while kernels are compiled."""
+        self.line(_PREPARED if not text else f"kernels: compiling those of {text}, {done} of {total} stages (once per installation)")
 
     def run_started(self, stages: list[Stage]) -> None:
         """Start the clock."""
@@ -109,6 +118,16 @@ class TerminalDisplay(PlainDisplay):
     def line(self, text: str) -> None:
         """Print a line above the bar."""
         self.console.print(cell(text))
+
+    def preparing(self, done: int, total: int, text: str) -> None:
+        """A bar of its own while kernels are compiled."""
+        if self._task is None:
+            self._task = self._bar.add_task("kernels", total=total, note="", left="")
+            self._bar.start()
+        self._bar.update(self._task, completed=done, total=total, note=f"compiling those of {text}, once per installation")
+        if not text:
+            self.close()
+            self.console.print(_done("kernels").append(_PREPARED.partition(" ")[2], "dim"))
 
     def stage_reused(self, state: StageState) -> None:
         """Print a stage that needs no work."""

@@ -10,6 +10,7 @@ from gsbake.cli.display import choose_display, close_display
 from gsbake.cli.inspect import plan_document, print_plan
 from gsbake.cli.options import Options
 from gsbake.cli.output import print_json, print_text
+from gsbake.cli.warm_up import compile_kernels
 from gsbake.pipeline.plan import StageState
 from gsbake.text import duration, number, size
 
@@ -27,6 +28,7 @@ def run_pipeline(options: Options, target: str | None) -> None:
             print_plan(states)
         return
     try:
+        compile_kernels(session, target, display)
         result = session.run(target)
     finally:
         close_display(display)

@@ -28,8 +28,9 @@ def test_targets(text: str, target: Target, stem: str, form: str) -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("mobile", "no target"), ("web:draco", "no form"), ("film:udim", "UDIM"), ("udim", "one UV tile"), ("web:webp+ktx2", "several"),
-        ("ar:usdz+obj", "several"), ("ar:usdz+meshopt", "stand alone"), ("surfels:usdz", "no forms"), ("web:", "no form"), ("", "no target"),
+        ("mobile", "no target"), ("web:draco", "no form"), ("film:udim", "UDIM"), ("udim", "one UV tile"),
+        ("web:webp+ktx2", "several"), ("ar:usdz+obj", "several"), ("ar:usdz+meshopt", "stand alone"), ("surfels:usdz", "no forms"),
+        ("web:", "no form"), ("", "no target"),
     ],
 )  # fmt: skip
 def test_wrong_targets(text: str, message: str) -> None:

@@ -14,7 +14,8 @@ from tests.support.node import run_node
 
 DECODE = """
 const folder = process.argv[1] + '/three/examples/jsm/libs/basis', fs = require('fs');
-const load = new Function('module', 'exports', '__dirname', 'require', fs.readFileSync(folder + '/basis_transcoder.js') + '; return BASIS;');
+const source = fs.readFileSync(folder + '/basis_transcoder.js') + '; return BASIS;';
+const load = new Function('module', 'exports', '__dirname', 'require', source);
 load({exports: {}}, {}, folder, require)({wasmBinary: fs.readFileSync(folder + '/basis_transcoder.wasm')}).then(basis => {
   basis.initializeBasis();
   const file = new basis.KTX2File(new Uint8Array(fs.readFileSync(process.argv[2])));

@@ -67,7 +67,8 @@ def visit(url: str, steps: list[dict[str, str]], folder: Any, size: tuple[int, i
     Returns `errors` and warnings of the console, `requests` beyond data inside the page, and `results` of the expressions.
     """
     job = folder / "visit.json"
-    job.write_text(json.dumps({"chromium": chromium(), "url": url, "steps": steps, "width": size[0], "height": size[1], "timeout": 1000 * TIMEOUT}))
+    what = {"chromium": chromium(), "url": url, "steps": steps, "width": size[0], "height": size[1], "timeout": 1000 * TIMEOUT}
+    job.write_text(json.dumps(what))
     found: dict[str, Any] = run_node(VISIT, "puppeteer-core", job)
     return found
 

@@ -53,7 +53,8 @@ def unwrapped() -> GltfMesh:
     position, normal = points[atlas.source], vertex_normals(points, faces)[atlas.source]
     frames = tangents(position, normal, atlas.uv, atlas.faces)
     source = frames.source
-    return GltfMesh(*(np.asarray(a, np.float32) for a in (position[source], normal[source], frames.tangent, atlas.uv[source])), frames.faces)
+    arrays = position[source], normal[source], frames.tangent, atlas.uv[source]
+    return GltfMesh(*(np.asarray(array, np.float32) for array in arrays), frames.faces)
 
 
 @pytest.fixture(scope="session")

@@ -44,10 +44,8 @@ def test_the_least_point_is_where_the_gradient_vanishes() -> None:
     quadric = triangle_quadrics(rng.normal(size=(12, 5)), rng.permutation(12).reshape(4, 3)).sum(0)
     best = np.empty(5)
     assert least_point(quadric, np.zeros(5), best)
-    pulled = quadric.copy()
-    value = [
-        quadric_value(pulled, best + d) + 1e-3 * quadric[21] * np.sum((best + d) ** 2) for d in [np.zeros(5), *rng.normal(size=(20, 5)) * 1e-2]
-    ]
+    steps = [np.zeros(5), *rng.normal(size=(20, 5)) * 1e-2]
+    value = [quadric_value(quadric, best + d) + 1e-3 * quadric[21] * np.sum((best + d) ** 2) for d in steps]
     assert np.argmin(value) == 0
 
 
