@@ -3,8 +3,8 @@
 python -m benchmarks.blender OUT… --python PYTHON_WITH_BPY [--views N]
 
 Axes, orientation of the light and exposure are those of the files, as anybody imports them. Prints the mean PSNR of Blender's pictures and
-of our own renderer's over the same test photos, both measured as the report does; Cycles casts shadows and interreflections that the split sum
-of the report leaves out, so the two differ. Exits 1 where Blender's is more than 1 dB below.
+of our own renderer's over the same test photos, both measured as the report does; Cycles casts shadows and interreflections that the split
+sum of the report leaves out, so the two differ. Exits 1 where Blender's is more than 1 dB below.
 """
 
 from __future__ import annotations

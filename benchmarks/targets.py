@@ -3,9 +3,9 @@
 python -m benchmarks.targets OUT… [--score "PYTHON SCORE.PY" --truth OUT=CAPTURE/gt …] [--render NAME …]
 
 OUT is the output folder of `gsbake run … --target …`. Distances are those of `gsbake compare`: chamfer distance as a share of the dense
-mesh's diagonal. `--score` is the independent scorer, which renders the asset in Blender under lights that lit no photo; it reads neither KTX2
-nor meshoptimizer, so such files are decoded by gsbake's reader and written plainly first. `--render` names the files that it renders; default:
-all of level 0. Rows go to benchmarks/results/targets.csv, each with commit, host, seed and date; rows of other files stay.
+mesh's diagonal. `--score` is the independent scorer, which renders the asset in Blender under lights that lit no photo; it reads neither
+KTX2 nor meshoptimizer, so such files are decoded by gsbake's reader and written plainly first. `--render` names the files that it renders;
+default: all of level 0. Rows go to benchmarks/results/targets.csv, each with commit, host, seed and date; rows of other files stay.
 """
 
 from __future__ import annotations

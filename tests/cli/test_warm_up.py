@@ -41,6 +41,7 @@ def runs(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[dict[str, Any]
         options["observer"].stage_finished(None)
 
     monkeypatch.setattr("gsbake.api.run", run)
+    monkeypatch.setattr("gsbake.synth.capture.write_capture", lambda folder, views, size: None)
     monkeypatch.setenv("GSBAKE_WARM_UP", "auto")
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
     return started
