@@ -32,6 +32,7 @@ from gsbake.cli.options import (
     TargetOption,
     ThreadsOption,
     VerboseOption,
+    ViewOption,
     complete_profile,
     complete_stage,
     given_path,
@@ -102,6 +103,7 @@ def _pipeline_command(target: str | None) -> Callable[..., None]:
         seed: SeedOption = None,
         store: StoreOption = None,
         dry_run: DryRunOption = False,
+        view: ViewOption = False,
         quiet: QuietOption = False,
         verbose: VerboseOption = False,
         as_json: JsonOption = False,
@@ -113,7 +115,7 @@ def _pipeline_command(target: str | None) -> Callable[..., None]:
         options = Options(
             photos=photos, out=out, profile=profile, overrides=settings,
             masks=masks.folder if masks else None, poses=poses, device=device.value, threads=threads, seed=seed,
-            dry_run=dry_run, quiet=quiet, verbose=verbose, as_json=as_json, store=store,
+            dry_run=dry_run, quiet=quiet, verbose=verbose, as_json=as_json, store=store, view=view,
         )  # fmt: skip
         run_pipeline(options, target)
 

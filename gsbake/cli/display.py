@@ -11,7 +11,7 @@ from rich.progress import BarColumn, Progress, TaskID, TaskProgressColumn, TextC
 from rich.text import Text
 
 from gsbake.cli.output import cell
-from gsbake.cli.time_left import TimeLeft
+from gsbake.live.time_left import TimeLeft
 from gsbake.pipeline.engine import Observer
 from gsbake.pipeline.lease import LeaseHolder
 from gsbake.pipeline.plan import StageState

@@ -196,6 +196,9 @@ PosesOption = Annotated[
     ),
 ]
 InvertOption = Annotated[bool, typer.Option("--invert-masks", help="Masks are white on the background.")]
+ViewOption = Annotated[
+    bool, typer.Option("--view", help="Serve a page on this machine that shows the run: render, curves, decisions, time left.")
+]
 DeviceOption = Annotated[Device, typer.Option("--device", help="Device of the kernels.")]
 ThreadsOption = Annotated[
     int, typer.Option("--threads", help="Number of threads, at most 512; 0 uses the physical cores.", show_default=False)
@@ -234,6 +237,7 @@ class Options:
     verbose: bool = False
     as_json: bool = False
     store: str | None = None
+    view: bool = False
 
     def session(self, observer: Observer | None = None) -> Session:
         """Session of the run that the options describe; nothing is written."""

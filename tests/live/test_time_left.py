@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from gsbake.cli.time_left import TimeLeft
+from gsbake.live.time_left import TimeLeft
 
 
 def test_a_first_step_that_compiles_does_not_count() -> None:
