@@ -69,7 +69,7 @@ def test_points_are_read_from_the_coverage_of_the_bake(asset: Asset, tmp_path: P
 
 
 def test_the_map_marks_weak_views_and_cannot_leave_its_element(asset: Asset) -> None:
-    cameras = [look_at(np.array(c), size=32, name=name) for c, name in (((2, 0, 0), "a"), ((0, 2, 0), "</script>b"), ((0, 0, 2), "c"))]
+    cameras = [look_at(np.array(c), size=32, name=name) for c, name in (((2, 0, 0), "a"), ((0, 2, 0), "</script>b"), ((1.5, 0, 1.5), "c"))]
     text = map_json(asset, cameras, unseen_below(asset), {"a": 20.0, "</script>b": 30.0}, [(np.array([0.0, -1, 0]), 0.5)])
     body = json.loads(text)
     assert "<" not in text and [c["weak"] for c in body["cameras"]] == [True, False, False]
