@@ -17,6 +17,7 @@ from gsbake.cli.options import (
     InvertOption,
     JsonOption,
     KnownDistanceOption,
+    LevelsOption,
     MarkerSizeOption,
     MasksOption,
     Options,
@@ -28,12 +29,15 @@ from gsbake.cli.options import (
     SeedOption,
     SetOption,
     StoreOption,
+    TargetOption,
     ThreadsOption,
     VerboseOption,
+    ViewOption,
     complete_profile,
     complete_stage,
     given_path,
     scale_settings,
+    target_settings,
 )
 
 app = typer.Typer(
@@ -62,6 +66,7 @@ STAGE_HELP = {
     "bake": "Unwrap the mesh and bake its textures.",
     "export": "Write asset.glb, cameras.json and light.hdr, and audit the asset.",
     "report": "Write report.html, which compares photos and renders.",
+    "targets": "Write the asset's files for the places where it is used (--target).",
 }
 
 
@@ -91,11 +96,14 @@ def _pipeline_command(target: str | None) -> Callable[..., None]:
         invert_masks: InvertOption = False,
         known_distances: KnownDistanceOption = None,
         marker_size: MarkerSizeOption = None,
+        targets: TargetOption = None,
+        levels: LevelsOption = None,
         device: DeviceOption = Device.auto,
         threads: ThreadsOption = 0,
         seed: SeedOption = None,
         store: StoreOption = None,
         dry_run: DryRunOption = False,
+        view: ViewOption = False,
         quiet: QuietOption = False,
         verbose: VerboseOption = False,
         as_json: JsonOption = False,
@@ -103,11 +111,11 @@ def _pipeline_command(target: str | None) -> Callable[..., None]:
         from gsbake.cli.run import run_pipeline
 
         mask_settings = (*(masks.settings if masks else ()), *(INVERTED if invert_masks else ()))
-        settings = [*(overrides or []), *mask_settings, *scale_settings(known_distances, marker_size)]
+        settings = [*(overrides or []), *mask_settings, *scale_settings(known_distances, marker_size), *target_settings(targets, levels)]
         options = Options(
             photos=photos, out=out, profile=profile, overrides=settings,
             masks=masks.folder if masks else None, poses=poses, device=device.value, threads=threads, seed=seed,
-            dry_run=dry_run, quiet=quiet, verbose=verbose, as_json=as_json, store=store,
+            dry_run=dry_run, quiet=quiet, verbose=verbose, as_json=as_json, store=store, view=view,
         )  # fmt: skip
         run_pipeline(options, target)
 

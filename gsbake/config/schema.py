@@ -12,6 +12,7 @@ from typing import Annotated, Literal
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
 from gsbake.config.lengths import parse_known_distance
+from gsbake.config.targets import parse_target
 from gsbake.monitor import Rule
 
 Fraction = Annotated[float, Field(ge=0, le=1)]
@@ -37,6 +38,12 @@ def _known_distance(text: str) -> str:
     return text
 
 
+def _target(text: str) -> str:
+    return parse_target(text).text
+
+
+#: A target that can be parsed, in its usual spelling.
+TargetText = Annotated[str, AfterValidator(_target)]
 #: A known distance that can be parsed.
 KnownDistanceText = Annotated[str, AfterValidator(_known_distance)]
 Pruning = Literal["visibility", "sdf", "gsdf", "gaussianroom", "gs-ror2"]
@@ -206,6 +213,14 @@ class Export(Section):
     copyright: str = Field("", description="Copyright line of the asset.")
 
 
+class Targets(Section):
+    """Further files of the asset, for the places where it is used."""
+
+    files: tuple[TargetText, ...] = Field((), max_length=32, description="Targets, each NAME or NAME:FORM+FORM. Names: default, web, ar, banner, planner, film (budgets of bytes, triangles and texels), surfels (splats as PLY). Forms: webp or ktx2, quantised or meshopt; usdz, usdc or obj instead of GLB.")
+    levels: int = Field(0, ge=0, le=8, description="Levels of detail below each target: files asset_lod1.glb and on, each with half the extent on the screen.")
+    lod_file: bool = Field(False, description="Also write all levels of a target into one GLB (MSFT_lod).")
+
+
 class Report(Section):
     """HTML report."""
 
@@ -246,5 +261,6 @@ class Profile(Section):
     bake: Bake = Bake()
     scale: Scale = Scale()
     export: Export = Export()
+    targets: Targets = Targets()
     report: Report = Report()
     skip: Skip = Skip()
