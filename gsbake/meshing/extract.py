@@ -5,6 +5,7 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,7 @@ from gsbake.meshing.decimation import decimate_to_error_bound
 from gsbake.meshing.decimator_choice import resolve_decimator
 from gsbake.meshing.depth_cache import DepthViewCache
 from gsbake.meshing.depth_views import DepthView, depth_noise
-from gsbake.meshing.imls import imls_field
+from gsbake.meshing.oriented_points import BALL_RADIUS, OrientedPoints, oriented_points
 from gsbake.meshing.refinement.normals import NormalAccumulator, integrate_normals
 from gsbake.meshing.refinement.silhouette import refine_silhouettes
 from gsbake.meshing.repair import close_holes, repair
@@ -31,22 +32,18 @@ from gsbake.meshing.support_plane import SupportPlane, find_support_plane, remov
 from gsbake.meshing.tsdf import SparseTsdf
 from gsbake.monitor import SILENT, Monitor, Rule, decide_skip, skips
 from gsbake.mvs.depth_maps import read_depth
-from gsbake.surfels.model import Surfels
+from gsbake.surfels.fields.registry import load_field
 from gsbake.surfels.raster.render import SurfelRenderer
 
 Doubles = NDArray[np.float64]
 Faces = NDArray[np.int32]
 
-#: Radius of the ball that contains the object: the unit sphere with a margin.
-BALL_RADIUS = 1.05
 #: Minimum and maximum truncation distance in voxels; between them it is three times the depth noise.
 TRUNCATION_CELLS = (4.0, 10.0)
 #: Maximum difference in voxels at which a stereo depth replaces a rendered one.
 STEREO_TOLERANCE = 3.0
 #: Memory for photos in photometric refinement, in bytes.
 PHOTO_CACHE_BYTES = 1 << 29
-#: Minimum opacity of a surfel, as a share of the transfer function's peak.
-MIN_OPACITY = 0.05
 #: Minimum extent of the surfels in the unit frame.
 MIN_EXTENT = 1e-9
 #: Maximum boundary edges of a hole that is filled after meshing; larger ones are openings.
@@ -68,15 +65,6 @@ class MeshOptions:
     def max_faces(self) -> int:
         """Maximum faces of the low-poly mesh under the error bound."""
         return max(self.mesh.faces, self.mesh.max_faces or min(4 * self.mesh.faces, self.max_triangles))
-
-
-@dataclass(frozen=True)
-class OrientedPoints:
-    """Surfels projected onto their zero set: `points` (n, 3), outward `normals` (n, 3), `weights` (n,) by area and opacity."""
-
-    points: Doubles
-    normals: Doubles
-    weights: Doubles
 
 
 def extract_mesh(
@@ -107,7 +95,7 @@ class _Extraction:
     """Inputs and settings of one mesh extraction."""
 
     posed: PosedPhotos
-    surfels: Path
+    trained: Path
     stereo: Path | None
     out: Path
     options: MeshOptions
@@ -115,6 +103,11 @@ class _Extraction:
     threads: int
     device: str
     monitor: Monitor
+
+    @cached_property
+    def renderer(self) -> SurfelRenderer:
+        """Renderer of the trained surfels."""
+        return SurfelRenderer.load(self.trained, self.device)
 
     def extract(self, cache: DepthViewCache) -> dict[str, Any]:
         """Run all steps; the results for the manifest."""
@@ -127,7 +120,7 @@ class _Extraction:
         evidence = f"median depth difference between neighbouring views {noise / resolution.cell:.2f} voxels"
         self.monitor.decide("truncation", f"{cells:.1f} voxels", evidence)
         support = self._support(samples)
-        field = self._field(cache, lower, upper, resolution, cells * resolution.cell, support, samples)
+        field = self._field(cache, lower, upper, resolution, cells * resolution.cell, support)
         with self.monitor.part("marching"):
             vertices, faces = field.mesh(close=self.options.mesh.holes == "close")
         del field
@@ -157,19 +150,11 @@ class _Extraction:
         }
 
     def _samples(self) -> OrientedPoints:
-        """Surfels inside the ball with at least `MIN_OPACITY`; raises BadInputError below ten."""
-        surfels = Surfels.load(self.surfels / "surfels.safetensors")
-        normal = surfels.normal().detach().cpu().numpy().astype(np.float64)
-        sdf = surfels.sdf.detach().cpu().numpy().astype(np.float64).reshape(-1, 1)
-        points = surfels.position.detach().cpu().numpy().astype(np.float64) - sdf * normal
-        opacity = surfels.opacity().detach().cpu().numpy().astype(np.float64).reshape(-1)
-        weights = surfels.scale.detach().cpu().numpy().astype(np.float64).prod(1) * opacity
-        keep = np.isfinite(points).all(1) & np.isfinite(normal).all(1) & np.isfinite(weights)
-        keep &= (np.linalg.norm(points, axis=1) <= BALL_RADIUS) & (opacity > MIN_OPACITY * surfels.transfer.peak)
-        if keep.sum() < 10:
+        """The surfels as oriented points; raises BadInputError below ten."""
+        samples = oriented_points(self.renderer.surfels)
+        if len(samples.points) < 10:
             raise BadInputError("mesh: fewer than ten surfels lie inside the unit sphere; training failed, see its figures in the report.")
-        weights = weights[keep]
-        return OrientedPoints(points[keep], normal[keep], weights / max(float(np.median(weights)), 1e-12))
+        return samples
 
     def _choose_resolution(self, points: Doubles) -> tuple[Doubles, Doubles, Resolution]:
         """The object's padded bounding box, and the voxel size with its reason."""
@@ -187,12 +172,11 @@ class _Extraction:
 
     def _render(self, cache: DepthViewCache, resolution: Resolution) -> None:
         """Render depth and normals at every photo's pose into the cache; stereo depths replace rendered ones that agree."""
-        renderer = SurfelRenderer.load(self.surfels, self.device)
         shares: list[float] = []
         for index in range(len(self.posed)):
             self.monitor.check_stop()
             photo = self.posed.view(index, self.options.train_size)
-            buffers = renderer.gbuffer(photo.camera)
+            buffers = self.renderer.gbuffer(photo.camera)
             view = DepthView.from_gbuffer(photo.camera, buffers, photo.mask, TRUNCATION_CELLS[0] * resolution.cell)
             stereo_file = None if self.stereo is None else self.stereo / "depth" / f"{photo.camera.name}.npz"
             if stereo_file is not None and stereo_file.exists():
@@ -215,7 +199,7 @@ class _Extraction:
 
     def _field(
         self, cache: DepthViewCache, lower: Doubles, upper: Doubles, resolution: Resolution, truncation: float,
-        support: SupportPlane | None, samples: OrientedPoints,
+        support: SupportPlane | None,
     ) -> SparseTsdf:  # fmt: skip
         """The distance field, from depth maps or from the surfels' SDF samples."""
         monitor, empty_outside = self.monitor, self.posed.has_masks or support is not None
@@ -230,7 +214,7 @@ class _Extraction:
             field.allocate(all_blocks=not skips(rule, holds=True))
         with monitor.part("fusion"):
             if self.options.mesh.field == "imls":
-                field.set_field(imls_field(field.lattice, samples.points, samples.normals, truncation, samples.weights))
+                field.set_field(load_field(self.trained, self.renderer.surfels, None).mesh(field.lattice, truncation))
             else:
                 for done, view in enumerate(cache):
                     monitor.check_stop()

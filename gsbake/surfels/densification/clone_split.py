@@ -94,7 +94,7 @@ def prune(
     """Prune surfels that are transparent, larger than `largest`, not finite, (given statistics) occluded in all views, or `off` (n,) the
     surface by a pruning policy; return also the kept indices and the number of surfels by reason."""
     dropped = {
-        "transparent": surfels.opacity() < MIN_RELATIVE_OPACITY * surfels.transfer.peak,
+        "transparent": surfels.opacity() < MIN_RELATIVE_OPACITY * surfels.peak_opacity,
         "too large": surfels.scale.max(1).values > largest,
         "not finite": ~torch.isfinite(surfels.position).all(1),
     }

@@ -21,10 +21,11 @@ if TYPE_CHECKING:
 SHADING_ALPHA_MIN = 1.0 / 255.0
 
 
-def rasterise(surfels: Surfels, view: TrainView, cull_backfaces: bool = False) -> Rendered:
-    """Blend all features of the surfels (their own, then the world normals) in one view."""
+def rasterise(surfels: Surfels, view: TrainView, cull_backfaces: bool = False, opacity: Tensor | None = None) -> Rendered:
+    """Blend all features of the surfels (their own, then the world normals) in one view; `opacity` (n,) replaces the surfels'."""
+    opacity = surfels.opacity() if opacity is None else opacity
     return render(
-        surfels.position, surfels.quaternion, surfels.log_scale, surfels.opacity(), surfels.features(view.centre),
+        surfels.position, surfels.quaternion, surfels.log_scale, opacity, surfels.features(view.centre),
         view.R, view.t, view.pinhole, cull_backfaces=cull_backfaces,
     )  # fmt: skip
 

@@ -12,6 +12,7 @@ from gsbake.monitor import SILENT, Monitor, decide_skip, skips
 from gsbake.shading.environment import EnvironmentLight
 from gsbake.surfels.densification.refinement import prune_and_densify
 from gsbake.surfels.densification.registry import choose_densification
+from gsbake.surfels.fields.registry import load_field, make_field
 from gsbake.surfels.initialisation import initialise_surfels
 from gsbake.surfels.model import Surfels
 from gsbake.surfels.training.session import Execution, Schedule, Session, TrainOptions
@@ -60,7 +61,9 @@ def train_surfels(
     assumed = 1.0 if options.confirmed_steps == "always" else share
     skipped = skipped_steps(steps, assumed) if skips(options.confirmed_steps, holds) else 0
     run = Execution(out, scratch, seed, threads, device, monitor)
-    session = Session(run, posed, surfels, light, options, Schedule(steps - skipped, options.train.coarse_share, policy))
+    field = make_field(surfels, options.loss)
+    schedule = Schedule(steps - skipped, options.train.coarse_share, policy)
+    session = Session(run, posed, surfels, light, options, schedule, field=field)
     results = session.run()
     saved, outcome = skipped * session.step_seconds, f"{skipped} of {steps} steps skipped"
     decide_skip(monitor, "confirmed_steps", options.confirmed_steps, holds, evidence, outcome, "no steps skipped", saved)
@@ -88,7 +91,9 @@ def refine_surfels(
     surfels = Surfels.load(trained / "surfels.safetensors")
     light = EnvironmentLight.load(trained / "light.safetensors") if (trained / "light.safetensors").exists() else None
     with monitor.part("prune and densify"):
-        surfels, counts = prune_and_densify(surfels, posed, options.refine, options.training.train.max_size, seed)
+        field = load_field(trained, surfels, options.training.loss)
+        surfels, counts = prune_and_densify(surfels, field, posed, options.refine, options.training.train.max_size, seed)
+        field.follow(surfels)
     run = Execution(out, scratch, seed, threads, device, monitor)
-    session = Session(run, posed, surfels, light, options.training, Schedule(options.refine.iterations, 0.0, None), trained)
+    session = Session(run, posed, surfels, light, options.training, Schedule(options.refine.iterations, 0.0, None), trained, field)
     return session.run() | {"counts": counts}

@@ -17,6 +17,8 @@ from gsbake.checkpoint import DamagedCheckpointError, load_checkpoint, save_chec
 from gsbake.config.schema import Loss, Train
 from gsbake.config.schema import Surfels as SurfelSettings
 from gsbake.monitor import SILENT, Monitor, Rule, decide_skip
+from gsbake.surfels.fields.field import Field
+from gsbake.surfels.fields.registry import save_field
 from gsbake.surfels.model import Surfels
 from gsbake.surfels.raster.threads import configure
 from gsbake.surfels.training.corrections import Correction
@@ -25,7 +27,7 @@ from gsbake.surfels.training.trainer import Plan, Trainer
 from gsbake.surfels.training.views import load_views, test_photos, validation_photos
 
 #: Checkpoints of other versions are ignored.
-CHECKPOINT_VERSION = 4
+CHECKPOINT_VERSION = 5
 #: Interval between checkpoints.
 CHECKPOINT_SECONDS = 30.0
 #: File with the logarithms of the exposure gains per photo and linear colour channel.
@@ -81,6 +83,7 @@ class Session:
         options: TrainOptions,
         schedule: Schedule,
         trained: Path | None = None,
+        field: Field | None = None,
     ) -> None:
         """Load the photos at `train.max_size`; resume from the checkpoint of an interrupted run.
 
@@ -103,7 +106,7 @@ class Session:
             *sections, schedule.iterations, schedule.coarse_share, policy is not None, run.seed, options.converged_steps, policy or "none"
         )
         light = None if light is None else light.to(run.device)
-        self.trainer = Trainer(plan, surfels.to(run.device), light, full, half, validation, test)
+        self.trainer = Trainer(plan, surfels.to(run.device), light, full, half, validation, test, field)
         self.aligner = None if trained else Aligner(self.trainer, options.pose_refinement, options.exposure_refinement)
         self.before = len(surfels)
         self.step_seconds = 0.0  # measured by `run`, evaluations included
@@ -199,7 +202,9 @@ class Session:
 
     def _write(self) -> dict[str, Any]:
         trainer, out = self.trainer, self.execution.out
+        trainer.field.settle(trainer.surfels)
         trainer.surfels.save(out / "surfels.safetensors")
+        save_field(out, trainer.field)
         if trainer.light is not None:
             trainer.light.save(out / "light.safetensors")
         self._write_corrections()

@@ -84,11 +84,12 @@ def test_prune_removes_surfels_off_the_surface() -> None:
 def test_policy_inputs_take_the_spacing_from_the_scales() -> None:
     s = ball()
     s.sdf[0], s.sdf[1] = -0.2, 0.1
-    at = PolicyInputs.from_surfels(s)
+    at = PolicyInputs.from_surfels(s, s.sdf)
     assert at.spacing == pytest.approx(float(np.median(spacing(s.position.numpy().astype(float)))), rel=1e-3)
     assert torch.allclose(at.distance[:3], torch.tensor([0.2, 0.1, 0.01])) and at.max_distance == pytest.approx(3 * at.spacing)
     assert float(at.opacity[0]) == pytest.approx(1 / np.cosh(0.1) ** 2, rel=1e-5)  # sech²(γs/2), γ = 1
-    assert PolicyInputs.from_surfels(s.select(torch.zeros(0, dtype=torch.long))).distance.shape == (0,)
+    empty = s.select(torch.zeros(0, dtype=torch.long))
+    assert PolicyInputs.from_surfels(empty, empty.sdf).distance.shape == (0,)
 
 
 def test_adam_follows_the_paper() -> None:
