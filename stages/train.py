@@ -14,7 +14,7 @@ def run(ctx: Context) -> dict[str, Any]:
 
     s = ctx.settings
     rules = s.skip.confirmed_steps, s.skip.converged_steps, s.skip.pose_refinement, s.skip.exposure_refinement
-    options = TrainOptions(s.train, s.surfels, s.loss, s.light.size, *rules)
+    options = TrainOptions(s.train, s.surfels, s.loss, s.light.size, *rules, field=s.field, coupling=s.coupling)
     return train_surfels(
         ctx.inputs["poses"], ctx.out, options, stereo=ctx.inputs["stereo"],
         seed=ctx.seed, threads=ctx.threads, device=ctx.device, scratch=ctx.checkpoint, monitor=ctx,
@@ -28,7 +28,10 @@ STAGE = Stage(
     run=run,
     summary="{surfels} surfels, {steps} steps, {psnr:dB} on validation photos",
     needs=("poses", "stereo"),
-    settings=("train.*", "surfels.*", "light.*", "loss.*", "skip.converged_steps", "skip.confirmed_steps", "skip.*_refinement"),
+    settings=(
+        "train.*", "surfels.*", "light.*", "loss.*", "field.*", "coupling.*", "skip.converged_steps", "skip.confirmed_steps",
+        "skip.*_refinement",
+    ),
     uses_device=True,
     seeded=True,
-)
+)  # fmt: skip

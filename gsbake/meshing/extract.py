@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from gsbake.capture.posed_photos import PosedPhotos
@@ -32,7 +33,10 @@ from gsbake.meshing.support_plane import SupportPlane, find_support_plane, remov
 from gsbake.meshing.tsdf import SparseTsdf
 from gsbake.monitor import SILENT, Monitor, Rule, decide_skip, skips
 from gsbake.mvs.depth_maps import read_depth
+from gsbake.surfels.fields.continuous import ContinuousField
+from gsbake.surfels.fields.field import Field
 from gsbake.surfels.fields.registry import load_field
+from gsbake.surfels.fields.samples import SamplesField
 from gsbake.surfels.raster.render import SurfelRenderer
 
 Doubles = NDArray[np.float64]
@@ -53,12 +57,13 @@ MAX_HOLE_EDGES = 400
 @dataclass(frozen=True)
 class MeshOptions:
     """Settings of mesh extraction; `train_size` and `stereo_size` are the longer sides in pixels of the photos in training and stereo,
-    `empty_cells` is the rule of [skip], `max_triangles` the limit of the exported asset."""
+    `empty_cells` is the rule of [skip], `projected_depth` that of [surfels], `max_triangles` the limit of the exported asset."""
 
     mesh: Mesh = Mesh()
     train_size: int = 512
     stereo_size: int = 800
     empty_cells: Rule = "auto"
+    projected_depth: bool = False
     max_triangles: int = 100_000
 
     @property
@@ -108,6 +113,11 @@ class _Extraction:
     def renderer(self) -> SurfelRenderer:
         """Renderer of the trained surfels."""
         return SurfelRenderer.load(self.trained, self.device)
+
+    @cached_property
+    def trained_field(self) -> Field:
+        """The field that the surfels were trained with."""
+        return load_field(self.trained, self.renderer.surfels)
 
     def extract(self, cache: DepthViewCache) -> dict[str, Any]:
         """Run all steps; the results for the manifest."""
@@ -176,7 +186,7 @@ class _Extraction:
         for index in range(len(self.posed)):
             self.monitor.check_stop()
             photo = self.posed.view(index, self.options.train_size)
-            buffers = self.renderer.gbuffer(photo.camera)
+            buffers = self.renderer.gbuffer(photo.camera, self.options.projected_depth)
             view = DepthView.from_gbuffer(photo.camera, buffers, photo.mask, TRUNCATION_CELLS[0] * resolution.cell)
             stereo_file = None if self.stereo is None else self.stereo / "depth" / f"{photo.camera.name}.npz"
             if stereo_file is not None and stereo_file.exists():
@@ -204,17 +214,22 @@ class _Extraction:
         """The distance field, from depth maps or from the surfels' SDF samples."""
         monitor, empty_outside = self.monitor, self.posed.has_masks or support is not None
         field = SparseTsdf(lower, upper, resolution.cell, truncation, ball=BALL_RADIUS, empty_outside=empty_outside, support=support)
+        source = self.options.mesh.field
+        trained = self.trained_field if source == "trained" else SamplesField(self.renderer.surfels, None)
         with monitor.part("survey"):
-            for done, view in enumerate(cache):
-                monitor.check_stop()
-                field.fuse_coarse(view)
-                monitor.progress(done + 1, 2 * len(cache), "fusing")
+            if isinstance(trained, ContinuousField):
+                field.evaluate_coarse(trained.mesh)
+            else:
+                for done, view in enumerate(cache):
+                    monitor.check_stop()
+                    field.fuse_coarse(view)
+                    monitor.progress(done + 1, 2 * len(cache), "fusing")
         rule = self.options.empty_cells
         with monitor.part("filling"):
             field.allocate(all_blocks=not skips(rule, holds=True))
         with monitor.part("fusion"):
-            if self.options.mesh.field == "imls":
-                field.set_field(load_field(self.trained, self.renderer.surfels, None).mesh(field.lattice, truncation))
+            if source != "tsdf":
+                field.set_field(trained.mesh(field.lattice, truncation))
             else:
                 for done, view in enumerate(cache):
                     monitor.check_stop()
@@ -236,13 +251,26 @@ class _Extraction:
             vertices = support.snap_to_plane(vertices, cell)
         vertices, faces, dropped = cleanup.remove_small_components(vertices, faces, settings.min_component)
         if settings.normal_wavelength > 0:
-            vertices = _integrate_normals(cache, vertices, faces, settings.normal_wavelength, cell)
+            if settings.normals == "field":
+                vertices = self._integrate_gradients(vertices, faces, cell)
+            else:
+                vertices = _integrate_normals(cache, vertices, faces, settings.normal_wavelength, cell)
         vertices = cleanup.smooth(vertices, faces, settings.smoothing_iterations)
         if not cleanup.topology(vertices, faces).watertight:
             vertices, faces = repair(vertices, faces)
             if settings.holes == "close":
                 vertices, faces = close_holes(vertices, faces, MAX_HOLE_EDGES)
         return vertices, faces, dropped + background
+
+    def _integrate_gradients(self, vertices: Doubles, faces: Faces, cell: float) -> Doubles:
+        """Refine the vertices against the gradient of the trained field at wavelengths below `mesh.normal_wavelength` voxels."""
+        with torch.no_grad():
+            points = torch.from_numpy(vertices.astype(np.float32))
+            gradient = torch.cat([self.trained_field.gradient(part) for part in points.split(1 << 16)]).numpy().astype(float)
+        length = np.linalg.norm(gradient, axis=1, keepdims=True)
+        normals, confidence = gradient / np.maximum(length, 1e-9), (length[:, 0] > 0.1).astype(float)
+        wavelength = self.options.mesh.normal_wavelength * cell
+        return integrate_normals(vertices, faces, normals, confidence, wavelength, max_displacement=1.5 * cell)
 
     def _refine_silhouettes(self, vertices: Doubles, faces: Faces) -> Doubles:
         """Refine the vertices against the masks, where every photo has one."""

@@ -7,6 +7,7 @@ another representation is one module and one entry in `gsbake.surfels.fields.reg
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -31,7 +32,7 @@ class TrainingStep:
     """What the losses of a field read of one step.
 
     `surfels`, what was `rendered` of them in the step's view, the `share` of the run that is done, whether the losses of the distance have
-    begun (`late`), and the `generator` of all random numbers.
+    begun (`late`), the `generator` of all random numbers, and the training `views` at the size of this step.
     """
 
     surfels: Surfels
@@ -39,6 +40,7 @@ class TrainingStep:
     share: float
     late: bool
     generator: torch.Generator
+    views: Sequence[TrainView] = ()
 
 
 class Field(ABC):
@@ -46,6 +48,10 @@ class Field(ABC):
 
     #: Name in the registry and in profiles.
     name: ClassVar[str]
+    #: Share of surfels added where the zero level set has none, at each densification.
+    seeds: float = 0.0
+    #: Times that all surfels are placed anew on the zero level set.
+    cycles: int = 0
 
     def follow(self, surfels: Surfels) -> None:
         """Take notice that these are the surfels from now on (after initialisation, densification, pruning, a resumed run)."""

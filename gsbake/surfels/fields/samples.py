@@ -17,6 +17,7 @@ from torch import Tensor
 
 from gsbake.meshing.imls import imls_field
 from gsbake.meshing.sparse_lattice import BlockLattice
+from gsbake.surfels.densification.policy import typical_spacing
 from gsbake.surfels.fields.field import Field, TrainingStep
 from gsbake.surfels.losses import terms as losses
 from gsbake.surfels.losses.projection import projection_loss
@@ -34,9 +35,9 @@ class SamplesField(Field):
 
     name = "samples"
 
-    def __init__(self, surfels: Surfels, loss: Any) -> None:
-        """`loss` is the profile's section [loss] with the weights of the median and projection losses."""
-        self.surfels, self.loss = surfels, loss
+    def __init__(self, surfels: Surfels, loss: Any, train: Any = None) -> None:
+        """`loss` and `train` are the profile's sections: the weights of the median and projection losses, and the unit of the sharpness."""
+        self.surfels, self.loss, self.train = surfels, loss, train
         self._index: tuple[cKDTree, Tensor, Tensor, Tensor] | None = None
 
     def follow(self, surfels: Surfels) -> None:
@@ -108,13 +109,21 @@ class SamplesField(Field):
         w, s, out = self.loss, step.surfels, step.rendered
         total = None
         if step.late and w.median:
-            total = w.median * losses.median_sharpness(s.sdf, s.gamma, s.transfer)
+            total = w.median * losses.median_sharpness(s.sdf, s.gamma, s.transfer, self._widths(step))
         if step.late and w.projection:
             projection = w.projection * projection_loss(
                 s.position, out.normal, s.sdf, out.visible, out.depth, out.alpha, view.R, view.t, view.pinhole
             )
             total = projection if total is None else total + projection
         return total
+
+    def _widths(self, step: TrainingStep) -> tuple[float, float] | None:
+        """Least and largest distance (unit frame) at which opacity is half, in this step; None where the unit frame is the unit."""
+        if self.train is None or self.train.sharpness == "unit":
+            return None
+        spacing, final = typical_spacing(step.surfels), self.train.final_width
+        widest = max(self.train.band, final)
+        return final * spacing, spacing * (final + (widest - final) * (1 - step.share))
 
     def mesh(self, lattice: BlockLattice, truncation: float) -> NDArray[np.float32]:
         """Implicit moving least squares with compact support; see `gsbake.meshing.imls`."""

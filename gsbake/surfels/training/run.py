@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -61,7 +61,8 @@ def train_surfels(
     assumed = 1.0 if options.confirmed_steps == "always" else share
     skipped = skipped_steps(steps, assumed) if skips(options.confirmed_steps, holds) else 0
     run = Execution(out, scratch, seed, threads, device, monitor)
-    field = make_field(surfels, options.loss)
+    with monitor.part("field"):
+        field = make_field(surfels, options, seed)
     schedule = Schedule(steps - skipped, options.train.coarse_share, policy)
     session = Session(run, posed, surfels, light, options, schedule, field=field)
     results = session.run()
@@ -91,7 +92,9 @@ def refine_surfels(
     surfels = Surfels.load(trained / "surfels.safetensors")
     light = EnvironmentLight.load(trained / "light.safetensors") if (trained / "light.safetensors").exists() else None
     with monitor.part("prune and densify"):
-        field = load_field(trained, surfels, options.training.loss)
+        # fine-tuning keeps the width that training has ended with
+        train = options.training.train.model_copy(update={"band": 0.0})
+        field = load_field(trained, surfels, replace(options.training, train=train))
         surfels, counts = prune_and_densify(surfels, field, posed, options.refine, options.training.train.max_size, seed)
         field.follow(surfels)
     run = Execution(out, scratch, seed, threads, device, monitor)

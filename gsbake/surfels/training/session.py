@@ -14,7 +14,7 @@ import torch
 
 from gsbake.capture.posed_photos import PosedPhotos
 from gsbake.checkpoint import DamagedCheckpointError, load_checkpoint, save_checkpoint
-from gsbake.config.schema import Loss, Train
+from gsbake.config.schema import Coupling, DistanceField, Loss, Train
 from gsbake.config.schema import Surfels as SurfelSettings
 from gsbake.monitor import SILENT, Monitor, Rule, decide_skip
 from gsbake.surfels.fields.field import Field
@@ -46,6 +46,8 @@ class TrainOptions:
     converged_steps: Rule = "auto"
     pose_refinement: Rule = "auto"
     exposure_refinement: Rule = "auto"
+    field: DistanceField = DistanceField()
+    coupling: Coupling = Coupling()
 
 
 @dataclass(frozen=True)
@@ -202,7 +204,9 @@ class Session:
 
     def _write(self) -> dict[str, Any]:
         trainer, out = self.trainer, self.execution.out
-        trainer.field.settle(trainer.surfels)
+        with torch.no_grad():
+            trainer.field.distance(trainer.surfels)
+            trainer.field.settle(trainer.surfels)
         trainer.surfels.save(out / "surfels.safetensors")
         save_field(out, trainer.field)
         if trainer.light is not None:
@@ -220,5 +224,6 @@ class Session:
             "psnr": round(psnr, 3),
             "validation": [trainer.views[i].name for i in trainer.validation_indices],
             "gamma": round(float(trainer.surfels.gamma), 4),
+            "densification": dict(trainer.counts),
             "sdf_median": round(float(trainer.surfels.sdf.abs().median()), 6) if len(trainer.surfels) else None,
         }

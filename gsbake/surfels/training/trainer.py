@@ -15,9 +15,10 @@ import torch
 from torch import Tensor
 
 from gsbake.imaging.metrics import decibels
-from gsbake.surfels.densification.clone_split import Statistics, densify, prune
-from gsbake.surfels.densification.policy import PolicyInputs
+from gsbake.surfels.densification.clone_split import Statistics, densify, prune, reset_opacity
+from gsbake.surfels.densification.policy import PolicyInputs, typical_spacing
 from gsbake.surfels.densification.registry import DENSIFICATION, PRUNING
+from gsbake.surfels.densification.seeding import place_anew, seed_gaps
 from gsbake.surfels.fields.field import Field, TrainingStep
 from gsbake.surfels.fields.samples import SamplesField
 from gsbake.surfels.losses.image import image_losses
@@ -34,6 +35,8 @@ from gsbake.surfels.training.views import TrainView
 SDF_START, DENSIFY_START, DENSIFY_END = 1 / 30, 1 / 60, 0.6
 #: Minimum number of steps between densifications.
 DENSIFY_INTERVAL = 100
+#: Share of the run up to which opacity is reset.
+RESET_END = 1 / 3
 #: Share of the run in which learning rates decay after an early stop.
 COOLDOWN_SHARE = 0.1
 #: Surfels with a larger scale (unit frame) are pruned.
@@ -78,7 +81,8 @@ class Trainer:
         `test_indices` those that nothing looks at, neither of them trained on; `light` is an `EnvironmentLight` or None; `field` is by
         default that of the surfels' own samples."""
         self.plan, self.surfels, self.light = plan, surfels, light
-        self.field = field or SamplesField(surfels, plan.loss)
+        self.field = field or SamplesField(surfels, plan.loss, plan.train)
+        self.counts: dict[str, int] = {}
         self.views, self.half_views = views, half_views
         self.validation_indices = validation_indices
         self.training_indices = [i for i in range(len(views)) if i not in {*validation_indices, *test_indices}]
@@ -123,7 +127,9 @@ class Trainer:
             from gsbake.shading.neutral_light import neutral_light_loss
 
             total = total + w.neutral_light * neutral_light_loss(self.light.radiance())
-        step = TrainingStep(self.surfels, out, self.done / max(1, self.plan.iterations), late, self.generator)
+        views = self.half_views if self.coarse() else self.views
+        photos = [views[i] for i in self.training_indices]
+        step = TrainingStep(self.surfels, out, self.done / max(1, self.plan.iterations), late, self.generator, photos)
         asked = self.field.losses(step, view)
         return total if asked is None else total + asked, colour
 
@@ -135,11 +141,15 @@ class Trainer:
             start = self.cooldown_start / max(1, n)
             share = start + (1 - start) * (self.done - self.cooldown_start) / max(1, self.end - self.cooldown_start)
         slow, fast = 0.1**share, 0.01**share
+        sdf, gamma = t.lr_sdf, t.lr_gamma
+        if t.sharpness == "spacing":
+            sdf, gamma = t.lr_sample * typical_spacing(self.surfels), t.lr_gamma * float(self.surfels.gamma)
         rates = {
             "position": t.lr_position * fast, "quaternion": t.lr_rotation * slow, "log_scale": t.lr_scale * slow,
-            "sdf": t.lr_sdf * slow, "gamma": t.lr_gamma * slow,
+            "sdf": sdf * slow, "gamma": gamma * slow,
         }  # fmt: skip
         rates |= {f"attributes.{k}": t.lr_material * slow for k in self.surfels.attributes} | {"light": t.lr_light * slow}
+        rates["attributes.opacity"] = t.lr_opacity * slow
         return rates | {f"field.{k}": rate * slow for k, rate in self.field.rates().items()}
 
     def step(self) -> dict[str, float]:
@@ -156,7 +166,8 @@ class Trainer:
             for p in self.light.parameters():
                 p.grad = None
             tables = self.light.prefilter()
-        out = rasterise(self.surfels, view, opacity=self.field.opacity(self.surfels))
+        distance = self.field.distance(self.surfels) if self.plan.model.projected_depth else None
+        out = rasterise(self.surfels, view, opacity=self.field.opacity(self.surfels), distance=distance)
         loss, colour = self._loss(out, view, tables)
         loss.backward()
         value = float(loss.detach())
@@ -201,6 +212,12 @@ class Trainer:
 
     def _densify_and_prune(self) -> None:
         n = self.plan.iterations
+        cycles = self.field.cycles if self.plan.densify else 0
+        if cycles and self.done in {round(DENSIFY_END * n * (i + 1) / cycles) for i in range(cycles)}:
+            self.surfels, placed = place_anew(self.surfels, self.adam, self.field, self.generator)
+            self._count({"placed anew": placed})
+            self.stats = Statistics.zeros(len(self.surfels), self.surfels.position.device)
+            self.field.follow(self.surfels)
         interval = max(DENSIFY_INTERVAL, len(self.training_indices))  # statistics cover every photo
         if not self.plan.densify or self.done % interval or self.done < max(interval, DENSIFY_START * n):
             return
@@ -209,13 +226,25 @@ class Trainer:
         share = (self.done / n - DENSIFY_START) / (DENSIFY_END - DENSIFY_START)
         budget = int(self.start_count + (self.plan.model.max_count - self.start_count) * min(1.0, share))
         off = PRUNING[self.plan.train.prune](self._policy_inputs())
-        self.surfels, keep, _ = prune(self.surfels, self.adam, self.stats, MAX_SCALE, off)
+        self.surfels, keep, pruned = prune(self.surfels, self.adam, self.stats, MAX_SCALE, off)
+        before = len(self.surfels)
         kept = Statistics(self.stats.gradient[keep], self.stats.views[keep], self.stats.weight[keep])
         large = float(self.surfels.scale.max(1).values.median()) if len(self.surfels) else 0.01
         score = DENSIFICATION[self.plan.policy](kept.mean_gradient(), self._policy_inputs())
         self.surfels = densify(self.surfels, self.adam, score, budget, large, self.generator)
+        self._count({f"pruned, {k}": v for k, v in pruned.items()} | {"densified": len(self.surfels) - before})
+        if self.field.seeds:
+            self.field.follow(self.surfels)
+            self.surfels, seeded = seed_gaps(self.surfels, self.adam, self.field, self.field.seeds, self.generator)
+            self._count({"seeded": seeded})
+        if self.plan.train.reset_opacity and self.done < RESET_END * n:
+            self._count({"reset": reset_opacity(self.surfels, self.plan.train.reset_opacity)})
         self.stats = Statistics.zeros(len(self.surfels), self.surfels.position.device)
         self.field.follow(self.surfels)
+
+    def _count(self, counts: dict[str, int]) -> None:
+        for what, number in counts.items():
+            self.counts[what] = self.counts.get(what, 0) + number
 
     @torch.no_grad()
     def _policy_inputs(self) -> PolicyInputs:
@@ -268,6 +297,7 @@ class Trainer:
             "light": None if self.light is None else self.light.state_dict(), "queue": self.queue, "log": self.log, "done": self.done,
             "end": self.end, "cooling_from": self.cooldown_start, "standing": self.plateau_evidence, "start_count": self.start_count,
             "stats": (self.stats.gradient, self.stats.views, self.stats.weight), "field": self.field.state(),
+            "counts": self.counts,
         }  # fmt: skip
 
     def restore(self, state: dict[str, Any]) -> None:
@@ -281,4 +311,5 @@ class Trainer:
         self.cooldown_start, self.plateau_evidence, self.start_count = state["cooling_from"], state["standing"], state["start_count"]
         self.stats = Statistics(*state["stats"])
         self.field.restore(state["field"])
+        self.counts = dict(state["counts"])
         self.field.follow(self.surfels)
