@@ -10,18 +10,16 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from gsbake.surfels.couplings.ray_pixels import pixel_table
 from gsbake.surfels.densification.policy import typical_spacing
 from gsbake.surfels.fields.field import TrainingStep
 from gsbake.surfels.fields.ray_marching import March, Rays, make_rays, march, sample_depths, sphere_trace
+from gsbake.surfels.raster.kernel import AUX_PLANES
 from gsbake.surfels.training.views import TrainView
 
 if TYPE_CHECKING:
     from gsbake.surfels.fields.continuous import ContinuousField
 
-#: Share of the rays inside the mask; the others are drawn around it.
-INSIDE_SHARE = 0.8
-#: Pixels around the mask in which rays outside are drawn.
-BORDER = 12
 #: Half-width of the interval on a ray in units of the distance at the surfels' depth, and its least in cells.
 BAND, MIN_BAND_CELLS = 3.0, 3.0
 #: Random points: share near the surface, and their standard deviation from it in cells.
@@ -88,38 +86,34 @@ class CouplingInputs:
     @cached_property
     def rays(self) -> Rays:
         """Rays inside the mask, in proportion to its edges where the profile wants that, and around it."""
-        generator, count = self.step.generator, self.settings.rays
-        cover = self.cover
-        inside = (cover > 0.5).to(torch.float32).cpu()
-        if self.settings.edges:
-            grey = F.pad(self.view.colour().mean(0).cpu()[None, None], (1, 1, 1, 1), mode="replicate")[0, 0]
-            edge = torch.hypot(grey[1:-1, 2:] - grey[1:-1, :-2], grey[2:, 1:-1] - grey[:-2, 1:-1])
-            inside = inside * (1 - self.settings.edges + self.settings.edges * edge / edge.mean().clamp_min(1e-6))
-        grown = F.max_pool2d((cover > 0.5).float().cpu()[None, None], 2 * BORDER + 1, 1, BORDER)[0, 0]
-        outside = grown * (cover < 0.5).float().cpu()
-        parts = []
-        for weight, share in ((inside, INSIDE_SHARE), (outside, 1 - INSIDE_SHARE)):
-            flat = weight.flatten()
-            if float(flat.sum()) > 0:
-                parts.append(torch.multinomial(flat, max(1, round(share * count)), replacement=True, generator=generator))
-        if not parts:
-            parts.append(torch.randint(cover.numel(), (count,), generator=generator))
-        pixel = torch.cat(parts).to(cover.device)
-        lower, upper = self.field.lower.to(cover), self.field.upper.to(cover)
-        return make_rays(self.view, pixel, lower, upper)
+        view, cover = self.view, self.cover
+        tables, key = self.field.pixel_tables, (view.name, view.pinhole.width)
+        table = tables.get(key) if view.mask is not None else None
+        if table is None:
+            table = pixel_table(view, cover, self.settings.edges)
+            if view.mask is not None:
+                tables[key] = table
+        pixel = table.draw(self.settings.rays, self.step.generator).to(cover.device)
+        return make_rays(view, pixel, self.field.lower.to(cover), self.field.upper.to(cover))
+
+    @cached_property
+    def _splats(self) -> Tensor:
+        """Blended normals, depth and alpha (5, m) on the rays: one gather, since each costs the backward pass a copy of all planes."""
+        planes = self.step.rendered.planes
+        c = planes.shape[0] - AUX_PLANES
+        rows = torch.tensor([c - 3, c - 2, c - 1, c, c + 4], device=planes.device)
+        return planes.flatten(1)[rows[:, None], self.rays.pixel]
 
     @cached_property
     def splat_depth(self) -> Tensor:
         """Expected depth (m,) of the surfels on the rays, with gradients to them; 0 where they show nothing."""
-        out, pixel = self.step.rendered, self.rays.pixel
-        depth, alpha = out.depth.flatten()[pixel], out.alpha.flatten()[pixel]
+        depth, alpha = self._splats[3], self._splats[4]
         return torch.where(alpha > 0.5, depth / alpha.clamp_min(0.5), torch.zeros_like(depth))
 
     @cached_property
     def splat_normal(self) -> Tensor:
         """Unit blended normals (m, 3) of the surfels on the rays, with gradients to them."""
-        normal = self.step.rendered.features[-3:].flatten(1)[:, self.rays.pixel].T
-        return F.normalize(normal, dim=1, eps=1e-6)
+        return F.normalize(self._splats[:3].T, dim=1, eps=1e-6)
 
     @cached_property
     def covered(self) -> Tensor:

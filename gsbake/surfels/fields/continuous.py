@@ -42,6 +42,8 @@ class ContinuousField(Field):
         self.lower, self.upper = (torch.tensor(np.asarray(x, np.float32)) for x in box)
         self._at: tuple[Tensor, Tensor] | None = None
         self.radiance: Radiance | None = None
+        #: Pixels that rays are drawn from, by photo and width.
+        self.pixel_tables: dict[tuple[str, int], Any] = {}
 
     def make_radiance(self, seed: int) -> None:
         """Colours of the field's own, where a coupling marches them."""

@@ -33,6 +33,7 @@ def train_surfels(
     options: TrainOptions | None = None,
     *,
     stereo: Path | None = None,
+    priors: tuple[Path | None, Path | None] = (None, None),
     seed: int = 0,
     threads: int = 2,
     device: str = "cpu",
@@ -41,8 +42,9 @@ def train_surfels(
 ) -> dict[str, Any]:
     """Initialise surfels, train them on the photos of the folder `poses`, write them into the folder `out`; return the figures.
 
-    Written: `surfels.safetensors`, `log.csv`, with PBR shading `light.safetensors`, and where they were refined `cameras.json` and
-    `exposure.json`. `stereo` is the folder that `run_stereo` wrote. A stop that `monitor` requests leaves a checkpoint in `scratch`, from
+    Written: `surfels.safetensors`, `log.csv`, with PBR shading `light.safetensors`, with a continuous field `field.safetensors`, and where
+    they were refined `cameras.json` and `exposure.json`. `stereo` is the folder that `run_stereo` wrote, `priors` are the folders of given
+    normals and depths (`prior_maps`). A stop that `monitor` requests leaves a checkpoint in `scratch`, from
     which the next call continues with the same result. Raises InterruptedRun then.
     """
     options = options or TrainOptions()
@@ -64,7 +66,7 @@ def train_surfels(
     with monitor.part("field"):
         field = make_field(surfels, options, seed)
     schedule = Schedule(steps - skipped, options.train.coarse_share, policy)
-    session = Session(run, posed, surfels, light, options, schedule, field=field)
+    session = Session(run, posed, surfels, light, options, schedule, field=field, priors=priors)
     results = session.run()
     saved, outcome = skipped * session.step_seconds, f"{skipped} of {steps} steps skipped"
     decide_skip(monitor, "confirmed_steps", options.confirmed_steps, holds, evidence, outcome, "no steps skipped", saved)

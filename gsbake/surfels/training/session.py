@@ -23,6 +23,7 @@ from gsbake.surfels.model import Surfels
 from gsbake.surfels.raster.threads import configure
 from gsbake.surfels.training.corrections import Correction
 from gsbake.surfels.training.pose_refinement import Aligner
+from gsbake.surfels.training.prior_maps import add_priors
 from gsbake.surfels.training.trainer import Plan, Trainer
 from gsbake.surfels.training.views import load_views, test_photos, validation_photos
 
@@ -86,17 +87,19 @@ class Session:
         schedule: Schedule,
         trained: Path | None = None,
         field: Field | None = None,
+        priors: tuple[Path | None, Path | None] = (None, None),
     ) -> None:
         """Load the photos at `train.max_size`; resume from the checkpoint of an interrupted run.
 
         Poses and exposures are refined (as the options allow), unless an earlier run did that: `trained` is its folder, whose cameras
-        `posed` has.
+        `posed` has. `priors` are the folders of given normals and depths.
         """
         self.execution, self.posed, self.trained, self.options = run, posed, trained, options
         self.monitor = run.monitor
         configure(run.threads)
         with self.monitor.part("load photos"):
-            full, half = ([view.to(run.device) for view in views] for views in load_views(posed, options.train.max_size))
+            loaded = (add_priors(views, posed.cameras, posed.folder, *priors) for views in load_views(posed, options.train.max_size))
+            full, half = ([view.to(run.device) for view in views] for views in loaded)
         if trained is not None and (trained / EXPOSURE).exists():
             gains = json.loads((trained / EXPOSURE).read_text())["log_gains"]
             exposure = [Correction(torch.zeros(6).double(), torch.tensor(gains[view.name]).double()) for view in full]
