@@ -124,9 +124,10 @@ class CouplingInputs:
     def march(self) -> March:
         """Samples of the field along the rays."""
         field, rays, settings = self.field, self.rays, self.settings
+        depth = self.splat_depth  # cached with its gradient, so outside of what follows
         with torch.no_grad():
             if settings.sampling == "surfels":
-                centre = self.splat_depth.detach()
+                centre = depth.detach()
                 known = centre > 0
                 off = field.value(rays.at(centre[:, None])[:, 0]).abs()
             else:
