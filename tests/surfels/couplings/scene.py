@@ -21,7 +21,9 @@ from gsbake.surfels.training.views import TrainView, camera_tensors
 from tests.support.cameras import look_at
 
 RADIUS, SIZE = 0.6, 40
-SMALL = {"resolution": 32, "levels": 4, "table_bits": 12, "rank": 3, "octaves": 3, "width": 16, "fit_steps": 150, "rays": 200, "points": 400}
+SMALL = {
+    "resolution": 32, "levels": 4, "table_bits": 12, "rank": 3, "octaves": 3, "width": 16, "fit_steps": 150, "rays": 200, "points": 400,
+}  # fmt: skip
 
 
 def ball(radius: float = RADIUS, count: int = 1500) -> Surfels:
