@@ -101,8 +101,8 @@ def test_add_a_field(monkeypatch: pytest.MonkeyPatch) -> None:
     profile = SimpleNamespace(field=settings, coupling=schema.Coupling(), loss=schema.Loss(), train=schema.Train())
     code = blocks("Add a field", "python")
     names: dict[str, Any] = {
-        "torch": torch, "Tensor": Tensor, "Known": Known, "Mapping": Mapping, "FIELDS": registry.FIELDS, "create": create, "spacing": spacing,
-        "fibonacci_sphere": fibonacci_sphere, "make_field": registry.make_field, "profile": profile,
+        "torch": torch, "Tensor": Tensor, "Known": Known, "Mapping": Mapping, "FIELDS": registry.FIELDS, "create": create,
+        "spacing": spacing, "fibonacci_sphere": fibonacci_sphere, "make_field": registry.make_field, "profile": profile,
     }  # fmt: skip
     exec(code["gsbake/surfels/fields/ball.py"], names)
     exec(code["gsbake/surfels/fields/registry.py"], names)

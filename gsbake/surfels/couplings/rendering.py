@@ -28,5 +28,5 @@ def colour(inputs: CouplingInputs) -> Tensor:
 
 def mask(inputs: CouplingInputs) -> Tensor:
     """Cross-entropy of the marched alpha and the mask."""
-    alpha = inputs.march.alpha.clamp(1e-4, 1 - 1e-4)
-    return F.binary_cross_entropy(alpha, inputs.covered.clamp(0, 1))
+    alpha, cover = inputs.march.alpha.clamp(1e-4, 1 - 1e-4), inputs.covered
+    return -(cover * alpha.log() + (1 - cover) * (1 - alpha).log()).mean()

@@ -67,12 +67,13 @@ class SamplesField(Field):
         return self._index
 
     def _blend(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """Value (n,) and gradient (n, 3)."""
+        """Value (n,) and gradient (n, 3); coordinates that are not finite count as 0."""
         tree, centres, normals, inverse = self._samples()
         k = min(NEIGHBOURS, len(centres))
         if not k:
             return torch.ones_like(points[:, 0]), torch.zeros_like(points)
-        finite = torch.nan_to_num(points.detach(), 0.0, 1e6, -1e6).cpu()
+        points = torch.where(torch.isfinite(points), points, 0.0)
+        finite = points.detach().cpu()
         index = torch.from_numpy(np.asarray(tree.query(finite.numpy().astype(np.float64), k=range(1, k + 1), workers=-1)[1]))
         centres, normals, inverse = (x.to(points)[index] for x in (centres, normals, inverse))
         offset = points[:, None] - centres

@@ -143,7 +143,7 @@ class Trainer:
         slow, fast = 0.1**share, 0.01**share
         sdf, gamma = t.lr_sdf, t.lr_gamma
         if t.sharpness == "spacing":
-            sdf, gamma = t.lr_sample * typical_spacing(self.surfels), t.lr_gamma * float(self.surfels.gamma)
+            sdf, gamma = t.lr_sample * typical_spacing(self.surfels), t.lr_gamma * float(self.surfels.gamma.detach())
         rates = {
             "position": t.lr_position * fast, "quaternion": t.lr_rotation * slow, "log_scale": t.lr_scale * slow,
             "sdf": sdf * slow, "gamma": gamma * slow,
