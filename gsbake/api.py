@@ -188,7 +188,7 @@ def open_session(options: RunOptions, observer: Observer | None = None, registry
     if not 0 <= options.threads <= MAX_THREADS:
         raise UsageError(f"The number of threads must be from 0 (the physical cores) to {MAX_THREADS}, not {options.threads}.")
     project = replace(project, profile=name, overrides=tuple(last.values()), seed=seed)
-    sources = project.sources()
+    sources = project.sources() | _priors(project, profile.profile)
     request = Request(
         out=out,
         sources=sources,
@@ -227,7 +227,19 @@ def _source_names(sources: dict[str, Path]) -> dict[str, list[str]]:
     names = {"photos": source_files(sources["photos"])}
     if "masks" in sources and sources["masks"].is_dir():
         names["masks"] = list_masks(sources["masks"])
+    for kind in ("normals", "depths"):
+        if kind in sources:
+            names[kind] = [path.name for path in sorted(sources[kind].iterdir()) if path.suffix.lower() in (".npy", ".png")]
     return names
+
+
+def _priors(project: Project, profile: Profile) -> dict[str, Path]:
+    """Folders of given normals and depths beside the photos' folder, where the profile has a weight for them."""
+    if project.photos is None:
+        return {}
+    weights = {"normals": profile.coupling.prior_normals, "depths": profile.coupling.prior_depths}
+    folders = {kind: Path(project.photos).parent / kind for kind, weight in weights.items() if weight}
+    return {kind: folder for kind, folder in folders.items() if folder.is_dir()}
 
 
 def _default_out(photos: Path | None) -> Path:
