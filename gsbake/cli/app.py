@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import lru_cache
 from pathlib import Path
 from typing import Annotated
 
@@ -401,3 +402,9 @@ def synth_command(
 
 
 app.add_typer(file_app)
+
+
+@lru_cache(maxsize=1)
+def parser() -> Callable[..., object]:
+    """The parser of all commands; a program that runs several commands builds it once."""
+    return typer.main.get_command(app)
