@@ -10,6 +10,8 @@ IN_RANGE := import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))
 PYTHON ?= $(shell for p in python3.11 python3.12 python3.13 python3 python; do \
 	command -v $$p >/dev/null 2>&1 && $$p -c '$(IN_RANGE)' 2>/dev/null && echo $$p && break; done)
 TORCH := $(shell grep '^torch==' constraints.txt)
+# Byte code is compiled afterwards, on all cores and without the packages' own tests: pip compiles on one core.
+PIP_OPTIONS := install --quiet --disable-pip-version-check --no-compile --constraint constraints.txt
 DEMO_OUT ?= out/demo
 
 # The scorer is a program of its own with an environment of its own (Blender as a module needs Python 3.11).
@@ -25,7 +27,11 @@ ARGS ?=
 # Damaged files that `make stress` tries per parser.
 FUZZ_INPUTS ?= 10000
 
-.PHONY: help setup node demo docs test check bench stress score lock audit sbom clean
+# Processes that `make test` and `make coverage` share the tests between.
+WORKERS ?= 2
+QUICK := -m "not slow and not stress" --numprocesses $(WORKERS)
+
+.PHONY: help setup node demo docs test coverage check bench stress score lock audit sbom clean
 
 help: ## Show this
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 10
@@ -36,8 +42,9 @@ $(STAMP): pyproject.toml constraints.txt
 	@test -n "$(PYTHON)" || { echo "gsbake needs Python 3.11, 3.12 or 3.13, and none is on the PATH; name one: make PYTHON=/path/to/python3.12" >&2; exit 1; }
 	@"$(PYTHON)" -c '$(IN_RANGE)' || { echo "gsbake needs Python 3.11, 3.12 or 3.13 (xatlas has no wheel for newer ones); $(PYTHON) is `"$(PYTHON)" --version 2>&1`" >&2; exit 1; }
 	@test -x $(BIN)/python || "$(PYTHON)" -m venv $(VENV) || { rm -rf $(VENV); echo "$(PYTHON) cannot make a virtual environment; on Debian: sudo apt-get install python3-venv" >&2; exit 1; }
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt $(TORCH)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[dev]'
+	$(BIN)/python -m pip $(PIP_OPTIONS) $(TORCH)
+	$(BIN)/python -m pip $(PIP_OPTIONS) --editable '.[dev]'
+	@$(BIN)/python -W ignore -m compileall -qq -j 0 -x 'site-packages/.*/tests?/' "`$(BIN)/python -c 'import sysconfig; print(sysconfig.get_path("purelib"))'`" || true
 	@$(BIN)/python -m gsbake.capture.masks.weights || echo "Without it masks are not made; everything else works." >&2
 	@touch $@
 
@@ -60,10 +67,13 @@ check: setup ## Lint and types
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 
-test: check node ## Lint, types and the quick tests, with the share of lines they run
-	$(BIN)/pytest -m "not slow and not stress" --cov --cov-report=term:skip-covered
+test: check node ## Lint, types and the quick tests, in two processes: WORKERS=2
+	$(BIN)/pytest $(QUICK)
 
-stress: setup node ## The slow tests: hostile input at length, kills at random moments, poses of a development capture where present
+coverage: setup node ## The quick tests with the share of lines they run, which takes about half as long again
+	$(BIN)/pytest $(QUICK) --cov --cov-report=term:skip-covered
+
+stress: setup node ## The slow tests: hostile input at length, kills at random moments, faults on a Slurm cluster and on servers where installed, poses of a development capture where present
 	GSBAKE_FUZZ_INPUTS=$(FUZZ_INPUTS) $(BIN)/pytest -m "slow or stress"
 
 bench: setup ## Measure kernels, error against time (beside other tools) and growth, about two idle hours: PARTS="table timeline growth" ARGS=…

@@ -17,11 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsbake.capture.posed_photos import PosedPhotos
+from gsbake.gltf.frame import read_transforms_json
 from gsbake.imaging.srgb import encode
 from gsbake.report import compose
 from gsbake.report.asset import open_asset
 from gsbake.report.lights import procedural
-from gsbake.report.quality import asset_cameras, compare
+from gsbake.report.quality import compare
 from gsbake.report.render import Renderer
 from gsbake.report.sheets import downsample, uv_atlas_image
 
@@ -79,7 +80,7 @@ def main(out: Path) -> None:
     """Make all pictures from the run in `out`."""
     stage = {path.parent.name: path for path in sorted((out / "stages").glob("*/*"), key=lambda path: path.stat().st_mtime)}
     asset = open_asset(stage["export"] / "asset.glb")
-    cameras = asset_cameras(stage["export"] / "cameras.json")
+    cameras = read_transforms_json(stage["export"] / "cameras.json")
     posed = PosedPhotos.open(stage["poses"], stage["refine"])
     renderer = Renderer(asset)
     learnt = compose.learnt_shader(stage["bake"] / "light.safetensors", compose.light_rotation(cameras[0], posed.cameras.cameras[0]))

@@ -17,6 +17,7 @@ from gsbake.capture.masks.weights import resolve_network
 from gsbake.capture.sources import PHOTO_FOLDERS, discover, list_masks, source_files
 from gsbake.config.load import DEFAULT, LoadedProfile, load_profile
 from gsbake.config.schema import Profile
+from gsbake.config.targets import parse_target, require_packages
 from gsbake.errors import BadInputError, UsageError
 from gsbake.meshing.decimator_choice import resolve_decimator
 from gsbake.pipeline.engine import Engine, Observer, artifacts_by_stage
@@ -31,6 +32,8 @@ from gsbake.publish import publish_results
 from gsbake.stages import REGISTRY
 from gsbake.text import number
 
+#: Stage that runs only where targets are asked for.
+TARGETS = "targets"
 #: Largest seed that all libraries accept (32-bit signed integer).
 MAX_SEED = 2**31 - 1
 #: Most threads: more than any machine has cores, few enough for every library's pool.
@@ -72,6 +75,8 @@ class Session:
 
         Raises what `Engine.run` raises.
         """
+        if target == TARGETS and TARGETS not in self.engine.registry.names:
+            raise UsageError("No target is set: name them, as in --target web,ar:usdz (settings: targets.files).")
         self.engine.shared = open_shared_store(self.store)
         try:
             states = self.engine.run(target, on_accepted=lambda: self.project.save(self.out))
@@ -183,7 +188,7 @@ def open_session(options: RunOptions, observer: Observer | None = None, registry
     if not 0 <= options.threads <= MAX_THREADS:
         raise UsageError(f"The number of threads must be from 0 (the physical cores) to {MAX_THREADS}, not {options.threads}.")
     project = replace(project, profile=name, overrides=tuple(last.values()), seed=seed)
-    sources = project.sources()
+    sources = project.sources() | _priors(project, profile.profile)
     request = Request(
         out=out,
         sources=sources,
@@ -194,7 +199,12 @@ def open_session(options: RunOptions, observer: Observer | None = None, registry
         source_names=_source_names(sources),
     )
     store = options.store or os.environ.get("GSBAKE_STORE") or None
-    return Session(Engine(registry or REGISTRY, request, observer), project, profile, out, store)
+    stages = registry or REGISTRY
+    wanted = profile.profile.targets
+    require_packages(parse_target(text) for text in wanted.files)
+    if not wanted.files:  # no run shall list a stage that has nothing to do
+        stages = stages.without(TARGETS)
+    return Session(Engine(stages, request, observer), project, profile, out, store)
 
 
 def open_store(out: Path | None) -> tuple[Store, tuple[str, ...]]:
@@ -217,7 +227,19 @@ def _source_names(sources: dict[str, Path]) -> dict[str, list[str]]:
     names = {"photos": source_files(sources["photos"])}
     if "masks" in sources and sources["masks"].is_dir():
         names["masks"] = list_masks(sources["masks"])
+    for kind in ("normals", "depths"):
+        if kind in sources:
+            names[kind] = [path.name for path in sorted(sources[kind].iterdir()) if path.suffix.lower() in (".npy", ".png")]
     return names
+
+
+def _priors(project: Project, profile: Profile) -> dict[str, Path]:
+    """Folders of given normals and depths beside the photos' folder, where the profile has a weight for them."""
+    if project.photos is None:
+        return {}
+    weights = {"normals": profile.coupling.prior_normals, "depths": profile.coupling.prior_depths}
+    folders = {kind: Path(project.photos).parent / kind for kind, weight in weights.items() if weight}
+    return {kind: folder for kind, folder in folders.items() if folder.is_dir()}
 
 
 def _default_out(photos: Path | None) -> Path:

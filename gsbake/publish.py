@@ -1,4 +1,4 @@
-"""Publication of a run's results in its output folder: asset.glb, cameras.json, light.hdr and report.html."""
+"""Publication of a run's results in its output folder: asset.glb, cameras.json, light.hdr, report.html, and the files of targets."""
 
 from __future__ import annotations
 
@@ -13,6 +13,8 @@ from gsbake.pipeline.store import Artifact
 
 #: {stage: files that are copied to the output folder}.
 RESULTS = {"export": ("asset.glb", "cameras.json", "light.hdr"), "report": ("report.html",)}
+#: Stage whose files are all results, but for these suffixes and names.
+TARGETS, INTERNAL = "targets", (".audit.json", "targets.json")
 
 
 def publish_results(
@@ -25,7 +27,7 @@ def publish_results(
     """
     placed: dict[str, Path] = {}
     published = dict(project.published)
-    for stage, names in RESULTS.items():
+    for stage, names in _results(artifacts, published).items():
         artifact = artifacts.get(stage)
         if artifact is None:
             continue
@@ -34,9 +36,20 @@ def publish_results(
             there = digests.file(target) if target.is_file() else None
             if name in artifact.files:
                 if there != artifact.files[name]:
+                    target.parent.mkdir(exist_ok=True)
                     copy_atomic(artifact.folder / name, target)
                 published[name] = artifact.files[name]
                 placed[name] = target
             elif there is not None and there == published.pop(name, None):
                 target.unlink()
     return placed, replace(project, published=published)
+
+
+def _results(artifacts: Mapping[str, Artifact], published: Mapping[str, str]) -> dict[str, tuple[str, ...]]:
+    """{stage: files that it has, or had when it was published before}."""
+    found = artifacts.get(TARGETS)
+    if found is None:
+        return dict(RESULTS)
+    now = {name for name in found.files if not name.endswith(INTERNAL)}
+    fixed = {name for names in RESULTS.values() for name in names}
+    return {**RESULTS, TARGETS: tuple(sorted(now | (set(published) - fixed)))}

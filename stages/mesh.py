@@ -12,7 +12,9 @@ def run(ctx: Context) -> dict[str, Any]:
     from gsbake.meshing.extract import MeshOptions, extract_mesh
 
     s = ctx.settings
-    options = MeshOptions(s.mesh, s.train.max_size, s.stereo.max_size, s.skip.empty_cells, s.export.max_triangles)
+    options = MeshOptions(
+        s.mesh, s.train.max_size, s.stereo.max_size, s.skip.empty_cells, s.surfels.projected_depth, s.export.max_triangles
+    )
     return extract_mesh(
         ctx.inputs["poses"], ctx.inputs["refine"], ctx.out, options, stereo=ctx.inputs["stereo"],
         seed=ctx.seed, threads=ctx.threads, device=ctx.device, scratch=ctx.checkpoint, monitor=ctx,
@@ -26,6 +28,8 @@ STAGE = Stage(
     run=run,
     summary="{faces} triangles, {dense_faces} before decimation",
     needs=("poses", "stereo", "refine"),
-    settings=("mesh.*", "train.max_size", "stereo.max_size", "skip.empty_cells", "export.max_triangles"),
+    settings=(
+        "mesh.*", "surfels.projected_depth", "train.max_size", "stereo.max_size", "skip.empty_cells", "export.max_triangles",
+    ),
     uses_device=True,
-)
+)  # fmt: skip

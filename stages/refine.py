@@ -13,7 +13,7 @@ def run(ctx: Context) -> dict[str, Any]:
     from gsbake.surfels.training.session import TrainOptions
 
     s = ctx.settings
-    training = TrainOptions(s.train, s.surfels, s.loss, converged_steps=s.skip.converged_steps)
+    training = TrainOptions(s.train, s.surfels, s.loss, converged_steps=s.skip.converged_steps, coupling=s.coupling)
     return refine_surfels(
         ctx.inputs["poses"], ctx.inputs["train"], ctx.out, RefineOptions(s.refine, training),
         seed=ctx.seed, threads=ctx.threads, device=ctx.device, scratch=ctx.checkpoint, monitor=ctx,
@@ -27,7 +27,10 @@ STAGE = Stage(
     run=run,
     summary="{surfels} surfels, {steps} steps, {psnr:dB} on validation photos",
     needs=("poses", "train"),
-    settings=("refine.*", "train.max_size", "train.holdout", "train.lr_*", "surfels.*", "loss.*", "skip.converged_steps"),
+    settings=(
+        "refine.*", "train.max_size", "train.holdout", "train.lr_*", "train.sharpness", "train.final_width", "surfels.*", "loss.*",
+        "coupling.*",        "skip.converged_steps",
+    ),
     uses_device=True,
     seeded=True,
-)
+)  # fmt: skip

@@ -96,7 +96,7 @@ def plan_capture(photos: Path, options: BatchOptions) -> CapturePlan:
         session = open_session(
             RunOptions(photos, out, options.profile, options.overrides, threads=options.threads, seed=options.seed),
         )
-        states = session.engine.plan()
+        states = _states(session)
     except UsageError:
         raise
     except GsbakeError as error:
@@ -112,6 +112,14 @@ def photos_of_run(out: Path) -> PhotoSet | None:
             pixels = sorted(int(p["source_width"]) * int(p["source_height"]) for p in photos)
             return PhotoSet(len(pixels), pixels[len(pixels) // 2] / 1e6)
     return None
+
+
+def _states(session: Session) -> list[StageState]:
+    """The states of the stages. Photos are read only where something is stored: else a batch would begin with the digests of all photos."""
+    engine = session.engine
+    if engine.store.stage_folder("").exists():
+        return engine.plan()
+    return engine.planner.plan_empty(engine.registry.up_to(None))
 
 
 def _photo_set(session: Session) -> PhotoSet:

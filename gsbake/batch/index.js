@@ -6,7 +6,8 @@ for (const button of document.querySelectorAll("th button")) {
     const down = button.dataset.order !== "down";
     button.dataset.order = down ? "down" : "up";
     const key = (row) => row.cells[column].dataset.sort;
-    const compare = (a, b) => (isNaN(key(a)) ? key(a).localeCompare(key(b)) : key(b) - key(a));
+    const figures = [...body.rows].every((row) => !isNaN(key(row)));
+    const compare = (a, b) => (figures ? key(b) - key(a) : key(a).localeCompare(key(b), undefined, { numeric: true }));
     const rows = [...body.rows].sort((a, b) => (down ? compare(a, b) : compare(b, a)));
     body.append(...rows);
   });

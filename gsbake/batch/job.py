@@ -17,7 +17,8 @@ from typing import Any
 from gsbake.api import RunOptions, open_session
 from gsbake.batch.captures import plan_state_key
 from gsbake.batch.records import Record, read_record
-from gsbake.errors import GsbakeError
+from gsbake.batch.slurm import node_name
+from gsbake.errors import GsbakeError, InterruptedRun
 from gsbake.pipeline.events import now
 from gsbake.pipeline.registry import Registry
 
@@ -46,7 +47,11 @@ def run_job(document: dict[str, Any], job_id: str) -> Record:
     except Exception as error:
         traceback.print_exc()  # into the log of the scheduler
         code, message = 1, f"Internal error ({type(error).__name__}: {error})."
-    record = Record(job["capture"], job_id, code, message, round(time.perf_counter() - start, 3), socket.gethostname(), now(), key)
+    failed_on = earlier.failed_on if earlier is not None else ()
+    if code == InterruptedRun.exit_code and node_name():
+        failed_on = tuple(dict.fromkeys((*failed_on, node_name())))
+    host = node_name() or socket.gethostname()
+    record = Record(job["capture"], job_id, code, message, round(time.perf_counter() - start, 3), host, now(), key, failed_on)
     record.write(root)
     return record
 

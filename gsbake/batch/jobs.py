@@ -7,13 +7,12 @@ cache, and the lease of a stage keeps two jobs from computing it twice.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
 from gsbake.batch.captures import BatchOptions, CapturePlan, identifier
-from gsbake.batch.estimate import Estimate, History
-from gsbake.pipeline.plan import StageState
+from gsbake.batch.estimate import History
 
 #: Expected seconds below which a job takes the next stage too: starting a job costs some seconds.
 PACK_SECONDS = 120.0
@@ -53,7 +52,8 @@ def make_jobs(
         states = plan.to_run or plan.states[-1:]  # nothing to compute: the last stage publishes the results
         estimates = {s.name: history.estimate(s.name, plan.photo_set, s.settings, threads) for s in states}
         earlier: tuple[str, ...] = ()
-        for group in _pack(states, estimates, pack_seconds):
+        for members in group_stages([estimates[state.name].seconds for state in states], pack_seconds):
+            group = [states[k] for k in members]
             target = group[-1].name
             seconds = sum(estimates[state.name].seconds for state in group)
             job = Job(
@@ -83,14 +83,16 @@ def stage_command(target: str, plan: CapturePlan, options: BatchOptions, threads
     return tuple(words + (["--store", options.store] if options.store else []))
 
 
-def _pack(states: Sequence[StageState], estimates: Mapping[str, Estimate], pack_seconds: float) -> list[list[StageState]]:
-    """Consecutive stages in groups: a group takes stages until it is expected to last `pack_seconds`; a short last group joins the one
-    before."""
-    groups: list[list[StageState]] = [[]]
-    for state in states:
-        if groups[-1] and sum(estimates[s.name].seconds for s in groups[-1]) >= pack_seconds:
-            groups.append([])
-        groups[-1].append(state)
-    if len(groups) > 1 and sum(estimates[s.name].seconds for s in groups[-1]) < pack_seconds:
-        groups[-2] += groups.pop()
+def group_stages(seconds: Sequence[float], pack_seconds: float) -> list[range]:
+    """Consecutive stages, by their expected seconds, in groups: a group takes stages until it is expected to last `pack_seconds`; a short
+    last group joins the one before."""
+    groups: list[range] = []
+    start = 0
+    for end in range(1, len(seconds) + 1):
+        if sum(seconds[start:end]) >= pack_seconds:
+            groups.append(range(start, end))
+            start = end
+    if start < len(seconds):
+        first = groups.pop().start if groups else start
+        groups.append(range(first, len(seconds)))
     return groups

@@ -65,7 +65,7 @@ def render(rows: Sequence[Row]) -> str:
     environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     environment.finalize = lambda value: printable(value) if type(value) is str else value
     page = environment.from_string(folder.joinpath("index.html.j2").read_text(encoding="utf-8"))
-    counts = {state: sum(row.state == state for row in rows) for state in ("done", "failed", "unfinished")}
+    counts = {state: sum(row.state == state for row in rows) for state in ("done", "running", "failed", "unfinished")}
     # `script` is gsbake's own file, and the only one that the policy allows.
     return page.render(rows=rows, columns=COLUMNS, counts=counts, script=Markup(script), script_digest=digest)
 

@@ -7,6 +7,7 @@ change or the user asks for it.
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass
@@ -23,7 +24,8 @@ FOLDER = ".batch"
 
 @dataclass(frozen=True)
 class Record:
-    """End of a job: exit code and sentence, seconds, host, and `key`, the cache key of the first stage that it had to run."""
+    """End of a job: exit code and sentence, seconds, host, `key`, the cache key of the first stage that it had to run, and the nodes of a
+    farm on which it was interrupted."""
 
     capture: str
     job: str
@@ -33,6 +35,7 @@ class Record:
     host: str
     finished: str
     key: str
+    failed_on: tuple[str, ...] = ()
 
     @property
     def final(self) -> bool:
@@ -57,6 +60,32 @@ def all_records(root: Path) -> list[Record]:
     """All records, oldest first."""
     names = (path.stem for path in (root / FOLDER / "records").glob("*.json"))
     return sorted((r for name in names if (r := read_record(root, name)) is not None), key=lambda r: r.finished)
+
+
+class RecordReader:
+    """Reads the records that are new since the last look, without reading the others again."""
+
+    def __init__(self, root: Path) -> None:
+        self._root = root
+        self._folder_time = -1
+        self._times: dict[str, int] = {}
+
+    def new_records(self) -> list[Record]:
+        """New and changed records, oldest first."""
+        found: list[Record] = []
+        with suppress(FileNotFoundError):
+            time = os.stat(self._root / FOLDER / "records").st_mtime_ns
+            if time == self._folder_time:
+                return []
+            with os.scandir(self._root / FOLDER / "records") as entries:
+                for entry in entries:
+                    changed = entry.stat().st_mtime_ns
+                    if entry.name.endswith(".json") and self._times.get(entry.name) != changed:
+                        self._times[entry.name] = changed
+                        record = read_record(self._root, entry.name.removesuffix(".json"))
+                        found += [record] if record is not None else []
+            self._folder_time = time
+        return sorted(found, key=lambda r: r.finished)
 
 
 def pending_key(plan: CapturePlan) -> str:

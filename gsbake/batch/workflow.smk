@@ -1,24 +1,42 @@
-# Workflow of `gsbake batch`: one rule per job of the file that the coordinator wrote (gsbake/batch/coordinator.py).
+# Workflow of `gsbake batch`: one rule, whose wildcard is a job of the file that the coordinator wrote (gsbake/batch/workflow.py): some
+# stages of a capture. Rules of their own for all jobs would take a time that grows with the square of their number.
 # The marker of a finished job only orders the jobs of this run; whether a stage is done is what gsbake's store says.
 import json
+from pathlib import Path
 
 with open(config["jobs"], encoding="utf-8") as file:
     BATCH = json.load(file)
+JOBS = {job["id"]: job for job in BATCH["jobs"]}
+
+
+def memory_mb(wildcards, attempt):
+    """More at each attempt where a job may have been killed for its memory, but not more than the largest node has."""
+    factor = (1 + attempt) / 2 if BATCH["grow"] else 1
+    return min(round(JOBS[wildcards.job]["memory_mb"] * factor), BATCH["most_memory_mb"])
+
+
+def slurm_options(wildcards, attempt):
+    """Keeps a job away from nodes on which it was interrupted: one with a full disk would take, and fail, every job of the batch."""
+    try:
+        failed = json.loads((Path(BATCH["records"]) / f"{wildcards.job}.json").read_text(encoding="utf-8"))["failed_on"]
+    except (OSError, ValueError, KeyError):
+        return ""
+    return f"--exclude={','.join(failed)}" if failed and len(failed) < BATCH["nodes"] else ""
 
 
 rule all:
-    input: [f"{job['id']}.done" for job in BATCH["jobs"]]
+    input: [f"{name}.done" for name in JOBS]
 
 
-for job in BATCH["jobs"]:
-    rule:
-        name: job["id"]
-        input: [f"{need}.done" for need in job["needs"]]
-        output: touch(f"{job['id']}.done")
-        threads: job["threads"]
-        retries: BATCH["retries"]
-        resources:
-            mem_mb=lambda wildcards, attempt, memory=job["memory_mb"]: memory * (attempt if BATCH["grow_memory"] else 1),
-            runtime=lambda wildcards, attempt, minutes=job["minutes"]: minutes * attempt,
-        params: command=job["shell"]
-        shell: "{params.command}"
+rule stages:
+    input: lambda wildcards: [f"{need}.done" for need in JOBS[wildcards.job]["needs"]]
+    output: touch("{job}.done")
+    wildcard_constraints: job="[A-Za-z0-9_]+"
+    threads: lambda wildcards: JOBS[wildcards.job]["threads"]
+    resources:
+        mem_mb=memory_mb,
+        runtime=lambda wildcards, attempt: JOBS[wildcards.job]["minutes"] * attempt,
+        slurm_extra=slurm_options,
+        **BATCH["resources"],
+    params: command=lambda wildcards: JOBS[wildcards.job]["shell"]
+    shell: "{params.command}"

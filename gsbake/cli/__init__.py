@@ -21,9 +21,9 @@ def main() -> None:
     signal.signal(signal.SIGINT, interrupted)
     signal.signal(signal.SIGTERM, interrupted)
     try:
-        from gsbake.cli.app import app
+        from gsbake.cli.app import parser
 
-        code = app(standalone_mode=False)
+        code = parser()(standalone_mode=False)
     except GsbakeError as error:
         _exit_with_error(str(error), error.exit_code)
     except BrokenPipeError:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import lru_cache
 from pathlib import Path
 from typing import Annotated
 
@@ -17,6 +18,7 @@ from gsbake.cli.options import (
     InvertOption,
     JsonOption,
     KnownDistanceOption,
+    LevelsOption,
     MarkerSizeOption,
     MasksOption,
     Options,
@@ -28,12 +30,15 @@ from gsbake.cli.options import (
     SeedOption,
     SetOption,
     StoreOption,
+    TargetOption,
     ThreadsOption,
     VerboseOption,
+    ViewOption,
     complete_profile,
     complete_stage,
     given_path,
     scale_settings,
+    target_settings,
 )
 
 app = typer.Typer(
@@ -62,6 +67,7 @@ STAGE_HELP = {
     "bake": "Unwrap the mesh and bake its textures.",
     "export": "Write asset.glb, cameras.json and light.hdr, and audit the asset.",
     "report": "Write report.html, which compares photos and renders.",
+    "targets": "Write the asset's files for the places where it is used (--target).",
 }
 
 
@@ -91,11 +97,14 @@ def _pipeline_command(target: str | None) -> Callable[..., None]:
         invert_masks: InvertOption = False,
         known_distances: KnownDistanceOption = None,
         marker_size: MarkerSizeOption = None,
+        targets: TargetOption = None,
+        levels: LevelsOption = None,
         device: DeviceOption = Device.auto,
         threads: ThreadsOption = 0,
         seed: SeedOption = None,
         store: StoreOption = None,
         dry_run: DryRunOption = False,
+        view: ViewOption = False,
         quiet: QuietOption = False,
         verbose: VerboseOption = False,
         as_json: JsonOption = False,
@@ -103,11 +112,11 @@ def _pipeline_command(target: str | None) -> Callable[..., None]:
         from gsbake.cli.run import run_pipeline
 
         mask_settings = (*(masks.settings if masks else ()), *(INVERTED if invert_masks else ()))
-        settings = [*(overrides or []), *mask_settings, *scale_settings(known_distances, marker_size)]
+        settings = [*(overrides or []), *mask_settings, *scale_settings(known_distances, marker_size), *target_settings(targets, levels)]
         options = Options(
             photos=photos, out=out, profile=profile, overrides=settings,
             masks=masks.folder if masks else None, poses=poses, device=device.value, threads=threads, seed=seed,
-            dry_run=dry_run, quiet=quiet, verbose=verbose, as_json=as_json, store=store,
+            dry_run=dry_run, quiet=quiet, verbose=verbose, as_json=as_json, store=store, view=view,
         )  # fmt: skip
         run_pipeline(options, target)
 
@@ -257,20 +266,30 @@ def batch_command(
     threads: ThreadsOption = 0,
     seed: BatchSeedOption = 0,
     store: StoreOption = None,
-    jobs: Annotated[int, typer.Option("--jobs", min=1, max=100_000, help="Most jobs in Slurm's queue at a time.")] = 100,
+    jobs: Annotated[
+        int,
+        typer.Option(
+            "--jobs", min=0, max=100_000, help="Most jobs in Slurm's queue at a time; 0: two for each core, at least 100.",
+            show_default=False,
+        ),
+    ] = 0,
+    partition: Annotated[str | None, typer.Option("--partition", help="Slurm's partition.  [default: Slurm's]", show_default=False)] = None,
+    account: Annotated[str | None, typer.Option("--account", help="Slurm's account.  [default: the user's]", show_default=False)] = None,
     retry_failed: Annotated[bool, typer.Option("--retry-failed", help="Run captures again that failed with the same input.")] = False,
     quiet: QuietOption = False,
     as_json: JsonOption = False,
 ) -> None:  # fmt: skip
     """Bake many captures on this machine or with Slurm, through Snakemake; the same command goes on where it stopped."""
     from gsbake.batch.captures import BatchOptions
+    from gsbake.batch.slurm import SlurmOptions
     from gsbake.cli import batch
 
     options = BatchOptions(out, profile, tuple(overrides or ()), threads, seed, store)
     if captures == [Path("status")]:
         batch.status(out, as_json)
     else:
-        batch.batch(captures, options, executor, retry_failed=retry_failed, workers=jobs, quiet=quiet, as_json=as_json)
+        slurm = SlurmOptions(partition, account)
+        batch.batch(captures, options, executor, retry_failed=retry_failed, workers=jobs, slurm=slurm, quiet=quiet, as_json=as_json)
 
 
 cache_app = typer.Typer(
@@ -383,3 +402,9 @@ def synth_command(
 
 
 app.add_typer(file_app)
+
+
+@lru_cache(maxsize=1)
+def parser() -> Callable[..., object]:
+    """The parser of all commands; a program that runs several commands builds it once."""
+    return typer.main.get_command(app)

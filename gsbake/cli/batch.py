@@ -17,12 +17,13 @@ from gsbake.batch.estimate import History
 from gsbake.batch.jobs import Job, make_jobs
 from gsbake.batch.page import write_index
 from gsbake.batch.records import Record, load_batch
+from gsbake.batch.slurm import SlurmOptions
 from gsbake.cli.output import cell, print_json, print_table, print_text
 from gsbake.errors import BadInputError, InterruptedRun, UsageError
 from gsbake.pipeline.machine import default_threads
 from gsbake.text import duration, size
 
-_STYLES = {"done": "green", "cached": "green", "failed": "red", "unfinished": "yellow"}
+_STYLES = {"done": "green", "cached": "green", "failed": "red", "unfinished": "yellow", "running": "cyan"}
 
 
 def plan(captures: Sequence[Path], options: BatchOptions, form: str | None) -> None:
@@ -53,7 +54,15 @@ def _print_jobs(jobs: Sequence[Job], done: int) -> None:
 
 
 def batch(
-    captures: Sequence[Path], options: BatchOptions, executor: str, *, retry_failed: bool, workers: int, quiet: bool, as_json: bool
+    captures: Sequence[Path],
+    options: BatchOptions,
+    executor: str,
+    *,
+    retry_failed: bool,
+    workers: int,
+    slurm: SlurmOptions,
+    quiet: bool,
+    as_json: bool,
 ) -> None:
     """Bake the captures, write the index, and print how each ended.
 
@@ -65,7 +74,7 @@ def batch(
         if not quiet and not as_json:
             print_text(f"{record.capture}: {record.message or f'{record.job} done in {duration(record.seconds)}'}")
 
-    outcomes = run_batch(captures, options, executor, retry_failed=retry_failed, workers=workers, on_record=on_record)
+    outcomes = run_batch(captures, options, executor, retry_failed=retry_failed, workers=workers, slurm=slurm, on_record=on_record)
     index = write_index(outcomes, options.root.absolute())
     if as_json:
         print_json({**_document(outcomes), "index": str(index), "seconds": round(time.perf_counter() - start, 3)})

@@ -7,10 +7,11 @@ from collections.abc import Mapping
 from typing import Any
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TaskID, TaskProgressColumn, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, Progress, TaskID, TaskProgressColumn, TextColumn
 from rich.text import Text
 
 from gsbake.cli.output import cell
+from gsbake.live.time_left import TimeLeft
 from gsbake.pipeline.engine import Observer
 from gsbake.pipeline.lease import LeaseHolder
 from gsbake.pipeline.plan import StageState
@@ -19,6 +20,7 @@ from gsbake.text import duration, figures, number, printable
 
 #: Seconds between progress lines without a terminal.
 PROGRESS_INTERVAL = 30.0
+_PREPARED = "kernels: compiled"
 _REUSED = {"cached": "cached", "replaced": "replaced by the user"}
 
 
@@ -33,6 +35,10 @@ class QuietDisplay(Observer):
         self.errors.print(cell(f"gsbake: warning ({name}): {text}"))
 
 
+    def preparing(self, done: int, total: int, text: str) -> None:
+        """Kernels are compiled, at stage `done` of `total`; `text` names the stage, empty at the end."""
+
+
 class PlainDisplay(QuietDisplay):
     """Timed lines for logs and pipes; `verbose` adds the reasons of stages and all decisions."""
 
@@ -41,13 +47,17 @@ class PlainDisplay(QuietDisplay):
         self.console = console or Console(highlight=False, soft_wrap=True)
         self.verbose = verbose
         self._begin = time.monotonic()
-        self._stage_begin = self._begin
         self._last = self._begin
         self._waiting = ""
+        self._left = TimeLeft()
 
     def line(self, text: str) -> None:
         """Print a line with the time since the start of the run."""
         self.console.print(cell(f"{_clock(time.monotonic() - self._begin)}  {text}"))
+
+    def preparing(self, done: int, total: int, text: str) -> None:
+        """Print a line per stage while kernels are compiled."""
+        self.line(_PREPARED if not text else f"kernels: compiling those of {text}, {done} of {total} stages (once per installation)")
 
     def run_started(self, stages: list[Stage]) -> None:
         """Start the clock."""
@@ -59,7 +69,8 @@ class PlainDisplay(QuietDisplay):
 
     def stage_started(self, state: StageState) -> None:
         """Print when verbose why a stage runs."""
-        self._stage_begin = self._last = time.monotonic()
+        self._last = time.monotonic()
+        self._left = TimeLeft()
         if self.verbose:
             self.line(f"{state.name}: {state.title} ({'; '.join(state.reasons)})")
 
@@ -73,10 +84,10 @@ class PlainDisplay(QuietDisplay):
     def progress(self, name: str, done: int, total: int, text: str, live: Mapping[str, float]) -> None:
         """Print a line every PROGRESS_INTERVAL seconds."""
         now = time.monotonic()
+        left = self._left.update(now, done, total, text)
         if now - self._last < PROGRESS_INTERVAL:
             return
         self._last = now
-        left = (now - self._stage_begin) / done * (total - done) if done else None
         parts = [f"{name}: {number(done)} of {number(total)}", text, _live(live), f"about {duration(left)} left" if left else ""]
         self.line(", ".join(part for part in parts if part))
 
@@ -99,7 +110,7 @@ class TerminalDisplay(PlainDisplay):
 
     def __init__(self, verbose: bool = False) -> None:
         super().__init__(verbose=verbose)
-        columns = (TextColumn("{task.description:>8}"), BarColumn(32), TaskProgressColumn(), TimeRemainingColumn())
+        columns = (TextColumn("{task.description:>8}"), BarColumn(32), TaskProgressColumn(), TextColumn("{task.fields[left]:>14}"))
         note = TextColumn("{task.fields[note]}", markup=False)  # the name of a photo, for example
         self._bar = Progress(*columns, note, console=self.console, transient=True, refresh_per_second=5)
         self._task: TaskID | None = None
@@ -108,6 +119,16 @@ class TerminalDisplay(PlainDisplay):
         """Print a line above the bar."""
         self.console.print(cell(text))
 
+    def preparing(self, done: int, total: int, text: str) -> None:
+        """A bar of its own while kernels are compiled."""
+        if self._task is None:
+            self._task = self._bar.add_task("kernels", total=total, note="", left="")
+            self._bar.start()
+        self._bar.update(self._task, completed=done, total=total, note=f"compiling those of {text}, once per installation")
+        if not text:
+            self.close()
+            self.console.print(_done("kernels").append(_PREPARED.partition(" ")[2], "dim"))
+
     def stage_reused(self, state: StageState) -> None:
         """Print a stage that needs no work."""
         self.console.print(_done(state.name).append(_REUSED[state.status], "dim"))
@@ -115,14 +136,16 @@ class TerminalDisplay(PlainDisplay):
     def stage_started(self, state: StageState) -> None:
         """Open the stage's bar."""
         super().stage_started(state)
-        self._task = self._bar.add_task(state.name, total=None, note=state.title)
+        self._task = self._bar.add_task(state.name, total=None, note=state.title, left="")
         self._bar.start()
 
     def progress(self, name: str, done: int, total: int, text: str, live: Mapping[str, float]) -> None:
         """Update the bar."""
         if self._task is not None:
             note = " ".join(part for part in (text, _live(live)) if part)
-            self._bar.update(self._task, completed=done, total=total or None, note=printable(note))
+            left = self._left.update(time.monotonic(), done, total, text)
+            shown = f"{duration(left)} left" if left else ""
+            self._bar.update(self._task, completed=done, total=total or None, note=printable(note), left=shown)
 
     def stage_finished(self, state: StageState) -> None:
         """Replace the bar by the stage's time and results."""

@@ -6,7 +6,7 @@ import json
 from dataclasses import dataclass, field
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -96,6 +96,23 @@ def scale_settings(known_distances: list[str] | None, marker_size: float | None)
     return (*distances, *(() if marker_size is None else (f"scale.marker_size={marker_size!r}",)))
 
 
+def given_targets(text: str) -> tuple[str, ...]:
+    """The targets of a list with commas."""
+    from gsbake.config.targets import parse_target
+
+    try:
+        return tuple(parse_target(part).text for part in text.split(","))
+    except ValueError as error:
+        raise typer.BadParameter(f"{error}.") from error
+
+
+def target_settings(targets: list[tuple[str, ...]] | None, levels: int | None) -> tuple[str, ...]:
+    """Settings of `--target` and `--levels`; the target default alone asks for nothing but asset.glb."""
+    files = list(dict.fromkeys(text for group in targets or () for text in group))
+    named = (f"targets.files={json.dumps(files)}",) if files else ()
+    return (*named, *(() if levels is None else (f"targets.levels={levels}",)))
+
+
 PhotosArgument = Annotated[
     Path | None,
     typer.Argument(
@@ -154,6 +171,20 @@ MarkerSizeOption = Annotated[
         show_default=False,
     ),
 ]
+TargetOption = Annotated[
+    list[Any] | None,
+    typer.Option(
+        "--target",
+        parser=given_targets,
+        metavar="NAME[:FORM],...",
+        help="Further files: default, web, ar, banner, planner, film, surfels; forms webp, ktx2, quantised, meshopt (joined by +), "
+        "usdz, usdc, obj. As in web,ar:usdz,default:ktx2+meshopt. Repeatable.",
+        show_default=False,
+    ),
+]
+LevelsOption = Annotated[
+    int | None, typer.Option("--levels", min=0, max=8, metavar="N", help="Levels of detail below each target.", show_default=False)
+]
 PosesOption = Annotated[
     Path | None,
     typer.Option(
@@ -165,6 +196,9 @@ PosesOption = Annotated[
     ),
 ]
 InvertOption = Annotated[bool, typer.Option("--invert-masks", help="Masks are white on the background.")]
+ViewOption = Annotated[
+    bool, typer.Option("--view", help="Serve a page on this machine that shows the run: render, curves, decisions, time left.")
+]
 DeviceOption = Annotated[Device, typer.Option("--device", help="Device of the kernels.")]
 ThreadsOption = Annotated[
     int, typer.Option("--threads", help="Number of threads, at most 512; 0 uses the physical cores.", show_default=False)
@@ -203,6 +237,7 @@ class Options:
     verbose: bool = False
     as_json: bool = False
     store: str | None = None
+    view: bool = False
 
     def session(self, observer: Observer | None = None) -> Session:
         """Session of the run that the options describe; nothing is written."""

@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
-from gsbake.api import Result
+from gsbake.api import Result, Session
 from gsbake.cli.display import choose_display, close_display
 from gsbake.cli.inspect import plan_document, print_plan
 from gsbake.cli.options import Options
 from gsbake.cli.output import print_json, print_text
+from gsbake.cli.warm_up import compile_kernels
+from gsbake.live.server import LiveView
+from gsbake.live.state import LiveState
 from gsbake.pipeline.plan import StageState
 from gsbake.text import duration, number, size
 
@@ -18,7 +23,8 @@ def run_pipeline(options: Options, target: str | None) -> None:
     """Bring the stages up to `target` (None: all) up to date and print a summary."""
     start = time.perf_counter()
     display = choose_display(quiet=options.quiet, verbose=options.verbose, as_json=options.as_json)
-    session = options.session(display)
+    state = LiveState(display) if options.view else None
+    session = options.session(state or display)
     if options.dry_run:
         states = session.engine.plan(target)
         if options.as_json:
@@ -27,7 +33,9 @@ def run_pipeline(options: Options, target: str | None) -> None:
             print_plan(states)
         return
     try:
-        result = session.run(target)
+        compile_kernels(session, target, display)
+        with serving(state, session):
+            result = session.run(target)
     finally:
         close_display(display)
     seconds = time.perf_counter() - start
@@ -36,6 +44,17 @@ def run_pipeline(options: Options, target: str | None) -> None:
     elif not options.quiet:
         for name, text in summary_lines(result, seconds):
             print_text(f"{name:<9} {text}")
+
+
+@contextmanager
+def serving(state: LiveState | None, session: Session) -> Iterator[None]:
+    """Serve the live view while the run lasts; its address goes to stderr. Nothing without a state."""
+    if state is None:
+        yield
+        return
+    with LiveView(state, session.out, session.profile.profile.surfels.transfer) as view:
+        print_text(f"Live view: {view.address}", error=True)
+        yield
 
 
 def summary_lines(result: Result, seconds: float) -> list[tuple[str, str]]:

@@ -12,6 +12,7 @@ from typing import Annotated, Literal
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
 from gsbake.config.lengths import parse_known_distance
+from gsbake.config.targets import parse_target
 from gsbake.monitor import Rule
 
 Fraction = Annotated[float, Field(ge=0, le=1)]
@@ -37,6 +38,12 @@ def _known_distance(text: str) -> str:
     return text
 
 
+def _target(text: str) -> str:
+    return parse_target(text).text
+
+
+#: A target that can be parsed, in its usual spelling.
+TargetText = Annotated[str, AfterValidator(_target)]
 #: A known distance that can be parsed.
 KnownDistanceText = Annotated[str, AfterValidator(_known_distance)]
 Pruning = Literal["visibility", "sdf", "gsdf", "gaussianroom", "gs-ror2"]
@@ -96,12 +103,61 @@ class Surfels(Section):
     sh_degree: int = Field(1, ge=0, le=2, description="Degree of the spherical harmonics (surfels.shading = colour).")
     transfer: Literal["sech2", "bell", "gaussian", "laplace", "neus"] = Field("sech2", description="Transfer function from SDF sample to opacity: sech² (discretized SDF), the bell of 3DGSR, a Gaussian, the Laplace density of VolSDF, or the density of NeuS on a thin layer.")
     max_count: int = Field(60_000, ge=100, le=10_000_000, description="Maximum number of surfels.")
+    projected_depth: bool = Field(False, description="Rendered depth, in training and in fusion, is that of the surfels moved by their signed distance onto the zero level set.")
 
 
 class Light(Section):
     """Environment map."""
 
     size: int = Field(32, ge=4, le=128, description="Edge of the cube map's faces in texels.")
+
+
+class DistanceField(Section):
+    """Signed distance field that the surfels are trained with."""
+
+    kind: Literal["samples", "grid", "octree", "tensor", "hash", "mlp"] = Field("samples", description="Representation. samples: one SDF sample per surfel; grid: sparse voxels; octree: corners, fine where curved; tensor: planes and lines with a network; hash: multi-resolution hash grid with a network; mlp: a network of the position.")
+    opacity: Literal["own", "field"] = Field("own", description="Opacity of surfels beside a continuous field. own: trained for itself; field: the transfer function of the field's value at the centre.")
+    start: Literal["surfels", "sphere"] = Field("surfels", description="What a continuous field starts from. surfels: the distance to the initial surfels; sphere: a sphere.")
+    resolution: int = Field(96, ge=8, le=512, description="Finest cells along the longest side (grid, octree, tensor, hash).")
+    levels: int = Field(8, ge=1, le=16, description="Levels of the hash grid.")
+    features: int = Field(2, ge=1, le=8, description="Features per level of the hash grid.")
+    table_bits: int = Field(15, ge=8, le=22, description="Rows of a level of the hash grid, as a power of two; levels that fit are dense.")
+    rank: int = Field(6, ge=1, le=32, description="Components of the factorised tensor per pair of axes.")
+    octaves: int = Field(5, ge=0, le=10, description="Octaves of Fourier features (mlp).")
+    width: int = Field(32, ge=4, le=256, description="Width of the network's layers.")
+    hidden: int = Field(1, ge=1, le=8, description="Hidden layers of the network.")
+    splats: bool = Field(False, description="Add embeddings of the nearest surfels to the features of the hash grid.")
+    fit_steps: int = Field(200, ge=0, le=100_000, description="Steps of the fit to the known distance before training (tensor, hash, mlp).")
+    rate: float = Field(1.0, gt=0, le=1000, description="Factor on the learning rates of the field.")
+    points: int = Field(4096, ge=16, le=1_000_000, description="Random points per iteration at which couplings ask for distance and gradient.")
+    rays: int = Field(512, ge=8, le=100_000, description="Rays per iteration along which couplings march.")
+    ray_samples: int = Field(12, ge=3, le=512, description="Samples per marched ray.")
+    sampling: Literal["surfels", "sphere-tracing"] = Field("surfels", description="Where rays are sampled. surfels: around their rendered depth; sphere-tracing: around the field's own hit, else all over the box.")
+    renderer: Literal["neus", "laplace", "logistic"] = Field("neus", description="Transfer function of marched rays: NeuS, VolSDF's Laplace density, or the logistic bump.")
+    edges: Fraction = Field(0.0, description="Share of the rays drawn in proportion to the photo's gradient.")
+    seeds: Fraction = Field(0.0, description="Surfels added where the zero level set has none, at each densification, as a share of all.")
+    cycles: int = Field(0, ge=0, le=10, description="Times that all surfels are placed anew on the field's zero level set.")
+
+
+class Coupling(Section):
+    """Weights of the losses between surfels and a continuous field; 0 switches one off."""
+
+    surface: Weight = Field(0.0, description="Surfels lie on the zero level set: |f(μ)| in surfel spacings.")
+    alignment: Weight = Field(0.0, description="Normals of surfels are parallel to ∇f.")
+    opacity_target: Weight = Field(0.0, description="Opacity of surfels of their own follows the bell of f(μ).")
+    pull_surfels: Fraction = Field(0.0, description="Share of the way to the zero level set that surfels are moved in each iteration.")
+    depth: Weight = Field(0.0, description="Depth of surfels and marched depth of the field agree.")
+    normals: Weight = Field(0.0, description="Normals of surfels and of the field agree along rays.")
+    eikonal: Weight = Field(0.0, description="Slope 1.")
+    smoothness: Weight = Field(0.0, description="Change of ∇f over a cell and a half near the surface.")
+    free_space: Weight = Field(0.0, description="No surface before the depth of the surfels.")
+    silhouette: Weight = Field(0.0, description="Rays outside the mask miss the surface, rays inside meet it.")
+    pulling: Weight = Field(0.0, description="Points near the surface, moved by f and ∇f, land on the nearest surfel.")
+    colour: Weight = Field(0.0, description="Marched colours of the field agree with the photo.")
+    mask: Weight = Field(0.0, description="Cross-entropy of marched alpha and mask.")
+    extra_views: Weight = Field(0.0, description="Depth and normals of the field agree with surfels rendered between photos.")
+    prior_normals: Weight = Field(0.0, description="Agreement with given normal maps (folder normals/ of the capture).")
+    prior_depths: Weight = Field(0.0, description="Agreement with given depth maps up to scale and shift (folder depths/ of the capture).")
 
 
 class Train(Section):
@@ -116,12 +172,18 @@ class Train(Section):
         "gradient", description="Densification. gradient: surfels with the largest screen-space gradient; sdf: of these, those close to the surface; gsdf, gaussianroom: the rules of those papers. auto: none after stereo initialisation, else gradient."
     )
     prune: Pruning = Field("visibility", description="Pruning during training; the policies of refine.prune.")
+    band: float = Field(0.0, ge=0, le=20, description="Half-thickness in surfel spacings of the band around the initial surface over which surfels are spread, each with its distance as SDF sample. 0: all on the surface.")
+    sharpness: Literal["unit", "spacing"] = Field("unit", description="Unit of SDF samples and sharpness. unit: the unit frame, as in the paper; spacing: surfel spacings, with the distance of half opacity falling to train.final_width.")
+    final_width: float = Field(1.0, gt=0, le=100, description="Distance in surfel spacings at which opacity is half at the end (train.sharpness = spacing).")
+    reset_opacity: Fraction = Field(0.0, description="Opacity to which more opaque surfels are reset at each densification in the first third of training, by moving them off the surface; 0 is off.")
     holdout: HeldOut = Field(8, description="Every n-th photo is held out of training; 0 holds none out, 1 is an error.")
     lr_position: LearningRate = Field(8e-4, description="Learning rate of positions (unit frame); decays to 1/100.")
     lr_scale: LearningRate = Field(0.02, description="Learning rate of log-scales; decays to 1/10.")
     lr_rotation: LearningRate = Field(2e-3, description="Learning rate of quaternions; decays to 1/10.")
     lr_sdf: LearningRate = Field(0.005, description="Learning rate of SDF samples; decays to 1/10.")
-    lr_gamma: LearningRate = Field(0.03, description="Learning rate of the sharpness γ; decays to 1/10.")
+    lr_gamma: LearningRate = Field(0.03, description="Learning rate of the sharpness γ; decays to 1/10. A share of γ with train.sharpness = spacing.")
+    lr_sample: LearningRate = Field(0.05, description="Learning rate of SDF samples in surfel spacings (train.sharpness = spacing); decays to 1/10.")
+    lr_opacity: LearningRate = Field(0.05, description="Learning rate of opacities of their own, before the sigmoid (field.opacity = own); decays to 1/10.")
     lr_material: LearningRate = Field(1.6e-2, description="Learning rate of colours and materials; decays to 1/10.")
     lr_light: LearningRate = Field(5e-2, description="Learning rate of the environment map; decays to 1/10.")
 
@@ -155,7 +217,8 @@ class Mesh(Section):
 
     resolution: int = Field(0, ge=0, le=2048, description="Voxels along the longest side; 0 derives it from surfel spacing and pixel footprint.")
     max_resolution: int = Field(384, ge=16, le=2048, description="Maximum of the derived resolution in voxels.")
-    field: Literal["tsdf", "imls"] = Field("tsdf", description="Field that is meshed. tsdf: fused depth maps; imls: the surfels' SDF samples.")
+    field: Literal["tsdf", "imls", "trained"] = Field("tsdf", description="Field that is meshed. tsdf: fused depth maps; imls: the surfels' SDF samples; trained: the field they were trained with (field.kind).")
+    normals: Literal["surfels", "field"] = Field("surfels", description="Source of the normals that refine the mesh (mesh.normal_wavelength). surfels: rendered; field: the gradient of the trained field.")
     holes: Literal["close", "leave"] = Field("close", description="Fill the surface where no photo observed it, or leave holes.")
     support_plane: Literal["remove", "keep"] = Field("remove", description="Without masks: remove or keep the plane on which the object stands.")
     faces: int = Field(30_000, ge=100, le=10_000_000, description="Triangles of the low-poly mesh, where mesh.max_error does not require more.")
@@ -206,6 +269,14 @@ class Export(Section):
     copyright: str = Field("", description="Copyright line of the asset.")
 
 
+class Targets(Section):
+    """Further files of the asset, for the places where it is used."""
+
+    files: tuple[TargetText, ...] = Field((), max_length=32, description="Targets, each NAME or NAME:FORM+FORM. Names: default, web, ar, banner, planner, film (budgets of bytes, triangles and texels), surfels (splats as PLY). Forms: webp or ktx2, quantised or meshopt; usdz, usdc or obj instead of GLB.")
+    levels: int = Field(0, ge=0, le=8, description="Levels of detail below each target: files asset_lod1.glb and on, each with half the extent on the screen.")
+    lod_file: bool = Field(False, description="Also write all levels of a target into one GLB (MSFT_lod).")
+
+
 class Report(Section):
     """HTML report."""
 
@@ -239,6 +310,8 @@ class Profile(Section):
     stereo: Stereo = Stereo()
     surfels: Surfels = Surfels()
     light: Light = Light()
+    field: DistanceField = DistanceField()
+    coupling: Coupling = Coupling()
     train: Train = Train()
     loss: Loss = Loss()
     refine: Refine = Refine()
@@ -246,5 +319,6 @@ class Profile(Section):
     bake: Bake = Bake()
     scale: Scale = Scale()
     export: Export = Export()
+    targets: Targets = Targets()
     report: Report = Report()
     skip: Skip = Skip()

@@ -14,6 +14,7 @@ from typing import Any, Literal
 import numpy as np
 
 from gsbake.errors import BadInputError
+from gsbake.gltf.document import decode_image, image_format
 from gsbake.gltf.read import GltfAsset, parse_glb
 from gsbake.texturing.texels import overlapping
 
@@ -41,8 +42,13 @@ class Finding:
     severity: Severity
 
 
-def audit(data: bytes, name: str, max_megabytes: float, max_triangles: int) -> list[Finding]:
-    """Audit the bytes of a GLB; `name` identifies it in errors. An unreadable file gives one failed finding."""
+def audit(
+    data: bytes, name: str, max_megabytes: float, max_triangles: int, extensions: frozenset[str] = frozenset(), budget: Severity = "warning"
+) -> list[Finding]:
+    """Audit the bytes of a GLB; `name` identifies it in errors. An unreadable file gives one failed finding.
+
+    `extensions` may be required by the file; `budget` is the severity of a file that is too large.
+    """
     try:
         asset = parse_glb(data, name)
     except BadInputError as error:
@@ -55,7 +61,7 @@ def audit(data: bytes, name: str, max_megabytes: float, max_triangles: int) -> l
     check("readable GLB", True, f"{len(data)} bytes")
     try:
         with np.errstate(all="ignore"):  # a value that overflows fails the rule that it is for
-            _structure(asset, check)
+            _structure(asset, check, extensions)
             _geometry(asset, check, max_triangles)
             _uv_layout(asset, check)
             _images(asset, check)
@@ -64,7 +70,7 @@ def audit(data: bytes, name: str, max_megabytes: float, max_triangles: int) -> l
     except (KeyError, IndexError, ValueError, TypeError, AttributeError, OverflowError, struct.error) as error:
         check("well-formed document", False, " ".join(repr(error).split())[:200])
     megabytes = len(data) / 1e6
-    check("file size", megabytes <= max_megabytes, f"{megabytes:.2f} MB of {max_megabytes:g} MB", "warning")
+    check("file size", megabytes <= max_megabytes, f"{megabytes:.2f} MB of {max_megabytes:g} MB", budget)
     return found
 
 
@@ -78,7 +84,7 @@ def as_json(findings: list[Finding]) -> list[dict[str, Any]]:
     return [asdict(f) for f in findings]
 
 
-def _structure(asset: GltfAsset, check: Any) -> None:
+def _structure(asset: GltfAsset, check: Any, allowed: frozenset[str]) -> None:
     """Rules of the document: version, one mesh and material, self-contained, buffer views in order."""
     document = asset.document
     header = document["asset"]
@@ -88,15 +94,19 @@ def _structure(asset: GltfAsset, check: Any) -> None:
     check("scale is stated", scale in ("metres", "unknown"), f"asset.extras.scale = {scale}", "warning")
     counts = {key: len(document.get(key, [])) for key in ("meshes", "materials", "scenes", "buffers")}
     primitives = sum(len(m["primitives"]) for m in document["meshes"])
-    check("one mesh, one material", counts["meshes"] == counts["materials"] == primitives == 1, f"{counts}, {primitives} primitives")
+    levels = 1 + len(document["nodes"][0].get("extensions", {}).get("MSFT_lod", {}).get("ids", [])) if document.get("nodes") else 1
+    single = counts["meshes"] == primitives == levels and 1 <= counts["materials"] <= levels
+    check("one mesh, one material", single, f"{counts}, {primitives} primitives, {levels} levels of detail")
     external = [x for key in ("buffers", "images") for x in document.get(key, []) if "uri" in x]
     check("self-contained", not external, f"{len(external)} external references")
     extensions = document.get("extensionsRequired", [])
-    check("no required extensions", not extensions, ", ".join(extensions) or "none")
+    unasked = [name for name in extensions if name not in allowed]
+    check("no required extensions", not unasked, ", ".join(extensions) or "none")
     material = document["materials"][0] if document.get("materials") else {}
     check("opaque", material.get("alphaMode", "OPAQUE") == "OPAQUE", f"alphaMode {material.get('alphaMode', 'OPAQUE')}")
     end, aligned, total = 0, True, document["buffers"][0]["byteLength"]
-    for view in document["bufferViews"]:
+    for entry in document["bufferViews"]:
+        view = entry.get("extensions", {}).get("EXT_meshopt_compression", entry)
         start = view.get("byteOffset", 0)
         aligned = aligned and start % 4 == 0 and start >= end
         end = start + view["byteLength"]
@@ -117,6 +127,8 @@ def _geometry(asset: GltfAsset, check: Any, max_triangles: int) -> None:
     check("indices in range", in_range, f"{len(faces)} triangles, {len(position)} vertices")
     accessor = asset.document["accessors"][asset.document["meshes"][0]["primitives"][0]["attributes"]["POSITION"]]
     bounds = np.array([accessor.get("min", [np.nan] * 3), accessor.get("max", [np.nan] * 3)], np.float32)
+    if accessor.get("normalized"):
+        bounds = bounds / np.float32(65535 if accessor["componentType"] == 5123 else 255)
     check("POSITION bounds", np.array_equal(bounds, np.stack([position.min(0), position.max(0)])), f"{bounds.tolist()}")
     if in_range:
         corner = position[faces].astype(np.float64)
@@ -153,7 +165,7 @@ def _uv_layout(asset: GltfAsset, check: Any) -> None:
 
 
 def _images(asset: GltfAsset, check: Any) -> None:
-    """Rules of the textures: PNG of a power of two without colour chunks, packing, plausible values."""
+    """Rules of the textures: powers of two, PNG without colour chunks, other formats as the file says, packing, plausible values."""
     surface = asset.document["materials"][0].get("pbrMetallicRoughness", {}) if asset.document.get("materials") else {}
     factors = {"roughnessFactor", "metallicFactor"} <= surface.keys()
     present = "base_color" in asset.roles and ("orm" in asset.roles or factors)
@@ -164,17 +176,19 @@ def _images(asset: GltfAsset, check: Any) -> None:
         if role not in asset.roles:
             continue
         content = asset.images[asset.roles[role]]
-        chunks = png_chunks(content)
-        if not chunks:
-            check(f"{role}: PNG", False, "not a PNG file")
+        form = image_format(content)
+        if form == "png":
+            width, height = _png_header(role, content, occlusion_only, check)
+        elif form == "jpeg" or (form != "unknown" and _extension_of(form) in asset.document.get("extensionsRequired", [])):
+            height, width = decode_image(content, role).shape[:2]
+            check(f"{role}: image format", True, f"{width}x{height}, {form}")
+        else:
+            check(f"{role}: PNG", False, f"{form}: neither PNG, JPEG nor of an extension that the file requires")
             continue
-        width, height, depth, kind = struct.unpack_from(">IIBB", content, 16)
-        colours, colour_type = ("grey", 0) if role == "occlusion" else ("RGB", 2)
-        check(f"{role}: 8-bit {colours} PNG", depth == 8 and kind == colour_type, f"{width}x{height}, {depth} bits, colour type {kind}")
+        if not width:
+            continue
         check(f"{role}: square power of two", width == height and width & (width - 1) == 0, f"{width}x{height}")
         check(f"{role}: usual size", USUAL_SIZES[0] <= width <= USUAL_SIZES[1], f"{width} texels", "info")
-        colour = [c for c in chunks if c in COLOUR_CHUNKS]
-        check(f"{role}: no colour chunks", not colour, ", ".join(colour) or "none")
         pixels = asset.image(role)
         if pixels is None:
             continue
@@ -187,6 +201,24 @@ def _images(asset: GltfAsset, check: Any) -> None:
             check("normal map of unit vectors", share < 0.02, f"length error above 0.1 in {share:.2%} of the texels")
             inward = float((pixels[..., 2] < 128).mean())
             check("normal map points outwards", inward < 0.001, f"{inward:.2%} of the texels")
+
+
+def _extension_of(form: str) -> str:
+    return {"webp": "EXT_texture_webp", "ktx2": "KHR_texture_basisu"}[form]
+
+
+def _png_header(role: str, content: bytes, occlusion_only: bool, check: Any) -> tuple[int, int]:
+    """Check the header and the chunks of a PNG; its width and height, 0 where it is damaged."""
+    chunks = png_chunks(content)
+    if not chunks:
+        check(f"{role}: PNG", False, "not a complete PNG file")
+        return 0, 0
+    width, height, depth, kind = struct.unpack_from(">IIBB", content, 16)
+    colours, colour_type = ("grey", 0) if role == "occlusion" and occlusion_only else ("RGB", 2)
+    check(f"{role}: 8-bit {colours} PNG", depth == 8 and kind == colour_type, f"{width}x{height}, {depth} bits, colour type {kind}")
+    colour = [c for c in chunks if c in COLOUR_CHUNKS]
+    check(f"{role}: no colour chunks", not colour, ", ".join(colour) or "none")
+    return int(width), int(height)
 
 
 def png_chunks(content: bytes) -> list[str]:

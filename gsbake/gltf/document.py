@@ -1,13 +1,14 @@
 """Any glTF file, GLB or JSON with files beside it: its document, its buffer views, its images.
 
-A file that needs an extension that cannot be honoured, such as compressed geometry, is refused in one sentence. glTF 2.0 specification,
-sections 3.6 (binary data) and 3.6.2.3 (sparse accessors).
+A file that needs an extension that cannot be honoured, such as Draco, is refused in one sentence. glTF 2.0 specification, sections 3.6
+(binary data) and 3.6.2.3 (sparse accessors); EXT_meshopt_compression and KHR_texture_basisu by the packages of the extra `web`.
 """
 
 from __future__ import annotations
 
 import base64
 import binascii
+import importlib.util
 import json
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -20,6 +21,7 @@ from numpy.typing import NDArray
 
 from gsbake.errors import BadInputError
 from gsbake.gltf.container import unpack_glb
+from gsbake.imaging import ktx2
 
 COMPONENT_TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 COMPONENT_COUNTS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
@@ -32,7 +34,11 @@ READ = {
 }  # fmt: skip
 #: Required extensions without which the object still has its shape and its base colour.
 IGNORED = ("KHR_materials_", "KHR_lights_", "KHR_xmp", "KHR_node_visibility", "KHR_animation_pointer", "ADOBE_materials_")
-KTX2_MAGIC = b"\xabKTX 20\xbb\r\n\x1a\n"
+MESHOPT, BASISU = "EXT_meshopt_compression", "KHR_texture_basisu"
+#: {extension: package of the extra `web` that reads it}.
+OPTIONAL = {MESHOPT: "meshopt", BASISU: "alktx2"}
+#: Filters of EXT_meshopt_compression.
+FILTERS = ("NONE", "OCTAHEDRAL", "QUATERNION", "EXPONENTIAL")
 
 
 @dataclass
@@ -73,6 +79,12 @@ class Document:
         out = cls(document, [], name, folder, len(data))
         with out.readable():
             required = [e for e in document.get("extensionsRequired", []) if e not in READ and not str(e).startswith(IGNORED)]
+            missing = [e for e in required if e in OPTIONAL and importlib.util.find_spec(OPTIONAL[e]) is None]
+            required = [e for e in required if e not in OPTIONAL]
+            if missing and not required:
+                package = OPTIONAL[missing[0]]
+                remedy = "pip install 'gsbake[web]', or export it without"
+                raise BadInputError(f"'{name}' needs {missing[0]}, which the package {package} reads: {remedy}.")
             if required:
                 raise BadInputError(f"'{name}' needs {', '.join(map(str, required))}, which gsbake does not read; export it without.")
             for index, entry in enumerate(document.get("buffers", [])):
@@ -86,13 +98,15 @@ class Document:
     @property
     def ignored(self) -> list[str]:
         """Extensions in use that the reader leaves out."""
-        return sorted(str(e) for e in self.json.get("extensionsUsed", []) if e not in READ)
+        return sorted(str(e) for e in self.json.get("extensionsUsed", []) if e not in READ and e not in OPTIONAL)
 
     def _buffer(self, index: int, entry: dict[str, Any], binary: bytes) -> bytes:
         if "uri" in entry:
             content = self.load(entry["uri"])
         else:
             content = binary if index == 0 else b""
+            if index and entry.get("extensions", {}).get(MESHOPT, {}).get("fallback"):
+                return content
         if len(content) < entry["byteLength"]:
             raise BadInputError(f"'{self.name}' is damaged: buffer {index} has {len(content)} of {entry['byteLength']} bytes.")
         return content
@@ -123,6 +137,9 @@ class Document:
         return self._views[index]
 
     def _slice(self, index: int, view: dict[str, Any]) -> bytes:
+        packed = view.get("extensions", {}).get(MESHOPT)
+        if packed is not None and importlib.util.find_spec("meshopt") is not None:
+            return _decoded(self._slice(index, {k: v for k, v in packed.items() if k != "extensions"}), packed, view["byteLength"])
         start, length = view.get("byteOffset", 0), view["byteLength"]
         content = self.buffers[view["buffer"]][start : start + length]
         if start < 0 or len(content) != length:
@@ -131,6 +148,14 @@ class Document:
 
     def accessor(self, index: int) -> NDArray[Any]:
         """Values of an accessor (count, width) as float32 if normalised, else in their own type; (count,) for scalars."""
+        values = self.stored(index)
+        if self.json["accessors"][index].get("normalized") and values.dtype.kind != "f":
+            limit = np.float32(np.iinfo(values.dtype).max)
+            values = np.maximum(values.astype(np.float32) / limit, np.float32(-1))
+        return values[:, 0] if values.shape[1] == 1 else values
+
+    def stored(self, index: int) -> NDArray[Any]:
+        """Values of an accessor (count, width) in the type in which they are stored."""
         accessor = self.json["accessors"][index]
         kind, width, count = np.dtype(COMPONENT_TYPES[accessor["componentType"]]), COMPONENT_COUNTS[accessor["type"]], accessor["count"]
         if "bufferView" in accessor:
@@ -145,10 +170,7 @@ class Document:
             at, to, n = sparse["indices"], sparse["values"], sparse["count"]
             rows = _strided(self.view(at["bufferView"]), np.dtype(COMPONENT_TYPES[at["componentType"]]), n, 1, at.get("byteOffset", 0), 0)
             values[rows[:, 0]] = _strided(self.view(to["bufferView"]), kind, n, width, to.get("byteOffset", 0), 0)
-        if accessor.get("normalized") and kind.kind != "f":
-            limit = np.float32(np.iinfo(kind).max)
-            values = np.maximum(values.astype(np.float32) / limit, np.float32(-1))
-        return values[:, 0] if width == 1 else values
+        return values
 
     def stride(self, view: int) -> int | None:
         """Stride of a buffer view in bytes, or None where it has none."""
@@ -177,9 +199,11 @@ def texture_infos(material: dict[str, Any]) -> dict[str, Any]:
 def texture_source(document: dict[str, Any], texture: int) -> int | None:
     """Index of a texture's image, of its extension where it has one; None without."""
     entry = document["textures"][texture]
-    if "EXT_texture_webp" in entry.get("extensions", {}):
-        return int(entry["extensions"]["EXT_texture_webp"]["source"])
-    source = entry.get("source")
+    extensions, source = entry.get("extensions", {}), entry.get("source")
+    if "EXT_texture_webp" in extensions:
+        return int(extensions["EXT_texture_webp"]["source"])
+    if BASISU in extensions and (source is None or ktx2.available()):
+        return int(extensions[BASISU]["source"])
     return None if source is None else int(source)
 
 
@@ -206,10 +230,26 @@ def _strided(content: bytes, kind: np.dtype[Any], count: int, width: int, start:
     return np.ndarray((count, width), kind, content, start, (stride, kind.itemsize)).copy()
 
 
+def _decoded(content: bytes, packed: dict[str, Any], length: int) -> bytes:
+    """The plain bytes of a compressed buffer view."""
+    import meshopt
+
+    count, stride, mode = int(packed["count"]), int(packed["byteStride"]), packed["mode"]
+    kind = packed.get("filter", "NONE")
+    if kind not in FILTERS or not 0 < count * stride <= 4 * MAX_EMPTY or count * stride > length:
+        raise ValueError(f"a compressed buffer view states {count} rows of {stride} bytes with the filter {kind}")
+    return bytes(meshopt.decode_gltf_buffer(content, count, stride, mode, kind).tobytes())
+
+
 def decode_image(content: bytes, name: str) -> NDArray[np.uint8]:
-    """Pixels (h, w, 4) 8-bit RGBA of a PNG, JPEG or WebP file. Raises BadInputError, which names `name`."""
-    if content[:12] == KTX2_MAGIC:
-        raise BadInputError(f"{name} is a KTX2 image, which gsbake does not read; export the file with PNG, JPEG or WebP.")
+    """Pixels (h, w, 4) 8-bit RGBA of a PNG, JPEG, WebP or KTX2 file. Raises BadInputError, which names `name`."""
+    if content[:12] == ktx2.MAGIC:
+        if not ktx2.available():
+            raise BadInputError(f"{name} is a KTX2 image, which the package alktx2 reads: pip install 'gsbake[web]', or export it without.")
+        try:
+            return ktx2.decode_ktx2(content)
+        except ValueError as error:
+            raise BadInputError(f"{name} is a KTX2 image that cannot be decoded: {error}.") from error
     try:
         pixels = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error:  # more pixels than OpenCV decodes, or no bytes
@@ -243,4 +283,4 @@ def image_format(content: bytes) -> str:
         return "jpeg"
     if content[:4] == b"RIFF" and content[8:12] == b"WEBP":
         return "webp"
-    return "ktx2" if content[:12] == KTX2_MAGIC else "unknown"
+    return "ktx2" if content[:12] == ktx2.MAGIC else "unknown"

@@ -68,10 +68,10 @@ def encode_within_budget(maps: TextureMaps, budget: int) -> tuple[GltfTextures, 
     base = encode_png(maps.base_color)
     emissive = None if maps.emissive is None else encode_png(maps.emissive)
     for level in PRECISION_LEVELS:
-        orm = encode_png(_reduce_precision(_downsample(maps.orm, level.downsampling), level.orm_bits))
+        orm = encode_png(reduce_precision(_downsample(maps.orm, level.downsampling), level.orm_bits))
         normal = None
         if maps.normal is not None:
-            normal = encode_png(_reduce_precision(_downsample_normals(maps.normal, level.downsampling), level.normal_bits))
+            normal = encode_png(reduce_precision(_downsample_normals(maps.normal, level.downsampling), level.normal_bits))
         if len(base) + len(orm) + len(normal or b"") + len(emissive or b"") <= budget:
             break
     return GltfTextures(base, orm, normal, emissive), level
@@ -82,7 +82,7 @@ def _to_8bit(image: NDArray[Any]) -> Bytes:
     return np.asarray(np.floor(np.clip(np.asarray(image, np.float64), 0, 1) * 255 + 0.5), np.uint8)
 
 
-def _reduce_precision(image: Bytes, bits: int) -> Bytes:
+def reduce_precision(image: Bytes, bits: int) -> Bytes:
     """Codes rounded to multiples of 2**bits around 128; 0 and 255 are preserved."""
     if bits == 0:
         return image

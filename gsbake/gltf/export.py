@@ -11,8 +11,6 @@ import cv2
 import numpy as np
 from blake3 import blake3
 from numpy.typing import NDArray
-from safetensors import SafetensorError
-from safetensors.numpy import load_file
 
 from gsbake import __version__
 from gsbake.capture.posed_photos import PosedPhotos
@@ -21,10 +19,11 @@ from gsbake.errors import BadInputError
 from gsbake.geometry.cameras import CameraSet, Similarity
 from gsbake.geometry.raycast import RayCaster
 from gsbake.gltf.audit import as_json, audit, failed
+from gsbake.gltf.baked import load_mesh_arrays, mesh_in_frame, read_texture
 from gsbake.gltf.encode import TextureMaps, encode_within_budget, quantise
 from gsbake.gltf.frame import asset_frame, transforms_json
 from gsbake.gltf.write import GltfMesh, build_glb
-from gsbake.imaging.exr import read_exr, write_hdr
+from gsbake.imaging.exr import write_hdr
 from gsbake.imaging.png import encode_png
 from gsbake.monitor import SILENT, Monitor
 from gsbake.scale.measure import MetricScale, measure_scale
@@ -65,7 +64,7 @@ def export_asset(
     options = options or ExportOptions()
     settings = options.export
     cameras = PosedPhotos.open(poses, surfels).cameras
-    arrays = _load_mesh_arrays(baked / "mesh.safetensors")
+    arrays = load_mesh_arrays(baked / "mesh.safetensors")
     with monitor.part("scale"):
         surface = RayCaster(arrays["position"], arrays["faces"])
         scale = measure_scale(ingest, poses, options.scale, surface, cameras.to_world, monitor=monitor)
@@ -73,12 +72,12 @@ def export_asset(
         to_world = cameras.to_world.then(Similarity(scale.metres))
         cameras = replace(cameras, to_world=to_world, metric=True)
     frame = asset_frame(cameras, arrays["position"])
-    mesh = _to_asset_frame(arrays, frame)
+    mesh = mesh_in_frame(arrays, frame)
     if not np.isfinite(mesh.position).all():
         raise BadInputError("export: the object is too large for the asset's single precision; check the scale of the poses.")
     with monitor.part("images"):
-        normal, emissive = (_read_texture(path) if path.exists() else None for path in (baked / "normal.exr", baked / "emissive.exr"))
-        maps = quantise(_read_texture(baked / "base_color.exr"), _read_texture(baked / "orm.exr"), normal, emissive)
+        normal, emissive = (read_texture(path) if path.exists() else None for path in (baked / "normal.exr", baked / "emissive.exr"))
+        maps = quantise(read_texture(baked / "base_color.exr"), read_texture(baked / "orm.exr"), normal, emissive)
         geometry = sum(a.nbytes for a in (mesh.position, mesh.normal, mesh.tangent, mesh.uv, mesh.faces)) + 4096
         images, level = encode_within_budget(maps, int(settings.max_megabytes * 1e6) - geometry)
     monitor.check_stop()
@@ -127,61 +126,6 @@ def _audit(data: bytes, out: Path, settings: Export, monitor: Monitor) -> tuple[
         details = "; ".join(f"{f.rule} ({f.detail})" for f in errors)
         raise BadInputError(f"export: the asset fails {len(errors)} audit rules: {details}; change the mesh or the limits in the profile.")
     return sum(f.passed for f in findings), len(findings)
-
-
-def _load_mesh_arrays(path: Path) -> dict[str, NDArray[Any]]:
-    """The arrays of `mesh.safetensors`."""
-    try:
-        arrays: dict[str, NDArray[Any]] = load_file(path)
-    except (OSError, SafetensorError) as error:
-        raise BadInputError(f"{path} cannot be read ({error}); bake again.") from error
-    missing = {"position", "normal", "tangent", "uv", "faces"} - arrays.keys()
-    if missing:
-        raise BadInputError(f"{path} lacks {', '.join(sorted(missing))}; bake again.")
-    fault = _fault(arrays)
-    if fault:
-        raise BadInputError(f"{path} holds {fault}; bake again.")
-    return arrays
-
-
-def _fault(arrays: dict[str, NDArray[Any]]) -> str:
-    """What is wrong with the arrays of a mesh, or nothing."""
-    faces, count = arrays["faces"], len(arrays["position"])
-    for name, width in (("position", 3), ("normal", 3), ("tangent", 4), ("uv", 2)):
-        if arrays[name].shape != (count, width):
-            return f"{name} of shape {arrays[name].shape}"
-        if not np.isfinite(arrays[name]).all():
-            return f"{name} that is not finite"
-    if faces.ndim != 2 or faces.shape[1] != 3 or len(faces) == 0:
-        return "no faces"
-    if faces.min() < 0 or faces.max() >= count:
-        return "faces of vertices that do not exist"
-    return "uv outside the texture" if np.abs(arrays["uv"] - 0.5).max() > 0.5 + 1e-4 else ""
-
-
-def _read_texture(path: Path) -> NDArray[np.float32]:
-    """The pixels of a baked texture, all of them finite."""
-    image = read_exr(path)
-    if not np.isfinite(image).all():
-        raise BadInputError(f"{path} holds values that are not finite; bake again.")
-    return image
-
-
-def _to_asset_frame(arrays: dict[str, NDArray[Any]], frame: Similarity) -> GltfMesh:
-    """The mesh in the asset frame; `frame` is a proper similarity, so handedness is preserved."""
-
-    def rotated(vectors: NDArray[Any]) -> NDArray[np.float64]:
-        out = vectors.astype(np.float64) @ frame.rotation.T
-        return out / np.maximum(np.linalg.norm(out, axis=1, keepdims=True), 1e-12)
-
-    tangent = np.column_stack([rotated(arrays["tangent"][:, :3]), arrays["tangent"][:, 3]])
-    return GltfMesh(
-        frame.apply(arrays["position"].astype(np.float64)).astype(np.float32),
-        rotated(arrays["normal"]).astype(np.float32),
-        tangent.astype(np.float32),
-        arrays["uv"].astype(np.float32),
-        arrays["faces"].astype(np.int32),
-    )
 
 
 def _extras(options: ExportOptions, cameras: CameraSet, mesh: GltfMesh, maps: TextureMaps, scale: MetricScale | None) -> dict[str, Any]:

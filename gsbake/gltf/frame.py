@@ -6,12 +6,15 @@ poses is arbitrary, so the origin moves to the bottom centre of the object.
 
 from __future__ import annotations
 
+import json
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gsbake.geometry.cameras import CameraSet, Similarity
+from gsbake.errors import BadInputError
+from gsbake.geometry.cameras import Camera, CameraSet, Similarity
 
 #: World (Z-up) to glTF (Y-up).
 Y_UP = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
@@ -56,3 +59,21 @@ def transforms_json(cameras: CameraSet, frame: Similarity, sources: dict[str, st
         "poses": cameras.poses,
         "frames": frames,
     }
+
+
+def read_transforms_json(path: Path) -> tuple[Camera, ...]:
+    """Cameras of the asset's `cameras.json` (nerfstudio format, asset frame, OpenGL axes), in the order of the poses stage's photos.
+
+    Raises BadInputError when the file has another format.
+    """
+    try:
+        body = json.loads(path.read_text(encoding="utf-8"))
+        out = []
+        for frame in body["frames"]:
+            merged: dict[str, Any] = {**body, **frame}
+            rotation, translation = Camera.pose_from_opengl(np.array(frame["transform_matrix"], float))
+            fx, fy, cx, cy = (float(merged[k]) for k in ("fl_x", "fl_y", "cx", "cy"))
+            out.append(Camera(str(frame["file_path"]), int(merged["w"]), int(merged["h"]), fx, fy, cx, cy, rotation, translation))
+    except (OSError, ValueError, LookupError, TypeError, OverflowError, RecursionError) as error:
+        raise BadInputError(f"{path} is not a camera file in nerfstudio's format ({error}); export the asset again.") from error
+    return tuple(out)

@@ -9,13 +9,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from gsbake.errors import BadInputError
 from gsbake.gltf.container import unpack_glb
-from gsbake.gltf.document import Document, texture_infos, texture_source
+from gsbake.gltf.document import Document, decode_image, texture_infos, texture_source
 
 WIDTHS = {"POSITION": 3, "NORMAL": 3, "TANGENT": 4, "TEXCOORD_0": 2}
 
@@ -40,13 +39,7 @@ class GltfAsset:
         """Pixels (h, w, 3) 8-bit RGB of a role's image as stored, or None when the material has none."""
         if role not in self.roles:
             return None
-        try:
-            pixels = cv2.imdecode(np.frombuffer(self.images[self.roles[role]], np.uint8), cv2.IMREAD_COLOR)
-        except cv2.error:  # more pixels than OpenCV decodes, or no bytes
-            pixels = None
-        if pixels is None:
-            raise BadInputError(f"The {role} image of the asset cannot be decoded; export it again.")
-        return np.ascontiguousarray(pixels[..., ::-1], np.uint8)
+        return np.ascontiguousarray(decode_image(self.images[self.roles[role]], f"The {role} image of the asset")[..., :3])
 
 
 def read_glb(path: Path) -> GltfAsset:
@@ -57,7 +50,8 @@ def read_glb(path: Path) -> GltfAsset:
 def parse_glb(data: bytes, name: str) -> GltfAsset:
     """Parse the bytes of a GLB; `name` identifies it in errors. Raises BadInputError as `read_glb`."""
     document, binary = unpack_glb(data, name)
-    file = Document(document, [binary], name, None, len(data))
+    fallback = [b""] * (len(document.get("buffers", [])) - 1) if isinstance(document.get("buffers"), list) else []
+    file = Document(document, [binary, *fallback], name, None, len(data))
     try:
         primitive = document["meshes"][0]["primitives"][0]
         attributes = {key: file.accessor(index) for key, index in primitive["attributes"].items()}

@@ -5,10 +5,12 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from gsbake.capture.posed_photos import PosedPhotos
@@ -21,7 +23,7 @@ from gsbake.meshing.decimation import decimate_to_error_bound
 from gsbake.meshing.decimator_choice import resolve_decimator
 from gsbake.meshing.depth_cache import DepthViewCache
 from gsbake.meshing.depth_views import DepthView, depth_noise
-from gsbake.meshing.imls import imls_field
+from gsbake.meshing.oriented_points import BALL_RADIUS, OrientedPoints, oriented_points
 from gsbake.meshing.refinement.normals import NormalAccumulator, integrate_normals
 from gsbake.meshing.refinement.silhouette import refine_silhouettes
 from gsbake.meshing.repair import close_holes, repair
@@ -31,22 +33,21 @@ from gsbake.meshing.support_plane import SupportPlane, find_support_plane, remov
 from gsbake.meshing.tsdf import SparseTsdf
 from gsbake.monitor import SILENT, Monitor, Rule, decide_skip, skips
 from gsbake.mvs.depth_maps import read_depth
-from gsbake.surfels.model import Surfels
+from gsbake.surfels.fields.continuous import ContinuousField
+from gsbake.surfels.fields.field import Field
+from gsbake.surfels.fields.registry import load_field
+from gsbake.surfels.fields.samples import SamplesField
 from gsbake.surfels.raster.render import SurfelRenderer
 
 Doubles = NDArray[np.float64]
 Faces = NDArray[np.int32]
 
-#: Radius of the ball that contains the object: the unit sphere with a margin.
-BALL_RADIUS = 1.05
 #: Minimum and maximum truncation distance in voxels; between them it is three times the depth noise.
 TRUNCATION_CELLS = (4.0, 10.0)
 #: Maximum difference in voxels at which a stereo depth replaces a rendered one.
 STEREO_TOLERANCE = 3.0
 #: Memory for photos in photometric refinement, in bytes.
 PHOTO_CACHE_BYTES = 1 << 29
-#: Minimum opacity of a surfel, as a share of the transfer function's peak.
-MIN_OPACITY = 0.05
 #: Minimum extent of the surfels in the unit frame.
 MIN_EXTENT = 1e-9
 #: Maximum boundary edges of a hole that is filled after meshing; larger ones are openings.
@@ -56,27 +57,19 @@ MAX_HOLE_EDGES = 400
 @dataclass(frozen=True)
 class MeshOptions:
     """Settings of mesh extraction; `train_size` and `stereo_size` are the longer sides in pixels of the photos in training and stereo,
-    `empty_cells` is the rule of [skip], `max_triangles` the limit of the exported asset."""
+    `empty_cells` is the rule of [skip], `projected_depth` that of [surfels], `max_triangles` the limit of the exported asset."""
 
     mesh: Mesh = Mesh()
     train_size: int = 512
     stereo_size: int = 800
     empty_cells: Rule = "auto"
+    projected_depth: bool = False
     max_triangles: int = 100_000
 
     @property
     def max_faces(self) -> int:
         """Maximum faces of the low-poly mesh under the error bound."""
         return max(self.mesh.faces, self.mesh.max_faces or min(4 * self.mesh.faces, self.max_triangles))
-
-
-@dataclass(frozen=True)
-class OrientedPoints:
-    """Surfels projected onto their zero set: `points` (n, 3), outward `normals` (n, 3), `weights` (n,) by area and opacity."""
-
-    points: Doubles
-    normals: Doubles
-    weights: Doubles
 
 
 def extract_mesh(
@@ -107,7 +100,7 @@ class _Extraction:
     """Inputs and settings of one mesh extraction."""
 
     posed: PosedPhotos
-    surfels: Path
+    trained: Path
     stereo: Path | None
     out: Path
     options: MeshOptions
@@ -115,6 +108,16 @@ class _Extraction:
     threads: int
     device: str
     monitor: Monitor
+
+    @cached_property
+    def renderer(self) -> SurfelRenderer:
+        """Renderer of the trained surfels."""
+        return SurfelRenderer.load(self.trained, self.device)
+
+    @cached_property
+    def trained_field(self) -> Field:
+        """The field that the surfels were trained with."""
+        return load_field(self.trained, self.renderer.surfels)
 
     def extract(self, cache: DepthViewCache) -> dict[str, Any]:
         """Run all steps; the results for the manifest."""
@@ -127,7 +130,7 @@ class _Extraction:
         evidence = f"median depth difference between neighbouring views {noise / resolution.cell:.2f} voxels"
         self.monitor.decide("truncation", f"{cells:.1f} voxels", evidence)
         support = self._support(samples)
-        field = self._field(cache, lower, upper, resolution, cells * resolution.cell, support, samples)
+        field = self._field(cache, lower, upper, resolution, cells * resolution.cell, support)
         with self.monitor.part("marching"):
             vertices, faces = field.mesh(close=self.options.mesh.holes == "close")
         del field
@@ -157,19 +160,11 @@ class _Extraction:
         }
 
     def _samples(self) -> OrientedPoints:
-        """Surfels inside the ball with at least `MIN_OPACITY`; raises BadInputError below ten."""
-        surfels = Surfels.load(self.surfels / "surfels.safetensors")
-        normal = surfels.normal().detach().cpu().numpy().astype(np.float64)
-        sdf = surfels.sdf.detach().cpu().numpy().astype(np.float64).reshape(-1, 1)
-        points = surfels.position.detach().cpu().numpy().astype(np.float64) - sdf * normal
-        opacity = surfels.opacity().detach().cpu().numpy().astype(np.float64).reshape(-1)
-        weights = surfels.scale.detach().cpu().numpy().astype(np.float64).prod(1) * opacity
-        keep = np.isfinite(points).all(1) & np.isfinite(normal).all(1) & np.isfinite(weights)
-        keep &= (np.linalg.norm(points, axis=1) <= BALL_RADIUS) & (opacity > MIN_OPACITY * surfels.transfer.peak)
-        if keep.sum() < 10:
+        """The surfels as oriented points; raises BadInputError below ten."""
+        samples = oriented_points(self.renderer.surfels)
+        if len(samples.points) < 10:
             raise BadInputError("mesh: fewer than ten surfels lie inside the unit sphere; training failed, see its figures in the report.")
-        weights = weights[keep]
-        return OrientedPoints(points[keep], normal[keep], weights / max(float(np.median(weights)), 1e-12))
+        return samples
 
     def _choose_resolution(self, points: Doubles) -> tuple[Doubles, Doubles, Resolution]:
         """The object's padded bounding box, and the voxel size with its reason."""
@@ -187,12 +182,11 @@ class _Extraction:
 
     def _render(self, cache: DepthViewCache, resolution: Resolution) -> None:
         """Render depth and normals at every photo's pose into the cache; stereo depths replace rendered ones that agree."""
-        renderer = SurfelRenderer.load(self.surfels, self.device)
         shares: list[float] = []
         for index in range(len(self.posed)):
             self.monitor.check_stop()
             photo = self.posed.view(index, self.options.train_size)
-            buffers = renderer.gbuffer(photo.camera)
+            buffers = self.renderer.gbuffer(photo.camera, self.options.projected_depth)
             view = DepthView.from_gbuffer(photo.camera, buffers, photo.mask, TRUNCATION_CELLS[0] * resolution.cell)
             stereo_file = None if self.stereo is None else self.stereo / "depth" / f"{photo.camera.name}.npz"
             if stereo_file is not None and stereo_file.exists():
@@ -215,22 +209,27 @@ class _Extraction:
 
     def _field(
         self, cache: DepthViewCache, lower: Doubles, upper: Doubles, resolution: Resolution, truncation: float,
-        support: SupportPlane | None, samples: OrientedPoints,
+        support: SupportPlane | None,
     ) -> SparseTsdf:  # fmt: skip
         """The distance field, from depth maps or from the surfels' SDF samples."""
         monitor, empty_outside = self.monitor, self.posed.has_masks or support is not None
         field = SparseTsdf(lower, upper, resolution.cell, truncation, ball=BALL_RADIUS, empty_outside=empty_outside, support=support)
+        source = self.options.mesh.field
+        trained = self.trained_field if source == "trained" else SamplesField(self.renderer.surfels, None)
         with monitor.part("survey"):
-            for done, view in enumerate(cache):
-                monitor.check_stop()
-                field.fuse_coarse(view)
-                monitor.progress(done + 1, 2 * len(cache), "fusing")
+            if isinstance(trained, ContinuousField):
+                field.evaluate_coarse(trained.mesh)
+            else:
+                for done, view in enumerate(cache):
+                    monitor.check_stop()
+                    field.fuse_coarse(view)
+                    monitor.progress(done + 1, 2 * len(cache), "fusing")
         rule = self.options.empty_cells
         with monitor.part("filling"):
             field.allocate(all_blocks=not skips(rule, holds=True))
         with monitor.part("fusion"):
-            if self.options.mesh.field == "imls":
-                field.set_field(imls_field(field.lattice, samples.points, samples.normals, truncation, samples.weights))
+            if source != "tsdf":
+                field.set_field(trained.mesh(field.lattice, truncation))
             else:
                 for done, view in enumerate(cache):
                     monitor.check_stop()
@@ -252,13 +251,26 @@ class _Extraction:
             vertices = support.snap_to_plane(vertices, cell)
         vertices, faces, dropped = cleanup.remove_small_components(vertices, faces, settings.min_component)
         if settings.normal_wavelength > 0:
-            vertices = _integrate_normals(cache, vertices, faces, settings.normal_wavelength, cell)
+            if settings.normals == "field":
+                vertices = self._integrate_gradients(vertices, faces, cell)
+            else:
+                vertices = _integrate_normals(cache, vertices, faces, settings.normal_wavelength, cell)
         vertices = cleanup.smooth(vertices, faces, settings.smoothing_iterations)
         if not cleanup.topology(vertices, faces).watertight:
             vertices, faces = repair(vertices, faces)
             if settings.holes == "close":
                 vertices, faces = close_holes(vertices, faces, MAX_HOLE_EDGES)
         return vertices, faces, dropped + background
+
+    def _integrate_gradients(self, vertices: Doubles, faces: Faces, cell: float) -> Doubles:
+        """Refine the vertices against the gradient of the trained field at wavelengths below `mesh.normal_wavelength` voxels."""
+        with torch.no_grad():
+            points = torch.from_numpy(vertices.astype(np.float32))
+            gradient = torch.cat([self.trained_field.gradient(part) for part in points.split(1 << 16)]).numpy().astype(float)
+        length = np.linalg.norm(gradient, axis=1, keepdims=True)
+        normals, confidence = gradient / np.maximum(length, 1e-9), (length[:, 0] > 0.1).astype(float)
+        wavelength = self.options.mesh.normal_wavelength * cell
+        return integrate_normals(vertices, faces, normals, confidence, wavelength, max_displacement=1.5 * cell)
 
     def _refine_silhouettes(self, vertices: Doubles, faces: Faces) -> Doubles:
         """Refine the vertices against the masks, where every photo has one."""

@@ -11,6 +11,7 @@ of one view.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -174,6 +175,19 @@ class SparseTsdf:
         self.near_share = float(near_surface.mean())
         self.lattice.allocate(near_surface | all_blocks)
         self._fused = TsdfBlocks(self.lattice, self.truncation)
+
+    def evaluate_coarse(self, evaluate: Callable[[BlockLattice, float], Floats]) -> None:
+        """Instead of the first pass: a field that is known everywhere. `evaluate` returns it on a lattice's blocks in units of a length."""
+        coarse = self.coarse_field
+        coarse.values[:] = evaluate(coarse.lattice, coarse.truncation)
+        coarse.observed[:] = OBSERVED_BY_DEPTH
+        edge = EDGE * self.lattice.cell
+        corners = BlockLattice(self.lattice.lower, self.lattice.lower + (np.array(self.lattice.shape) + 1) * edge, edge)
+        corners.allocate_all()
+        near = np.abs(corners.dense(evaluate(corners, 2 * edge))) < 0.5  # within a block's edge of the surface
+        for corner in np.ndindex(2, 2, 2):
+            at = tuple(slice(c, c + n) for c, n in zip(corner, self.lattice.shape, strict=True))
+            self._marked |= near[at]
 
     def integrate(self, view: DepthView) -> None:
         """Second pass: fuse this view into the fine blocks. Raises RuntimeError before `allocate`."""

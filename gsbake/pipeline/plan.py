@@ -69,6 +69,13 @@ class Planner:
             states.append(state)
         return states
 
+    def plan_empty(self, stages: Iterable[Stage]) -> list[StageState]:
+        """The states of the stages where nothing is stored: all have to run. No input is read, so there are no keys."""
+        return [
+            StageState(stage.name, stage.title, "waits" if stage.needs else "run", ("not run yet",), settings=self._declared(stage))
+            for stage in stages
+        ]
+
     def assess(self, stage: Stage, artifacts: Mapping[str, Artifact]) -> StageState:
         """The state of one stage, given the artifacts of earlier stages."""
         settings = self._declared(stage)

@@ -38,6 +38,10 @@ class Registry:
             raise UsageError(f"There is no stage '{name}'; the stages are {', '.join(self.names)}.")
         return load_stage(self.references[name])
 
+    def without(self, name: str) -> Registry:
+        """The stages but one, which no other needs."""
+        return Registry({key: reference for key, reference in self.references.items() if key != name})
+
     def up_to(self, target: str | None = None) -> list[Stage]:
         """`target` and its direct and indirect dependencies in running order; all stages without a target."""
         if target is None:

@@ -76,14 +76,26 @@ def open_shared_store(url: str | None, patience: float = PATIENCE) -> SharedStor
     protocol = url.partition("://")[0] if "://" in url else "file"
     if protocol not in _PROTOCOLS:
         raise UsageError(f"--store takes a folder or a URL of file, s3 or sftp, not '{url}'.")
-    options = {} if protocol in ("file", "local") else {"skip_instance_cache": True, "use_listings_cache": False}
     try:
-        system, path = fsspec.core.url_to_fs(url if "://" in url else str(Path(url).absolute()), **options)
+        if protocol in ("sftp", "ssh"):
+            system, path = _open_sftp(url)
+        else:
+            options = {"skip_instance_cache": True, "use_listings_cache": False} if protocol in _OBJECT_STORES else {}
+            system, path = fsspec.core.url_to_fs(url if "://" in url else str(Path(url).absolute()), **options)
     except ImportError as error:
         raise UsageError(f"--store {protocol}:// needs another package: pip install 'gsbake[store]'.") from error
+    except GsbakeError:
+        raise
     except Exception as error:  # a server that refuses, a wrong port: each library has its own exceptions
         raise InterruptedRun(f"The shared store '{url}' cannot be opened ({_words(error)}); check the address and try again.") from error
     return SharedStore(url, system, path.rstrip("/"), protocol, patience)
+
+
+def _open_sftp(url: str) -> tuple[Any, str]:
+    """The file system and the path of an sftp:// URL."""
+    from gsbake.pipeline.sftp import SftpStore
+
+    return SftpStore(**SftpStore._get_kwargs_from_urls(url), skip_instance_cache=True), str(SftpStore._strip_protocol(url))
 
 
 class SharedStore:
@@ -310,18 +322,11 @@ class SharedStore:
                 sync(Path(path).parent)
             else:
                 self._patiently(lambda: self._fs.put_file(str(source), temporary), check)
-                self._move(temporary, path, exclusive, check)
+                if not exclusive or not self._exists(path, None, check):
+                    self._patiently(lambda: self._fs.mv(temporary, path), check)
         finally:
             with suppress(Exception):  # usually it was renamed
                 self._fs.rm_file(temporary)
-
-    def _move(self, temporary: str, path: str, exclusive: bool, check: Callable[[], None]) -> None:
-        """Rename on a server; SFTP refuses where the target exists, which is then deleted first unless it is to stay."""
-        if self._exists(path, None, check):
-            if exclusive:
-                return
-            self._delete(path)
-        self._patiently(lambda: self._fs.mv(temporary, path), check)
 
     def _find(self, folder: str) -> dict[str, Mapping[str, Any]]:
         """{path: properties} of all files in a folder of the store."""
@@ -362,6 +367,9 @@ class SharedStore:
             check()
             time.sleep(pause)
             pause = min(2 * pause, 8.0)
+            if hasattr(self._fs, "reconnect"):
+                with suppress(Exception):  # it does not answer yet; the operation fails again and says so
+                    self._fs.reconnect()
 
 
 def _link(source: str, target: str) -> bool:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from gsbake.capture.posed_photos import PosedPhotos
 from gsbake.geometry.cameras import Camera
+from gsbake.imaging.srgb import encode
 from gsbake.report.html import Comparison, Figure, Light, Panel, hdr_base64, image_uri
 from gsbake.report.lights import PROCEDURAL_LIGHTS, LitShader, procedural
 from gsbake.report.manifests import Manifests, peak, total_seconds
@@ -24,6 +25,10 @@ Array = NDArray[np.float64]
 
 #: Gain in dB from which the PSNR with the exposure of each photo is shown too.
 EXPOSURE_DECIBELS = 1.0
+#: Difference of sRGB values that is brightest in the heat map.
+ERROR_RANGE = 0.25
+#: Height of the panorama of the light in pixels.
+PANORAMA_HEIGHT = 256
 #: Half the field of view (radians) of the cameras that show the whole asset.
 HALF_ANGLE = math.radians(15)
 
@@ -70,9 +75,28 @@ def score_views(
 def comparisons(scored: Sequence[ViewScore]) -> tuple[Comparison, ...]:
     """Photo and render pairs of the page."""
     return tuple(
-        Comparison(s.name, image_uri(s.metrics.photo), image_uri(s.metrics.render), s.metrics.psnr, s.metrics.ssim, s.held_out)
+        Comparison(
+            s.name, image_uri(s.metrics.photo), image_uri(s.metrics.render), s.metrics.psnr, s.metrics.ssim, s.held_out,
+            image_uri(heat_map(s.metrics.photo, s.metrics.render)),
+        )
         for s in scored
-    )
+    )  # fmt: skip
+
+
+def heat_map(photo: NDArray[np.floating], render: NDArray[np.floating]) -> NDArray[np.float32]:
+    """Mean difference of two sRGB images (h, w, 3) in colours (h, w, 3): black is none, the brightest ERROR_RANGE and more."""
+    import cv2
+
+    error = np.abs(np.asarray(photo, np.float32) - np.asarray(render, np.float32)).mean(2)
+    coded = np.asarray(np.rint(255 * np.clip(error / ERROR_RANGE, 0, 1)), np.uint8)
+    return np.asarray(cv2.applyColorMap(coded, cv2.COLORMAP_INFERNO)[..., ::-1] / np.float32(255), np.float32)
+
+
+def panorama(shader: LitShader) -> Panel:
+    """The fitted light as an image, its 95th percentile white."""
+    radiance = shader.equirectangular(PANORAMA_HEIGHT)
+    white = max(float(np.quantile(radiance, 0.95)), 1e-6)
+    return Panel("Fitted light", f"white is a radiance of {number(white)}", image_uri(encode(np.clip(radiance / white, 0, 1))))
 
 
 def framing_camera(asset: Asset, direction: Array, pixels: int) -> Camera:

@@ -37,11 +37,12 @@ class StageWarning:
 
     stage: str
     text: str
+    advice: str = ""
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """Photo and render of one view as data URIs, with PSNR (dB) and SSIM."""
+    """Photo, render and error heat map of one view as data URIs, with PSNR (dB) and SSIM."""
 
     name: str
     photo: str
@@ -49,15 +50,17 @@ class Comparison:
     psnr: float
     ssim: float
     held_out: bool
+    error: str = ""
 
 
 @dataclass(frozen=True)
 class Panel:
-    """An image (data URI) with title and caption."""
+    """An image (data URI) with title and caption; `channel` names a map of the asset that the 3D view can show."""
 
     title: str
     caption: str
     image: str
+    channel: str = ""
 
 
 @dataclass(frozen=True)
@@ -109,7 +112,8 @@ class StageRow:
 
 @dataclass(frozen=True)
 class Page:
-    """Contents of the page. Charts are SVG from `gsbake.report.charts`; `model` is the GLB in base64, empty for no 3D view."""
+    """Contents of the page. Charts are SVG from `gsbake.report.charts`; `model` is the GLB in base64, empty for no 3D view; `map` is
+    the JSON of `gsbake.report.coverage.map_json`, empty for no map; `places` say from where to photograph what no photo saw."""
 
     title: str
     lead: str
@@ -135,6 +139,13 @@ class Page:
     run_note: str
     footer: str
     masks: tuple[Panel, ...] = ()
+    panoramas: tuple[Panel, ...] = ()
+    map: str = ""
+    places: tuple[str, ...] = ()
+
+
+#: Scripts of the page, which are one: what is on every page, the map of cameras, the views of the asset.
+SCRIPTS = ("page.js", "page_map.js", "page_views.js")
 
 
 def image_uri(rgb: NDArray[np.floating], alpha: NDArray[np.floating] | None = None, quality: int = 88) -> str:
@@ -202,8 +213,8 @@ def render_page(page: Page) -> str:
     )
     template = environment.from_string(text("page.html.j2"))
     charts = {name: Markup(getattr(page, name)) for name in ("time_chart", "memory_chart")}
-    filled = {**vars(page), **charts, "curves": tuple(Markup(curve) for curve in page.curves)}
-    css, page_js = text("page.css"), inline_script(text("page.js"))
+    filled = {**vars(page), **charts, "curves": tuple(Markup(curve) for curve in page.curves), "map": Markup(page.map)}
+    css, page_js = text("page.css"), inline_script("".join(text(name) for name in SCRIPTS))
     viewer_js = inline_script(text("vendor/model-viewer.min.js") if page.model else "")
     policy = content_security_policy([page_js, viewer_js], [css, *_viewer_styles(viewer_js)])
     return template.render(page=filled, css=Markup(css), page_js=page_js, viewer_js=viewer_js, policy=policy)

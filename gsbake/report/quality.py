@@ -9,16 +9,11 @@ exposure of the photo first, by one factor on linear values.
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from gsbake.capture.posed_photos import View
-from gsbake.errors import BadInputError
-from gsbake.geometry.cameras import Camera
 from gsbake.imaging.metrics import psnr, ssim
 from gsbake.imaging.srgb import decode
 from gsbake.report.render import Floats, RenderedImage
@@ -70,24 +65,6 @@ def exposure_gain(photo: Floats, render: Floats) -> float:
         return 1.0
     wanted, given = (float(decode(values[usable]).mean(dtype=np.float64)) for values in (photo, render))
     return wanted / max(given, 1e-6)
-
-
-def asset_cameras(path: Path) -> tuple[Camera, ...]:
-    """Cameras of the asset's `cameras.json` (nerfstudio format, asset frame, OpenGL axes), in the order of the poses stage's photos.
-
-    Raises BadInputError when the file has another format.
-    """
-    try:
-        body = json.loads(path.read_text(encoding="utf-8"))
-        out = []
-        for frame in body["frames"]:
-            merged: dict[str, Any] = {**body, **frame}
-            rotation, translation = Camera.pose_from_opengl(np.array(frame["transform_matrix"], float))
-            fx, fy, cx, cy = (float(merged[k]) for k in ("fl_x", "fl_y", "cx", "cy"))
-            out.append(Camera(str(frame["file_path"]), int(merged["w"]), int(merged["h"]), fx, fy, cx, cy, rotation, translation))
-    except (OSError, ValueError, LookupError, TypeError, OverflowError, RecursionError) as error:
-        raise BadInputError(f"{path} is not a camera file in nerfstudio's format ({error}); export the asset again.") from error
-    return tuple(out)
 
 
 def select_views(count: int, held_out: list[int], views: int) -> tuple[list[int], bool]:

@@ -153,7 +153,7 @@ class Renderer:
 
     def __init__(self, asset: Asset, threads: int | None = None) -> None:
         self.asset = asset
-        self._caster = RayCaster(asset.position, asset.faces, threads)
+        self.caster = RayCaster(asset.position, asset.faces, threads)
         self._density = uv_density(asset.position, asset.uv, asset.faces)
         self._texture = lru_cache(maxsize=16)(self._mip_level)
 
@@ -176,7 +176,7 @@ class Renderer:
         inside = self._screen_bounds(fine)
         rays = fine.rays()[inside]
         shape = rays.shape[:2]
-        hits = self._caster.first_hit(fine.centre[None], rays.reshape(-1, 3))
+        hits = self.caster.first_hit(fine.centre[None], rays.reshape(-1, 3))
         index = np.flatnonzero(hits.hit)
         surface = self._samples(fine, rays.reshape(-1, 3)[index], hits.face[index], hits.bary[index], hits.distance[index])
         radiance = shader(surface) if surface.emissive is None else shader(surface) + surface.emissive

@@ -59,7 +59,8 @@ def map_panels(asset: Asset) -> tuple[Panel, ...]:
     """Panels of the asset's textures; missing ones are skipped."""
 
     def panel(title: str, caption: str, image: Floats) -> Panel:
-        return Panel(title, caption, image_uri(downsample(image)))
+        atlas = title == "UV atlas"
+        return Panel(title, caption, image_uri(downsample(image)), "" if atlas else title.lower().replace(" ", "-"))
 
     def grey(channel: Floats) -> Floats:
         return np.repeat(channel[..., None], 3, axis=2)

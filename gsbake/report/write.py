@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,12 +13,14 @@ from gsbake import __version__
 from gsbake.capture.posed_photos import PosedPhotos
 from gsbake.config.schema import Report
 from gsbake.errors import BadInputError
+from gsbake.gltf.frame import read_transforms_json
 from gsbake.monitor import SILENT, Monitor
-from gsbake.report import compose, manifests
+from gsbake.report import compose, coverage, manifests
+from gsbake.report.advice import advice
 from gsbake.report.asset import open_asset
 from gsbake.report.html import Light, Page, Panel, render_page
 from gsbake.report.masks import mask_panels
-from gsbake.report.quality import asset_cameras, select_views
+from gsbake.report.quality import select_views
 from gsbake.report.render import Asset, Renderer, Shader, unlit
 from gsbake.report.sheets import map_panels
 from gsbake.surfels.training.views import test_photos
@@ -58,6 +60,9 @@ class _Renders:
     lit: bool
     relit: tuple[Panel, ...]
     lights: tuple[Light, ...]
+    panoramas: tuple[Panel, ...]
+    map: str
+    places: tuple[str, ...]
 
 
 @dataclass
@@ -95,7 +100,7 @@ class _ReportWriter:
         posed = PosedPhotos.open(self.folders["poses"], self.folders["refine"])
         with monitor.part("open"):
             asset = open_asset(self.glb, unlit=not light.exists())
-            cameras = asset_cameras(self.folders["export"] / "cameras.json")
+            cameras = read_transforms_json(self.folders["export"] / "cameras.json")
             if len(cameras) != len(posed):
                 raise BadInputError(
                     f"The asset's cameras.json lists {len(cameras)} cameras for {len(posed)} photos; export the asset again."
@@ -117,7 +122,15 @@ class _ReportWriter:
             relit, lights = compose.relit_panels(
                 renderer, learnt, directions, settings.view_size, lambda k, n: monitor.progress(n + k, 2 * n, "relighting")
             )
-        return _Renders(asset, posed, scored, held, learnt is not None, relit, lights)
+        with monitor.part("coverage"):
+            points = coverage.surface_points(asset, self.folders["bake"] / "coverage.exr")
+            proposed = () if points is None else coverage.proposals(points, renderer.caster, asset.radius)
+            by_name = {s.name: s.metrics.psnr for s in scored}
+            named = [replace(camera, name=own.name) for camera, own in zip(cameras, posed.cameras.cameras, strict=True)]
+            drawn = coverage.map_json(asset, named, points, by_name, proposed)
+            places = tuple(f"{coverage.in_words(d)} ({share:.0%} of it)" for d, share in proposed)
+        panoramas = () if learnt is None else (compose.panorama(learnt),)
+        return _Renders(asset, posed, scored, held, learnt is not None, relit, lights, panoramas, drawn, places)
 
     def _figures(self, renders: _Renders) -> dict[str, Any]:
         """The figures of `report.json`."""
@@ -145,7 +158,7 @@ class _ReportWriter:
             title=manifests.capture_name(found),
             lead=_lead(count, _kind(lit, found), posed.cameras.poses),
             figures=compose.headline(found, renders.asset, self.glb.stat().st_size, scored, (len(posed), count)),
-            warnings=manifests.warnings(found),
+            warnings=tuple(replace(w, advice=advice(w.text, renders.places)) for w in manifests.warnings(found)),
             model=base64.b64encode(self.glb.read_bytes()).decode(),
             lights=renders.lights,
             comparisons=compose.comparisons([scored[i] for i in shown]),
@@ -167,6 +180,9 @@ class _ReportWriter:
             memory_chart=manifests.memory_chart(found),
             run_note=manifests.run_note(found),
             footer=f"gsbake {__version__}.",
+            panoramas=renders.panoramas,
+            map=renders.map,
+            places=renders.places,
             masks=mask_panels(self.folders["poses"], found["poses"].get("results") or {}),
         )
 

@@ -10,11 +10,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from gsbake.capture.posed_photos import PosedPhotos
 from gsbake.geometry.vectors import unit
+from gsbake.surfels.densification.policy import typical_spacing
 from gsbake.surfels.model import Surfels, create
 
 Floats = NDArray[np.float64]
@@ -109,7 +111,8 @@ def initialise_surfels(posed: PosedPhotos, train: Any, model: Any, seed: int, st
         points = SPHERE_RADIUS * fibonacci_sphere(train.init_surfels)
         normals, colours, sdf = points / SPHERE_RADIUS, None, 0.2
     gap = np.minimum(spacing(points), 0.3)
-    return create(points, normals, gap, colours, model.shading, model.sh_degree, sdf, 1.0, model.transfer), kind, evidence
+    surfels = create(points, normals, gap, colours, model.shading, model.sh_degree, sdf, 1.0, model.transfer)
+    return _spread(surfels, train, seed), kind, evidence
 
 
 def _from_stereo(posed: PosedPhotos, train: Any, model: Any, seed: int, folder: Path) -> tuple[Surfels, str, str] | None:
@@ -126,4 +129,21 @@ def _from_stereo(posed: PosedPhotos, train: Any, model: Any, seed: int, folder: 
     gap = np.minimum(spacing(points), 0.3)
     evidence = f"{initial.stereo} evenly spread stereo points, {filled} hull points in their holes"
     # One SDF sample for all: at the initial sharpness of 1 all are opaque.
-    return create(points, normals, gap, colours, model.shading, model.sh_degree, STEREO_SDF, 1.0, model.transfer), "stereo", evidence
+    surfels = create(points, normals, gap, colours, model.shading, model.sh_degree, STEREO_SDF, 1.0, model.transfer)
+    return _spread(surfels, train, seed), "stereo", evidence
+
+
+def _spread(surfels: Surfels, train: Any, seed: int) -> Surfels:
+    """Spread the surfels over the band of `train.band` spacings around where they are, each with its distance from there as SDF sample, and
+    start the sharpness where the widest has half the peak's opacity; unchanged where the unit of the sharpness is the unit frame."""
+    if train.sharpness == "unit" and not train.band:
+        return surfels
+    gap = typical_spacing(surfels)
+    width = max(train.band, train.final_width, 2 * float(surfels.sdf.abs().median()) / gap)
+    if train.band:
+        share = 2 * torch.rand(len(surfels), generator=torch.Generator().manual_seed(seed)) - 1
+        surfels.sdf = train.band * gap * share
+        surfels.position = surfels.position + surfels.sdf[:, None] * surfels.normal()
+    if train.sharpness == "spacing":
+        surfels.gamma = torch.tensor([surfels.transfer.half_width(0.5) / (width * gap)])
+    return surfels

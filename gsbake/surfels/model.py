@@ -1,7 +1,8 @@
 """The state that training optimises: 2D Gaussian surfels, each with one sample of the signed distance field.
 
 Per surfel: centre μ, quaternion (third axis = oriented normal, never flipped to a camera), two log-scales, SDF sample s, and either
-spherical-harmonic colours (shading "colour") or base colour, roughness and metallic (shading "pbr"). One global sharpness γ.
+spherical-harmonic colours (shading "colour") or base colour, roughness and metallic (shading "pbr"). One global sharpness γ. Systems
+whose splats have an opacity of their own carry its logit as another attribute; the SDF sample then is only a record of the field.
 (Zhu et al., Gaussian Splatting with Discretized SDF, ICCV 2025; Huang et al., 2D Gaussian Splatting, SIGGRAPH 2024.)
 """
 
@@ -31,7 +32,8 @@ class Surfels:
     """All surfels of a scene; tensors have the surfel count n as first dimension, in the unit frame.
 
     `position` (n, 3), `quaternion` (n, 4) as (w, x, y, z), `log_scale` (n, 2), `sdf` (n,), `attributes`: "sh" (n, (degree+1)², 3) or
-    "albedo" (n, 3), "roughness" (n,), "metallic" (n,) before the sigmoid; `gamma` (1,); `transfer` turns sdf and gamma into opacity.
+    "albedo" (n, 3), "roughness" (n,), "metallic" (n,) before the sigmoid, and "opacity" (n,) before the sigmoid where it does not follow
+    from the SDF; `gamma` (1,); `transfer` turns sdf and gamma into opacity.
     """
 
     position: Tensor
@@ -51,8 +53,15 @@ class Surfels:
         return "albedo" in self.attributes
 
     def opacity(self) -> Tensor:
-        """Opacity (n,) from the SDF samples."""
+        """Opacity (n,), from the SDF samples unless the surfels have one of their own."""
+        if "opacity" in self.attributes:
+            return torch.sigmoid(self.attributes["opacity"])
         return self.transfer.opacity(self.sdf, self.gamma)
+
+    @property
+    def peak_opacity(self) -> float:
+        """The largest opacity that a surfel can have."""
+        return 1.0 if "opacity" in self.attributes else self.transfer.peak
 
     def normal(self) -> Tensor:
         """Oriented unit normals (n, 3)."""

@@ -15,7 +15,7 @@ import psutil
 import pytest
 
 import gsbake.api
-from gsbake.batch import coordinator
+from gsbake.batch import coordinator, workflow
 from gsbake.batch.captures import BatchOptions
 from gsbake.batch.coordinator import run_batch
 from gsbake.batch.records import all_records
@@ -50,7 +50,7 @@ def test_a_batch_with_a_bad_capture(run: Run, make_capture: Make, monkeypatch: p
         raise AssertionError("nothing is left to run")
 
     with monkeypatch.context() as patch:
-        patch.setattr(coordinator, "_run_snakemake", refuse)
+        patch.setattr(coordinator, "run_workflow", refuse)
         again = run("batch", *captures, "--profile", "smoke", "--threads", "2", "--quiet")
         assert again.code == 42 and stages_run(out / "poor") == ["ingest"]  # nor in the next batch
         status = run("batch", "status", "--json").json
@@ -120,8 +120,10 @@ def test_memory_of_jobs_is_limited(make_capture: Make, monkeypatch: pytest.Monke
 
 def test_missing_packages_are_named(run: Run, make_capture: Make, monkeypatch: pytest.MonkeyPatch) -> None:
     capture = make_capture("one")
-    assert "needs Slurm's command sbatch" in run("batch", capture, "--executor", "slurm").err or os.access("/usr/bin/sbatch", os.X_OK)
-    monkeypatch.setattr(coordinator.importlib.util, "find_spec", lambda name: None)
+    with monkeypatch.context() as patch:
+        patch.setenv("PATH", "")
+        assert "needs Slurm's command sbatch" in run("batch", capture, "--executor", "slurm").err
+    monkeypatch.setattr(workflow.importlib.util, "find_spec", lambda name: None)
     end = run("batch", capture)
     assert end.code == 2 and "needs snakemake: pip install 'gsbake[batch]'" in end.err
     assert run("batch", capture, "--executor", "grid").code == 2

@@ -223,7 +223,11 @@ def test_masks_none_and_auto_are_settings(run: Run, capture: Path, tmp_path: Pat
 
 
 def test_profiles_are_listed_and_shown(run: Run) -> None:
-    assert set(run("profiles", "--json").json) == {"smoke", "preview", "relight", "quality", "scan"}
+    family = {
+        "dsdf", "gs-ror2", "3dgsr", "gsdf", "gs-octree", "gs-pull", "surfacesplat", "splatsdf", "gaussianroom", "ugsdf", "sdf-3dgan",
+        "neus", "volsdf",
+    }  # fmt: skip
+    assert set(run("profiles", "--json").json) == {"smoke", "preview", "relight", "quality", "scan"} | family
     shown = run("profiles", "smoke", "--set", "mesh.faces=123", "--json").json
     assert shown["mesh.faces"]["value"] == 123 and shown["mesh.faces"]["origin"] == "--set"
     assert shown["train.iterations"]["origin"] == "smoke" and shown["ingest.min_photos"]["origin"] == "default"

@@ -88,6 +88,36 @@ def test_add_a_profile(tmp_path: Path) -> None:
     assert profile.mesh.faces == 10000 and profile.bake.materials == "fit"
 
 
+def test_add_a_field(monkeypatch: pytest.MonkeyPatch) -> None:
+    from collections.abc import Mapping
+
+    from gsbake.surfels.fields import registry
+    from gsbake.surfels.fields.known import Known
+    from gsbake.surfels.initialisation import fibonacci_sphere, spacing
+    from gsbake.surfels.model import create
+
+    monkeypatch.setattr(registry, "FIELDS", dict(registry.FIELDS))
+    settings = schema.DistanceField().model_copy(update={"kind": "ball"})
+    profile = SimpleNamespace(field=settings, coupling=schema.Coupling(), loss=schema.Loss(), train=schema.Train())
+    code = blocks("Add a field", "python")
+    names: dict[str, Any] = {
+        "torch": torch, "Tensor": Tensor, "Known": Known, "Mapping": Mapping, "FIELDS": registry.FIELDS, "create": create,
+        "spacing": spacing, "fibonacci_sphere": fibonacci_sphere, "make_field": registry.make_field, "profile": profile,
+    }  # fmt: skip
+    exec(code["gsbake/surfels/fields/ball.py"], names)
+    exec(code["gsbake/surfels/fields/registry.py"], names)
+    exec(code["tests/surfels/fields/test_ball.py"], names)
+    run_tests(names)
+
+
+def test_add_a_coupling() -> None:
+    code = blocks("Add a coupling", "python")
+    names: dict[str, Any] = {"Tensor": Tensor, "CouplingInputs": object}
+    exec(code["gsbake/surfels/couplings/attachment.py"], names)
+    inputs = SimpleNamespace(visible=torch.tensor([0.5, 0.5]), at_surfels=(torch.tensor([-1.0, 3.0]), torch.zeros(2, 3)))
+    assert float(names["outside"](inputs)) == 0.5
+
+
 def test_add_a_densification_policy(monkeypatch: pytest.MonkeyPatch) -> None:
     from gsbake.surfels.densification import registry
 

@@ -29,6 +29,7 @@ FILES = {
     "bake": ("mesh.safetensors", "base_color.exr"),
     "export": ("asset.glb", "cameras.json", "light.hdr"),
     "report": ("report.html",),
+    "targets": ("asset_web.glb", "targets.json"),
 }
 
 
@@ -49,5 +50,5 @@ def _toy(name: str) -> Callable[[Context], dict[str, Any]]:
 
 
 STAGES = {name: replace(REAL.load(name), run=_toy(name), summary="") for name in ORDER}
-INGEST, POSES, STEREO, TRAIN, REFINE, MESH, BAKE, EXPORT, REPORT = (STAGES[name] for name in ORDER)
+INGEST, POSES, STEREO, TRAIN, REFINE, MESH, BAKE, EXPORT, REPORT, TARGETS = (STAGES[name] for name in ORDER)
 REGISTRY = Registry({name: f"tests.docs.toy_stages:{name.upper()}" for name in ORDER})

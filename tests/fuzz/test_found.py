@@ -16,10 +16,10 @@ from gsbake.config.load import load_profile
 from gsbake.errors import BadInputError
 from gsbake.geometry.ply import read_cloud, read_mesh, write_mesh
 from gsbake.gltf.audit import audit, failed
+from gsbake.gltf.frame import read_transforms_json
 from gsbake.gltf.read import parse_glb
 from gsbake.pipeline.store import MANIFEST, REPLACEMENT, Store, read_manifest
 from gsbake.report.manifests import audit_rows, load_manifests
-from gsbake.report.quality import asset_cameras
 from tests.fuzz.test_binary_files import FACES, VERTICES, glb, repack
 from tests.fuzz.test_documents import sealed
 
@@ -37,7 +37,7 @@ def test_documents_that_are_nested_too_deeply(tmp_path: Path) -> None:
     assert found is not None and found.faults == (f"{REPLACEMENT} cannot be read",)
     assert read_manifest(stage) is None
     assert load_manifests({"mesh": stage}) == {"mesh": {}}
-    for read in (audit_rows, asset_cameras):
+    for read in (audit_rows, read_transforms_json):
         with pytest.raises(BadInputError, match=r"is not .*export the asset again"):
             read(stage / MANIFEST)
     (tmp_path / "digests.json").write_text(DEEP)

@@ -1,10 +1,13 @@
-"""Photos of the toy pipeline."""
+"""Photos of the toy pipeline, and servers on loopback that hold a shared store."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+
+from tests.support.ssh_server import ServerUnavailable, SshServer
 
 
 @pytest.fixture
@@ -14,3 +17,50 @@ def photos(tmp_path: Path) -> Path:
     folder.mkdir()
     (folder / "a.txt").write_text("One two three")
     return folder
+
+
+@pytest.fixture(scope="module")
+def s3() -> Iterator[str]:
+    """The URL of a bucket on an object server on loopback."""
+    pytest.importorskip("moto.server")
+    pytest.importorskip("s3fs")
+    from moto.server import ThreadedMotoServer
+
+    server = ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
+    server.start()
+    port = server._server.server_port
+    keys = {"AWS_ENDPOINT_URL": f"http://127.0.0.1:{port}", "AWS_ACCESS_KEY_ID": "x", "AWS_SECRET_ACCESS_KEY": "x"}
+    with pytest.MonkeyPatch.context() as patch:
+        for name, value in {**keys, "AWS_DEFAULT_REGION": "us-east-1"}.items():
+            patch.setenv(name, value)
+        import s3fs
+
+        s3fs.S3FileSystem(skip_instance_cache=True).mkdir("farm")
+        yield "s3://farm/cache"
+    server.stop()
+
+
+@pytest.fixture(scope="module")
+def ssh(tmp_path_factory: pytest.TempPathFactory) -> Iterator[SshServer]:
+    """An SSH server on loopback that this process may use."""
+    pytest.importorskip("paramiko")
+    server = SshServer(tmp_path_factory.mktemp("ssh"))
+    try:
+        server.__enter__()
+    except ServerUnavailable as error:
+        pytest.skip(f"no SSH server can be started here: {error}")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("HOME", str(server.home))
+        yield server
+    server.kill()
+
+
+@pytest.fixture(params=["folder", "object server", pytest.param("SSH server", marks=pytest.mark.slow)])
+def url(request: pytest.FixtureRequest, tmp_path: Path) -> str:
+    if request.param == "folder":
+        return str(tmp_path / "shared")
+    if request.param == "SSH server":
+        server: SshServer = request.getfixturevalue("ssh")
+        return server.url(tmp_path / "shared")
+    found: str = request.getfixturevalue("s3")
+    return f"{found}/{tmp_path.name}"

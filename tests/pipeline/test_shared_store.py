@@ -9,7 +9,6 @@ import signal
 import subprocess
 import threading
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -47,35 +46,6 @@ def files(folder: Path) -> dict[str, bytes]:
         for path in (folder / "stages").rglob("*.txt")
         if ".lease" not in path.name and path.is_file()
     }
-
-
-@pytest.fixture(scope="module")
-def s3() -> Iterator[str]:
-    """The URL of a bucket on an object server on loopback."""
-    pytest.importorskip("moto.server")
-    pytest.importorskip("s3fs")
-    from moto.server import ThreadedMotoServer
-
-    server = ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
-    server.start()
-    port = server._server.server_port
-    keys = {"AWS_ENDPOINT_URL": f"http://127.0.0.1:{port}", "AWS_ACCESS_KEY_ID": "x", "AWS_SECRET_ACCESS_KEY": "x"}
-    with pytest.MonkeyPatch.context() as patch:
-        for name, value in {**keys, "AWS_DEFAULT_REGION": "us-east-1"}.items():
-            patch.setenv(name, value)
-        import s3fs
-
-        s3fs.S3FileSystem(skip_instance_cache=True).mkdir("farm")
-        yield "s3://farm/cache"
-    server.stop()
-
-
-@pytest.fixture(params=["folder", "object server"])
-def url(request: pytest.FixtureRequest, tmp_path: Path) -> str:
-    if request.param == "folder":
-        return str(tmp_path / "shared")
-    found: str = request.getfixturevalue("s3")
-    return f"{found}/{tmp_path.name}"
 
 
 def test_a_second_machine_computes_nothing(url: str, photos: Path, tmp_path: Path) -> None:

@@ -13,9 +13,10 @@ import pytest
 from gsbake.capture.posed_photos import View
 from gsbake.errors import BadInputError
 from gsbake.geometry.cameras import Camera
+from gsbake.gltf.frame import read_transforms_json
 from gsbake.imaging.metrics import MAX_PSNR, psnr, ssim
 from gsbake.imaging.srgb import decode, encode_bytes
-from gsbake.report.quality import GREY, asset_cameras, compare, exposure_gain, select_views
+from gsbake.report.quality import GREY, compare, exposure_gain, select_views
 from gsbake.report.render import RenderedImage
 from tests.report.shapes import front_camera
 
@@ -107,7 +108,7 @@ def test_asset_cameras_with_shared_and_own_intrinsics(tmp_path: Path) -> None:
     }  # fmt: skip
     path = tmp_path / "cameras.json"
     path.write_text(json.dumps(body))
-    found = asset_cameras(path)
+    found = read_transforms_json(path)
     first, second = found
     assert (first.fx, first.fy, first.cy, first.height) == (40, 41, 15, 30)
     assert (second.fx, second.width, second.name) == (50, 64, "photos/c.png")
@@ -123,7 +124,7 @@ def test_asset_cameras_in_another_format(tmp_path: Path, text: str) -> None:
     path = tmp_path / "cameras.json"
     path.write_text(text)
     with pytest.raises(BadInputError, match="nerfstudio"):
-        asset_cameras(path)
+        read_transforms_json(path)
 
 
 def test_chosen_views() -> None:

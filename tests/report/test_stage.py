@@ -13,11 +13,11 @@ import pytest
 from gsbake.capture.posed_photos import PosedPhotos
 from gsbake.config.schema import Skip
 from gsbake.errors import BadInputError
+from gsbake.gltf.frame import read_transforms_json
 from gsbake.gltf.read import read_glb
 from gsbake.report import compose, manifests
 from gsbake.report.asset import open_asset
 from gsbake.report.lights import LitShader
-from gsbake.report.quality import asset_cameras
 from gsbake.report.render import Renderer
 from gsbake.report.sheets import face_charts, uv_atlas_image
 from gsbake.shading.environment import EnvironmentLight
@@ -89,7 +89,7 @@ def test_settings_declared() -> None:
 
 def test_light_turns_with_the_frames(make_run: MakeRun) -> None:
     done = make_run()
-    cameras = asset_cameras(done.folders["export"] / "cameras.json")
+    cameras = read_transforms_json(done.folders["export"] / "cameras.json")
     posed = PosedPhotos.open(done.folders["poses"])
     to_light = compose.light_rotation(cameras[3], posed.cameras.cameras[3])
     # By the contract: unit → world by the similarity, world → asset by (x, y, z) → (x, z, −y).

@@ -43,7 +43,7 @@ def test_texture_transform() -> None:
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"extensionsRequired": ["EXT_meshopt_compression"]}, "needs EXT_meshopt_compression"),
+        ({"extensionsRequired": ["KHR_draco_mesh_compression"]}, "needs KHR_draco_mesh_compression"),
         ({"buffers": [{"byteLength": 36, "uri": "../secret.bin"}]}, "not in its folder"),
         ({"buffers": [{"byteLength": 36, "uri": "/dev/zero"}]}, "not in its folder"),
         ({"buffers": [{"byteLength": 36, "uri": "https://example.org/x.bin"}]}, "not a file beside it"),

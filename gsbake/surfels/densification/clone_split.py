@@ -94,7 +94,7 @@ def prune(
     """Prune surfels that are transparent, larger than `largest`, not finite, (given statistics) occluded in all views, or `off` (n,) the
     surface by a pruning policy; return also the kept indices and the number of surfels by reason."""
     dropped = {
-        "transparent": surfels.opacity() < MIN_RELATIVE_OPACITY * surfels.transfer.peak,
+        "transparent": surfels.opacity() < MIN_RELATIVE_OPACITY * surfels.peak_opacity,
         "too large": surfels.scale.max(1).values > largest,
         "not finite": ~torch.isfinite(surfels.position).all(1),
     }
@@ -108,3 +108,20 @@ def prune(
     if len(keep) == len(surfels):
         return surfels, keep, counts
     return replace_rows(surfels, adam, keep, None), keep, counts
+
+
+@torch.no_grad()
+def reset_opacity(surfels: Surfels, opacity: float) -> int:
+    """Lower the opacity of more opaque surfels to `opacity` (a share of the peak), in place, and return their number.
+
+    |s| grows to the distance of that opacity, and the centre moves off the surface by as much, so that the surface μ − s n stays: photos
+    decide anew which surfels show it. (The paper sets s to an opacity of .01 and leaves the centre, which moves the surface.)
+    """
+    if "opacity" in surfels.attributes:
+        return 0
+    distance = surfels.transfer.half_width(opacity) / surfels.gamma
+    near = surfels.sdf.abs() < distance
+    moved = torch.where(near, torch.where(surfels.sdf < 0, -distance, distance), surfels.sdf)
+    surfels.position += (moved - surfels.sdf)[:, None] * surfels.normal()
+    surfels.sdf.copy_(moved)
+    return int(near.sum())

@@ -33,10 +33,15 @@ class PolicyInputs:
     max_distance: float
 
     @staticmethod
-    def from_surfels(surfels: Surfels) -> PolicyInputs:
-        """Distances from the surfels' own SDF samples, the spacing from their median scale."""
-        spacing = float(surfels.scale.max(1).values.median()) / SCALE_TO_SPACING if len(surfels) else 1.0
-        return PolicyInputs(surfels.sdf.abs(), surfels.opacity() / surfels.transfer.peak, spacing, MAX_DISTANCE_SPACINGS * spacing)
+    def from_surfels(surfels: Surfels, distance: Tensor) -> PolicyInputs:
+        """From the field's signed `distance` (n,) of the surfels, the spacing from their median scale."""
+        spacing = typical_spacing(surfels)
+        return PolicyInputs(distance.abs(), surfels.opacity() / surfels.peak_opacity, spacing, MAX_DISTANCE_SPACINGS * spacing)
+
+
+def typical_spacing(surfels: Surfels) -> float:
+    """Typical distance (unit frame) between neighbouring surfels, from their median scale; 1 without surfels."""
+    return float(surfels.scale.detach().max(1).values.median()) / SCALE_TO_SPACING if len(surfels) else 1.0
 
 
 #: Score (n,) from mean screen-space gradients (n,): the highest scores are densified, surfels with a score of 0 never.

@@ -18,6 +18,7 @@ from gsbake.errors import BadInputError
 from gsbake.surfels.densification.clone_split import MIN_RELATIVE_OPACITY
 from gsbake.surfels.densification.policy import PolicyInputs
 from gsbake.surfels.densification.registry import PRUNING
+from gsbake.surfels.fields.field import Field
 from gsbake.surfels.initialisation import spacing
 from gsbake.surfels.model import Surfels
 from gsbake.surfels.raster.gbuffer import rasterise
@@ -64,16 +65,18 @@ def _measure_visibility(surfels: Surfels, posed: PosedPhotos, max_size: int) -> 
     return best, outside, torch.where(hits > 0, error / hits.clamp_min(1), torch.full_like(error, 1.0))
 
 
-def prune_and_densify(surfels: Surfels, posed: PosedPhotos, refine: Any, max_size: int, seed: int) -> tuple[Surfels, dict[str, int]]:
-    """Surfels after pruning and gap filling, and their number by rule; `refine` is the profile's section, `max_size` the size of the
-    renders that measure visibility. Raises BadInputError when fewer than MIN_SURFELS would be left."""
+def prune_and_densify(
+    surfels: Surfels, field: Field, posed: PosedPhotos, refine: Any, max_size: int, seed: int
+) -> tuple[Surfels, dict[str, int]]:
+    """Surfels after pruning and gap filling, and their number by rule; `field` is the one they were trained with, `refine` the profile's
+    section, `max_size` the size of the renders that measure visibility. Raises BadInputError when fewer than MIN_SURFELS would be left."""
     before = len(surfels)
     if before < MIN_SURFELS:
         return surfels, {"before": before, "after": before}
     best, outside, distance = _measure_visibility(surfels, posed, max_size)
     gap = torch.from_numpy(spacing(surfels.position.numpy().astype(float)).astype(np.float32))
     median_gap = float(gap.median())
-    opacity = surfels.opacity() / surfels.transfer.peak
+    opacity = surfels.opacity() / surfels.peak_opacity
     measured = (best >= MIN_VISIBLE_WEIGHT) & (distance < 1.0)
     inputs = PolicyInputs(torch.where(measured, distance, 0.0), opacity, median_gap, refine.prune_distance * median_gap)
     rules = {
@@ -92,16 +95,16 @@ def prune_and_densify(surfels: Surfels, posed: PosedPhotos, refine: Any, max_siz
             f"refine: {before - len(kept)} of {before} surfels would be pruned, most of them as {worst}: training did not find the "
             "object; raise train.iterations or set train.init=auto."
         )
-    added = _fill_gaps(kept, refine.densify_share, seed)
+    added = _fill_gaps(kept, field, refine.densify_share, seed)
     counts["added"] = len(added)
     if len(added):
         kept = kept.concat(added)
     return kept, counts | {"after": len(kept)}
 
 
-def _fill_gaps(surfels: Surfels, share: float, seed: int) -> Surfels:
-    """New surfels half-way between undersampled surfels and a neighbour, projected onto the zero level set μ − s n, with the mean of
-    their attributes; at most `share` of the surfels."""
+def _fill_gaps(surfels: Surfels, field: Field, share: float, seed: int) -> Surfels:
+    """New surfels half-way between undersampled surfels and a neighbour, projected onto the zero level set, with the mean of their
+    attributes; at most `share` of the surfels."""
     p = surfels.position.numpy().astype(float)
     k = min(7, len(p))
     distance, index = cKDTree(p).query(p, k=k, workers=-1)
@@ -120,5 +123,6 @@ def _fill_gaps(surfels: Surfels, share: float, seed: int) -> Surfels:
     others = other.tensors()
     blended = {k: v if k in ("gamma", "quaternion") else (v + others[k]) / 2 for k, v in one.tensors().items()}
     middle = Surfels.from_tensors(blended, one.transfer)
-    middle.position = middle.position - middle.sdf[:, None] * middle.normal()
+    with torch.no_grad():
+        middle.position = field.project_surfels(middle)
     return middle

@@ -62,9 +62,15 @@ def colour_loss(image: Tensor, target: Tensor, ssim_share: float) -> Tensor:
     return loss + ssim_share * (1 - ssim(image, target)) if ssim_share else loss
 
 
-def median_sharpness(sdf: Tensor, gamma: Tensor, transfer: Transfer) -> Tensor:
-    """relu(target(median |s|) − γ) with the transfer's target; the median is detached."""
+def median_sharpness(sdf: Tensor, gamma: Tensor, transfer: Transfer, widths: tuple[float, float] | None = None) -> Tensor:
+    """relu(target(median |s|) − γ); the median is detached.
+
+    The target is the transfer's, with its constants in the unit frame; or, given the least and largest of the `widths` (unit frame), half
+    the peak at the median held between them.
+    """
     median = float(sdf.detach().abs().median()) if len(sdf) else 1.0
+    if widths is not None:
+        return F.relu(transfer.half_width(0.5) / min(max(median, widths[0]), widths[1]) - gamma).sum()
     return F.relu(transfer.target_sharpness(max(median, 1e-6)) - gamma).sum()
 
 

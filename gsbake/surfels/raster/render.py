@@ -34,14 +34,14 @@ class SurfelRenderer:
         return SurfelRenderer(Surfels.load(folder / "surfels.safetensors").to(device), light)
 
     @torch.no_grad()
-    def gbuffer(self, camera: Camera) -> dict[str, Image]:
-        """Planes of one view as float32 arrays (h, w[, 3]).
+    def gbuffer(self, camera: Camera, projected: bool = False) -> dict[str, Image]:
+        """Planes of one view as float32 arrays (h, w[, 3]); with `projected` the depths of the surfels moved onto the zero level set.
 
         "alpha"; "depth" (expected z-depth, alpha-normalised, 0 = none); "median_depth"; "normal" (unit frame, unit length, not
         flipped); and with materials "albedo" (linear), "roughness", "metallic", else "colour" (sRGB from this camera).
         """
         view = _view(camera, self.surfels.position.device)
-        out = rasterise(self.surfels, view)
+        out = rasterise(self.surfels, view, distance=self.surfels.sdf if projected else None)
         alpha = out.alpha.clamp_min(1e-6)
         n = torch.nn.functional.normalize(out.features[-3:], dim=0, eps=1e-6)
         planes = {

@@ -85,6 +85,12 @@ class Adam:
                     kept = table[name][index]
                     table[name] = torch.cat([kept, kept.new_zeros(added, *kept.shape[1:])])
 
+    def forget(self, names: list[str]) -> None:
+        """Drop the moments and step counts of the named tensors, whose shapes have changed."""
+        for name in names:
+            for table in (self.first, self.second, self.count):
+                table.pop(name, None)
+
     def state(self) -> dict[str, object]:
         """Everything a checkpoint needs."""
         return {"first": self.first, "second": self.second, "count": self.count}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +12,7 @@ from gsbake.monitor import SILENT, Monitor, decide_skip, skips
 from gsbake.shading.environment import EnvironmentLight
 from gsbake.surfels.densification.refinement import prune_and_densify
 from gsbake.surfels.densification.registry import choose_densification
+from gsbake.surfels.fields.registry import load_field, make_field
 from gsbake.surfels.initialisation import initialise_surfels
 from gsbake.surfels.model import Surfels
 from gsbake.surfels.training.session import Execution, Schedule, Session, TrainOptions
@@ -32,6 +33,7 @@ def train_surfels(
     options: TrainOptions | None = None,
     *,
     stereo: Path | None = None,
+    priors: tuple[Path | None, Path | None] = (None, None),
     seed: int = 0,
     threads: int = 2,
     device: str = "cpu",
@@ -40,8 +42,9 @@ def train_surfels(
 ) -> dict[str, Any]:
     """Initialise surfels, train them on the photos of the folder `poses`, write them into the folder `out`; return the figures.
 
-    Written: `surfels.safetensors`, `log.csv`, with PBR shading `light.safetensors`, and where they were refined `cameras.json` and
-    `exposure.json`. `stereo` is the folder that `run_stereo` wrote. A stop that `monitor` requests leaves a checkpoint in `scratch`, from
+    Written: `surfels.safetensors`, `log.csv`, with PBR shading `light.safetensors`, with a continuous field `field.safetensors`, and where
+    they were refined `cameras.json` and `exposure.json`. `stereo` is the folder that `run_stereo` wrote, `priors` are the folders of given
+    normals and depths (`prior_maps`). A stop that `monitor` requests leaves a checkpoint in `scratch`, from
     which the next call continues with the same result. Raises InterruptedRun then.
     """
     options = options or TrainOptions()
@@ -60,7 +63,10 @@ def train_surfels(
     assumed = 1.0 if options.confirmed_steps == "always" else share
     skipped = skipped_steps(steps, assumed) if skips(options.confirmed_steps, holds) else 0
     run = Execution(out, scratch, seed, threads, device, monitor)
-    session = Session(run, posed, surfels, light, options, Schedule(steps - skipped, options.train.coarse_share, policy))
+    with monitor.part("field"):
+        field = make_field(surfels, options, seed)
+    schedule = Schedule(steps - skipped, options.train.coarse_share, policy)
+    session = Session(run, posed, surfels, light, options, schedule, field=field, priors=priors)
     results = session.run()
     saved, outcome = skipped * session.step_seconds, f"{skipped} of {steps} steps skipped"
     decide_skip(monitor, "confirmed_steps", options.confirmed_steps, holds, evidence, outcome, "no steps skipped", saved)
@@ -88,7 +94,11 @@ def refine_surfels(
     surfels = Surfels.load(trained / "surfels.safetensors")
     light = EnvironmentLight.load(trained / "light.safetensors") if (trained / "light.safetensors").exists() else None
     with monitor.part("prune and densify"):
-        surfels, counts = prune_and_densify(surfels, posed, options.refine, options.training.train.max_size, seed)
+        # fine-tuning keeps the width that training has ended with
+        train = options.training.train.model_copy(update={"band": 0.0})
+        field = load_field(trained, surfels, replace(options.training, train=train))
+        surfels, counts = prune_and_densify(surfels, field, posed, options.refine, options.training.train.max_size, seed)
+        field.follow(surfels)
     run = Execution(out, scratch, seed, threads, device, monitor)
-    session = Session(run, posed, surfels, light, options.training, Schedule(options.refine.iterations, 0.0, None), trained)
+    session = Session(run, posed, surfels, light, options.training, Schedule(options.refine.iterations, 0.0, None), trained, field)
     return session.run() | {"counts": counts}

@@ -14,18 +14,21 @@ import torch
 
 from gsbake.capture.posed_photos import PosedPhotos
 from gsbake.checkpoint import DamagedCheckpointError, load_checkpoint, save_checkpoint
-from gsbake.config.schema import Loss, Train
+from gsbake.config.schema import Coupling, DistanceField, Loss, Train
 from gsbake.config.schema import Surfels as SurfelSettings
 from gsbake.monitor import SILENT, Monitor, Rule, decide_skip
+from gsbake.surfels.fields.field import Field
+from gsbake.surfels.fields.registry import save_field
 from gsbake.surfels.model import Surfels
 from gsbake.surfels.raster.threads import configure
 from gsbake.surfels.training.corrections import Correction
 from gsbake.surfels.training.pose_refinement import Aligner
+from gsbake.surfels.training.prior_maps import add_priors
 from gsbake.surfels.training.trainer import Plan, Trainer
 from gsbake.surfels.training.views import load_views, test_photos, validation_photos
 
 #: Checkpoints of other versions are ignored.
-CHECKPOINT_VERSION = 4
+CHECKPOINT_VERSION = 5
 #: Interval between checkpoints.
 CHECKPOINT_SECONDS = 30.0
 #: File with the logarithms of the exposure gains per photo and linear colour channel.
@@ -44,6 +47,8 @@ class TrainOptions:
     converged_steps: Rule = "auto"
     pose_refinement: Rule = "auto"
     exposure_refinement: Rule = "auto"
+    field: DistanceField = DistanceField()
+    coupling: Coupling = Coupling()
 
 
 @dataclass(frozen=True)
@@ -81,17 +86,20 @@ class Session:
         options: TrainOptions,
         schedule: Schedule,
         trained: Path | None = None,
+        field: Field | None = None,
+        priors: tuple[Path | None, Path | None] = (None, None),
     ) -> None:
         """Load the photos at `train.max_size`; resume from the checkpoint of an interrupted run.
 
         Poses and exposures are refined (as the options allow), unless an earlier run did that: `trained` is its folder, whose cameras
-        `posed` has.
+        `posed` has. `priors` are the folders of given normals and depths.
         """
         self.execution, self.posed, self.trained, self.options = run, posed, trained, options
         self.monitor = run.monitor
         configure(run.threads)
         with self.monitor.part("load photos"):
-            full, half = ([view.to(run.device) for view in views] for views in load_views(posed, options.train.max_size))
+            loaded = (add_priors(views, posed.cameras, posed.folder, *priors) for views in load_views(posed, options.train.max_size))
+            full, half = ([view.to(run.device) for view in views] for views in loaded)
         if trained is not None and (trained / EXPOSURE).exists():
             gains = json.loads((trained / EXPOSURE).read_text())["log_gains"]
             exposure = [Correction(torch.zeros(6).double(), torch.tensor(gains[view.name]).double()) for view in full]
@@ -103,7 +111,7 @@ class Session:
             *sections, schedule.iterations, schedule.coarse_share, policy is not None, run.seed, options.converged_steps, policy or "none"
         )
         light = None if light is None else light.to(run.device)
-        self.trainer = Trainer(plan, surfels.to(run.device), light, full, half, validation, test)
+        self.trainer = Trainer(plan, surfels.to(run.device), light, full, half, validation, test, field)
         self.aligner = None if trained else Aligner(self.trainer, options.pose_refinement, options.exposure_refinement)
         self.before = len(surfels)
         self.step_seconds = 0.0  # measured by `run`, evaluations included
@@ -199,7 +207,11 @@ class Session:
 
     def _write(self) -> dict[str, Any]:
         trainer, out = self.trainer, self.execution.out
+        with torch.no_grad():
+            trainer.field.distance(trainer.surfels)
+            trainer.field.settle(trainer.surfels)
         trainer.surfels.save(out / "surfels.safetensors")
+        save_field(out, trainer.field)
         if trainer.light is not None:
             trainer.light.save(out / "light.safetensors")
         self._write_corrections()
@@ -215,5 +227,6 @@ class Session:
             "psnr": round(psnr, 3),
             "validation": [trainer.views[i].name for i in trainer.validation_indices],
             "gamma": round(float(trainer.surfels.gamma), 4),
+            "densification": dict(trainer.counts),
             "sdf_median": round(float(trainer.surfels.sdf.abs().median()), 6) if len(trainer.surfels) else None,
         }

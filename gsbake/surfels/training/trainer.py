@@ -15,12 +15,13 @@ import torch
 from torch import Tensor
 
 from gsbake.imaging.metrics import decibels
-from gsbake.surfels.densification.clone_split import Statistics, densify, prune
-from gsbake.surfels.densification.policy import PolicyInputs
+from gsbake.surfels.densification.clone_split import Statistics, densify, prune, reset_opacity
+from gsbake.surfels.densification.policy import PolicyInputs, typical_spacing
 from gsbake.surfels.densification.registry import DENSIFICATION, PRUNING
-from gsbake.surfels.losses import terms as losses
+from gsbake.surfels.densification.seeding import place_anew, seed_gaps
+from gsbake.surfels.fields.field import Field, TrainingStep
+from gsbake.surfels.fields.samples import SamplesField
 from gsbake.surfels.losses.image import image_losses
-from gsbake.surfels.losses.projection import projection_loss
 from gsbake.surfels.losses.terms import ImageWeights
 from gsbake.surfels.model import Surfels
 from gsbake.surfels.raster.gbuffer import rasterise, rendered_image
@@ -34,6 +35,8 @@ from gsbake.surfels.training.views import TrainView
 SDF_START, DENSIFY_START, DENSIFY_END = 1 / 30, 1 / 60, 0.6
 #: Minimum number of steps between densifications.
 DENSIFY_INTERVAL = 100
+#: Share of the run up to which opacity is reset.
+RESET_END = 1 / 3
 #: Share of the run in which learning rates decay after an early stop.
 COOLDOWN_SHARE = 0.1
 #: Surfels with a larger scale (unit frame) are pruned.
@@ -72,10 +75,14 @@ class Trainer:
         half_views: list[TrainView],
         validation_indices: list[int],
         test_indices: Sequence[int] = (),
+        field: Field | None = None,
     ) -> None:
         """`views` and `half_views` are all photos at full and half training size; `validation_indices` those that decisions look at and
-        `test_indices` those that nothing looks at, neither of them trained on; `light` is an `EnvironmentLight` or None."""
+        `test_indices` those that nothing looks at, neither of them trained on; `light` is an `EnvironmentLight` or None; `field` is by
+        default that of the surfels' own samples."""
         self.plan, self.surfels, self.light = plan, surfels, light
+        self.field = field or SamplesField(surfels, plan.loss, plan.train)
+        self.counts: dict[str, int] = {}
         self.views, self.half_views = views, half_views
         self.validation_indices = validation_indices
         self.training_indices = [i for i in range(len(views)) if i not in {*validation_indices, *test_indices}]
@@ -112,7 +119,7 @@ class Trainer:
 
     def _loss(self, out: Rendered, view: TrainView, tables: Any) -> tuple[Tensor, Tensor]:
         """Weighted sum of all losses, and the colour loss alone."""
-        w, s = self.plan.loss, self.surfels
+        w = self.plan.loss
         late = self.done >= SDF_START * self.plan.iterations
         weights = ImageWeights(w.ssim, w.normal, w.mask, w.distortion if late else 0.0, w.smoothness)
         total, colour = image_losses(out.planes, tables, view, self.masked, self._background(view), weights)
@@ -120,13 +127,11 @@ class Trainer:
             from gsbake.shading.neutral_light import neutral_light_loss
 
             total = total + w.neutral_light * neutral_light_loss(self.light.radiance())
-        if late and w.median:
-            total = total + w.median * losses.median_sharpness(s.sdf, s.gamma, s.transfer)
-        if late and w.projection:
-            total = total + w.projection * projection_loss(
-                s.position, out.normal, s.sdf, out.visible, out.depth, out.alpha, view.R, view.t, view.pinhole
-            )
-        return total, colour
+        views = self.half_views if self.coarse() else self.views
+        photos = [views[i] for i in self.training_indices]
+        step = TrainingStep(self.surfels, out, self.done / max(1, self.plan.iterations), late, self.generator, photos)
+        asked = self.field.losses(step, view)
+        return total if asked is None else total + asked, colour
 
     def rates(self) -> dict[str, float]:
         """Adam's rate per tensor at this step: exponential decay of positions (to 1/100) and of materials and light (to 1/10)."""
@@ -136,16 +141,23 @@ class Trainer:
             start = self.cooldown_start / max(1, n)
             share = start + (1 - start) * (self.done - self.cooldown_start) / max(1, self.end - self.cooldown_start)
         slow, fast = 0.1**share, 0.01**share
+        sdf, gamma = t.lr_sdf, t.lr_gamma
+        if t.sharpness == "spacing":
+            sdf, gamma = t.lr_sample * typical_spacing(self.surfels), t.lr_gamma * float(self.surfels.gamma.detach())
         rates = {
             "position": t.lr_position * fast, "quaternion": t.lr_rotation * slow, "log_scale": t.lr_scale * slow,
-            "sdf": t.lr_sdf * slow, "gamma": t.lr_gamma * slow,
+            "sdf": sdf * slow, "gamma": gamma * slow,
         }  # fmt: skip
-        return rates | {f"attributes.{k}": t.lr_material * slow for k in self.surfels.attributes} | {"light": t.lr_light * slow}
+        rates |= {f"attributes.{k}": t.lr_material * slow for k in self.surfels.attributes} | {"light": t.lr_light * slow}
+        rates["attributes.opacity"] = t.lr_opacity * slow
+        return rates | {f"field.{k}": rate * slow for k, rate in self.field.rates().items()}
 
     def step(self) -> dict[str, float]:
         """One iteration on one photo."""
         view = self._next_view()
-        leaves = self.surfels.tensors()
+        if self.field.advance(self.done / max(1, self.plan.iterations)):
+            self.adam.forget([f"field.{k}" for k in self.field.parameters()])
+        leaves = self.surfels.tensors() | {f"field.{k}": v for k, v in self.field.parameters().items()}
         for x in leaves.values():
             x.requires_grad_()
             x.grad = None
@@ -154,7 +166,8 @@ class Trainer:
             for p in self.light.parameters():
                 p.grad = None
             tables = self.light.prefilter()
-        out = rasterise(self.surfels, view)
+        distance = self.field.distance(self.surfels) if self.plan.model.projected_depth else None
+        out = rasterise(self.surfels, view, opacity=self.field.opacity(self.surfels), distance=distance)
         loss, colour = self._loss(out, view, tables)
         loss.backward()
         value = float(loss.detach())
@@ -179,6 +192,7 @@ class Trainer:
                     if p.grad is not None:
                         self.adam.step(f"light.{name}", p.data, p.grad, rates["light"])
         self.done += 1
+        self.field.settle(self.surfels)
         self._densify_and_prune()
         return {"loss": value, "colour": float(colour.detach()), "surfels": float(len(self.surfels))}
 
@@ -198,6 +212,12 @@ class Trainer:
 
     def _densify_and_prune(self) -> None:
         n = self.plan.iterations
+        cycles = self.field.cycles if self.plan.densify else 0
+        if cycles and self.done in {round(DENSIFY_END * n * (i + 1) / cycles) for i in range(cycles)}:
+            self.surfels, placed = place_anew(self.surfels, self.adam, self.field, self.generator)
+            self._count({"placed anew": placed})
+            self.stats = Statistics.zeros(len(self.surfels), self.surfels.position.device)
+            self.field.follow(self.surfels)
         interval = max(DENSIFY_INTERVAL, len(self.training_indices))  # statistics cover every photo
         if not self.plan.densify or self.done % interval or self.done < max(interval, DENSIFY_START * n):
             return
@@ -205,13 +225,30 @@ class Trainer:
             return
         share = (self.done / n - DENSIFY_START) / (DENSIFY_END - DENSIFY_START)
         budget = int(self.start_count + (self.plan.model.max_count - self.start_count) * min(1.0, share))
-        off = PRUNING[self.plan.train.prune](PolicyInputs.from_surfels(self.surfels))
-        self.surfels, keep, _ = prune(self.surfels, self.adam, self.stats, MAX_SCALE, off)
+        off = PRUNING[self.plan.train.prune](self._policy_inputs())
+        self.surfels, keep, pruned = prune(self.surfels, self.adam, self.stats, MAX_SCALE, off)
+        before = len(self.surfels)
         kept = Statistics(self.stats.gradient[keep], self.stats.views[keep], self.stats.weight[keep])
         large = float(self.surfels.scale.max(1).values.median()) if len(self.surfels) else 0.01
-        score = DENSIFICATION[self.plan.policy](kept.mean_gradient(), PolicyInputs.from_surfels(self.surfels))
+        score = DENSIFICATION[self.plan.policy](kept.mean_gradient(), self._policy_inputs())
         self.surfels = densify(self.surfels, self.adam, score, budget, large, self.generator)
+        self._count({f"pruned, {k}": v for k, v in pruned.items()} | {"densified": len(self.surfels) - before})
+        if self.field.seeds:
+            self.field.follow(self.surfels)
+            self.surfels, seeded = seed_gaps(self.surfels, self.adam, self.field, self.field.seeds, self.generator)
+            self._count({"seeded": seeded})
+        if self.plan.train.reset_opacity and self.done < RESET_END * n:
+            self._count({"reset": reset_opacity(self.surfels, self.plan.train.reset_opacity)})
         self.stats = Statistics.zeros(len(self.surfels), self.surfels.position.device)
+        self.field.follow(self.surfels)
+
+    def _count(self, counts: dict[str, int]) -> None:
+        for what, number in counts.items():
+            self.counts[what] = self.counts.get(what, 0) + number
+
+    @torch.no_grad()
+    def _policy_inputs(self) -> PolicyInputs:
+        return PolicyInputs.from_surfels(self.surfels, self.field.distance(self.surfels))
 
     # -- evaluation ---------------------------------------------------------------------------------------------------------------
 
@@ -237,9 +274,10 @@ class Trainer:
 
     def record(self) -> dict[str, float]:
         """Evaluate, append to the log, and decide on early stopping."""
+        distance = self.field.distance(self.surfels).detach().abs()
         row = {
             "step": float(self.done), "psnr": self.evaluate(), "surfels": float(len(self.surfels)),
-            "sdf_median": float(self.surfels.sdf.abs().median()) if len(self.surfels) else 0.0, "gamma": float(self.surfels.gamma),
+            "sdf_median": float(distance.median()) if len(self.surfels) else 0.0, "gamma": float(self.surfels.gamma),
         }  # fmt: skip
         self.log.append(row)
         densifying = self.plan.densify and self.done < DENSIFY_END * self.plan.iterations
@@ -258,7 +296,8 @@ class Trainer:
             "surfels": self.surfels.tensors(), "adam": self.adam.state(), "generator": self.generator.get_state(),
             "light": None if self.light is None else self.light.state_dict(), "queue": self.queue, "log": self.log, "done": self.done,
             "end": self.end, "cooling_from": self.cooldown_start, "standing": self.plateau_evidence, "start_count": self.start_count,
-            "stats": (self.stats.gradient, self.stats.views, self.stats.weight),
+            "stats": (self.stats.gradient, self.stats.views, self.stats.weight), "field": self.field.state(),
+            "counts": self.counts,
         }  # fmt: skip
 
     def restore(self, state: dict[str, Any]) -> None:
@@ -271,3 +310,6 @@ class Trainer:
         self.queue, self.log, self.done, self.end = state["queue"], state["log"], state["done"], state["end"]
         self.cooldown_start, self.plateau_evidence, self.start_count = state["cooling_from"], state["standing"], state["start_count"]
         self.stats = Statistics(*state["stats"])
+        self.field.restore(state["field"])
+        self.counts = dict(state["counts"])
+        self.field.follow(self.surfels)

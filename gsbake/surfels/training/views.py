@@ -34,7 +34,7 @@ def test_photos(count: int, every: int) -> list[int]:
 @dataclass(frozen=True)
 class TrainView:
     """One photo at one size: `rgb` (3, h, w) sRGB and `mask` (h, w) or None as 8-bit tensors, world→camera pose, camera `centre`,
-    intrinsics."""
+    intrinsics. Given priors, where there are any: `normals` (3, h, w) 8-bit signed in camera axes, `depths` (h, w), 0 where unknown."""
 
     name: str
     rgb: Tensor
@@ -43,12 +43,15 @@ class TrainView:
     t: Tensor
     centre: Tensor
     pinhole: Pinhole
+    normals: Tensor | None = None
+    depths: Tensor | None = None
 
     def to(self, device: str | torch.device) -> TrainView:
         """The view with all tensors on `device`."""
         mask = None if self.mask is None else self.mask.to(device)
         rgb, r, t, c = (x.to(device) for x in (self.rgb, self.R, self.t, self.centre))
-        return TrainView(self.name, rgb, mask, r, t, c, self.pinhole)
+        normals, depths = (x if x is None else x.to(device) for x in (self.normals, self.depths))
+        return TrainView(self.name, rgb, mask, r, t, c, self.pinhole, normals, depths)
 
     def colour(self) -> Tensor:
         """Photo as sRGB floats (3, h, w) in 0..1."""

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from gsbake.surfels.densification.clone_split import Statistics, densify, prune
+from gsbake.surfels.densification.clone_split import Statistics, densify, prune, reset_opacity
 from gsbake.surfels.densification.policy import PolicyInputs
 from gsbake.surfels.initialisation import fibonacci_sphere, spacing
 from gsbake.surfels.model import Surfels, create, quaternion_from_normal
@@ -84,11 +84,12 @@ def test_prune_removes_surfels_off_the_surface() -> None:
 def test_policy_inputs_take_the_spacing_from_the_scales() -> None:
     s = ball()
     s.sdf[0], s.sdf[1] = -0.2, 0.1
-    at = PolicyInputs.from_surfels(s)
+    at = PolicyInputs.from_surfels(s, s.sdf)
     assert at.spacing == pytest.approx(float(np.median(spacing(s.position.numpy().astype(float)))), rel=1e-3)
     assert torch.allclose(at.distance[:3], torch.tensor([0.2, 0.1, 0.01])) and at.max_distance == pytest.approx(3 * at.spacing)
     assert float(at.opacity[0]) == pytest.approx(1 / np.cosh(0.1) ** 2, rel=1e-5)  # sech²(γs/2), γ = 1
-    assert PolicyInputs.from_surfels(s.select(torch.zeros(0, dtype=torch.long))).distance.shape == (0,)
+    empty = s.select(torch.zeros(0, dtype=torch.long))
+    assert PolicyInputs.from_surfels(empty, empty.sdf).distance.shape == (0,)
 
 
 def test_adam_follows_the_paper() -> None:
@@ -100,3 +101,23 @@ def test_adam_follows_the_paper() -> None:
     m, v = 0.9 * 0.1 * 2 + 0.1 * -1, 0.999 * 0.001 * 4 + 0.001 * 1
     expected = 0.9 - 0.1 * (m / (1 - 0.81)) / (v / (1 - 0.999**2)) ** 0.5
     assert torch.allclose(x, torch.tensor([expected], dtype=torch.float32))
+
+
+def test_reset_opacity_moves_surfels_off_the_surface_but_not_the_surface() -> None:
+    s = ball(200)
+    s.gamma = torch.tensor([50.0])
+    s.sdf = torch.linspace(-0.1, 0.1, 200)
+    surface, far = s.position - s.sdf[:, None] * s.normal(), s.sdf.abs() > 0.04
+    before = s.sdf.clone()
+    count = reset_opacity(s, 0.5)
+    assert count == int((before.abs() < s.transfer.half_width(0.5) / 50).sum()) > 20
+    assert float(s.opacity().max()) < 0.5 + 1e-5
+    assert torch.allclose(s.position - s.sdf[:, None] * s.normal(), surface, atol=1e-6)
+    assert torch.equal(s.sdf[far], before[far]) and torch.equal(s.sdf < 0, before < 0)
+
+
+def test_surfels_with_an_opacity_of_their_own_are_left_alone() -> None:
+    s = ball(10)
+    s.attributes["opacity"] = torch.full((10,), 2.0)
+    assert reset_opacity(s, 0.5) == 0 and s.peak_opacity == 1.0
+    assert torch.allclose(s.opacity(), torch.sigmoid(torch.tensor(2.0)).expand(10))

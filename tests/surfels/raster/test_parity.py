@@ -14,7 +14,7 @@ from gsbake.surfels.raster.reference import render_reference
 NAMES = ("position", "quaternion", "log_scale", "opacity", "features", "rotation", "translation")
 
 
-def scene(n: int, seed: int, scale: float = 0.15, channels: int = 5) -> list[torch.Tensor]:
+def scene(n: int, seed: int, scale: float = 0.15, channels: int = 3) -> list[torch.Tensor]:
     g = torch.Generator().manual_seed(seed)
     position = torch.randn(n, 3, generator=g, dtype=torch.float64) * 0.5
     quaternion = torch.randn(n, 4, generator=g, dtype=torch.float64)
@@ -87,7 +87,7 @@ def test_smooth_scene_gradients_agree_closely() -> None:
 def test_nothing_to_draw() -> None:
     inputs = [x.float() for x in scene(0, 0)]
     out = render(*inputs, VIEWS[0], normals_as_features=False)
-    assert out.alpha.abs().sum() == 0 and out.features.shape == (5, 48, 64)
+    assert out.alpha.abs().sum() == 0 and out.features.shape == (3, 48, 64)
 
 
 @pytest.mark.parametrize("z", [-1.0, 0.0, 0.02, 1e-6])

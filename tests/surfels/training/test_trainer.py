@@ -17,6 +17,7 @@ from gsbake.config.schema import Profile
 from gsbake.errors import BadInputError
 from gsbake.geometry.cameras import CameraSet
 from gsbake.surfels.densification.refinement import prune_and_densify
+from gsbake.surfels.fields.samples import SamplesField
 from gsbake.surfels.initialisation import fibonacci_sphere, initialise_surfels, spacing
 from gsbake.surfels.model import Surfels, create
 from gsbake.surfels.raster.render import SurfelRenderer
@@ -117,7 +118,7 @@ def test_refinement_raises_when_all_surfels_are_pruned(posed: PosedPhotos) -> No
     s = ball()
     s.sdf = torch.full_like(s.sdf, 5.0)
     with pytest.raises(BadInputError, match="1500 of 1500 surfels would be pruned, most of them as transparent"):
-        prune_and_densify(s, posed, profile().model_copy().refine, SIZE, 0)
+        prune_and_densify(s, SamplesField(s, None), posed, profile().model_copy().refine, SIZE, 0)
 
 
 def test_refinement_prunes_floaters(posed: PosedPhotos) -> None:
@@ -125,7 +126,7 @@ def test_refinement_prunes_floaters(posed: PosedPhotos) -> None:
     keep = s.position[:, 2] < 0.7
     s = s.select(keep.nonzero()[:, 0])
     s.position[0] = torch.tensor([0.0, 0.0, 1.5])  # outside every silhouette
-    after, counts = prune_and_densify(s, posed, profile().refine, SIZE, 0)
+    after, counts = prune_and_densify(s, SamplesField(s, None), posed, profile().refine, SIZE, 0)
     assert counts["dropped, outside the silhouettes"] >= 1
     assert float(after.position.norm(dim=1).max()) < 1.0
     assert counts["before"] == len(s) and counts["after"] == len(after) < len(s) + counts["added"]
@@ -146,12 +147,13 @@ def test_refinement_fills_gaps(posed: PosedPhotos) -> None:
         return float((cKDTree(surfels.position.numpy()).query(samples)[0] < 0.06).mean())
 
     refine = profile().refine
-    filled, counts = prune_and_densify(sparse, posed, refine, SIZE, 0)
+    filled, counts = prune_and_densify(sparse, SamplesField(sparse, None), posed, refine, SIZE, 0)
     assert coverage(s) > 0.95 and coverage(filled) > coverage(sparse) + 0.08
     added = filled.position[-counts["added"] :]
     assert counts["added"] >= 20 and counts["after"] == len(filled) == len(sparse) + counts["added"]
     assert float((added.norm(dim=1) - 0.8).abs().max()) < 0.01 and float((added - centre).norm(dim=1).max()) < radius + 0.05
-    unfilled, counts = prune_and_densify(sparse, posed, refine.model_copy(update={"densify_share": 0.0}), SIZE, 0)
+    settings = refine.model_copy(update={"densify_share": 0.0})
+    unfilled, counts = prune_and_densify(sparse, SamplesField(sparse, None), posed, settings, SIZE, 0)
     assert counts["added"] == 0 and coverage(unfilled) == coverage(sparse)
 
 
@@ -186,7 +188,7 @@ def test_refinement_prunes_by_the_named_policy(posed: PosedPhotos, policy: str, 
     s.position[lifted] *= 0.86 / 0.8
     s.sdf[lifted] = 2 * np.arccosh(5) / 4.5
     refine = profile().refine.model_copy(update={"prune": policy, "densify_share": 0.0})
-    after, _ = prune_and_densify(s, posed, refine, SIZE, 0)
+    after, _ = prune_and_densify(s, SamplesField(s, None), posed, refine, SIZE, 0)
     found = int((after.sdf > 0.5).sum())
     # at the silhouette the surface is seen at grazing angles, and the measured distance is smaller or missing
     assert found >= 0.8 * len(lifted) if kept else found <= 0.5 * len(lifted)

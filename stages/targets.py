@@ -1,0 +1,25 @@
+"""Stage targets: the baked asset → files for the places where it is used, within their budgets."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from gsbake.pipeline.stage import Context, Stage
+
+
+def run(ctx: Context) -> dict[str, Any]:
+    """See `gsbake.targets.build.build_targets`."""
+    from gsbake.targets.build import TargetOptions, build_targets
+
+    return build_targets(ctx.inputs, ctx.out, TargetOptions(ctx.settings.targets, ctx.settings.export), monitor=ctx)
+
+
+STAGE = Stage(
+    name="targets",
+    version=1,
+    title="Targets",
+    run=run,
+    summary="{files} files",
+    needs=("poses", "refine", "mesh", "bake", "export"),
+    settings=("targets.*", "export.*"),
+)
