@@ -342,6 +342,7 @@ def linear_shading(
         b1 = lut[row + _U1, col, 1] + fx * (lut[row + _U1, col + _U1, 1] - lut[row + _U1, col, 1])
         scale = a0 + fy * (a1 - a0)
         bias = b0 + fy * (b1 - b0)
+        transmitted = _1 - _F0 * scale - bias
         mirror, _ = _mirror_weight(roughness)
         coeff = _1 + mirror * (_2 * c - _1)
         u, v = _encode(coeff * nx - mirror * vx, coeff * ny - mirror * vy, coeff * nz - mirror * vz)
@@ -355,7 +356,7 @@ def linear_shading(
             lower = _bilinear(table, base0, stride0, fx0, fy0, ch)
             upper = _bilinear(table, base1, stride1, fx1, fy1, ch)
             light = visible_s * (lower + t * (upper - lower)) + incident * outgoing[hit, ch]
-            diffuse[i, ch] = local[i, 0] * _bilinear(table, base2, stride2, fx2, fy2, ch) + local[i, 2 + ch]
+            diffuse[i, ch] = transmitted * (local[i, 0] * _bilinear(table, base2, stride2, fx2, fy2, ch) + local[i, 2 + ch])
             scaled[i, ch] = light * scale
             constant[i, ch] = light * bias + local[i, 5 + ch]
 

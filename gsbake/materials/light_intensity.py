@@ -4,7 +4,7 @@ Under one fixed environment, brighter light on darker albedo looks nearly the sa
 at normal incidence), tells them apart. Gradient steps hardly move along that valley; above all a uniform component of the initial light
 stays, because base colours have compensated for it. Here, for an environment L, the best base colour b of each texel in
 
-    shade = b · E(n) + L(d) · (.04 A + B)
+    shade = b · T E(n) + L(d) · (.04 A + B)
 
 is a weighted least-squares solution over its pixels, so residuals depend on the light alone (variable projection; Golub & Pereyra, *The
 differentiation of pseudo-inverses and nonlinear least squares problems whose variables separate*, 1973). Candidates are environments

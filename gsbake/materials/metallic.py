@@ -3,7 +3,7 @@
 Gradient steps do not turn a dielectric into a metal: on the way it loses its diffuse colour before it gains a reflection. Under a known
 environment, though, both models are linear in the base colour b,
 
-    dielectric: shade = b · E(n) + L(d) · (.04 A + B)        metal: shade = b · L(d) A + L(d) B
+    dielectric: shade = b · T E(n) + L(d) · (.04 A + B)        metal: shade = b · L(d) A + L(d) B
 
 so for each of a few roughnesses the best b is a weighted least-squares solution over the texel's pixels; weights contain the squared slope
 of the sRGB curve, so that errors count as they are displayed. The two are compared by their likelihood. Its standard deviation differs

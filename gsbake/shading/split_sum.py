@@ -1,7 +1,8 @@
 """Deferred split-sum shading of G-buffers under a prefiltered environment light.
 
     F0  = .04 (1 − metallic) + metallic · albedo
-    out = (1 − metallic) · albedo · (1 − .04 A − B) · E(n) + L(d, roughness) · (F0 · A(n·v, roughness) + B(n·v, roughness))
+    T   = 1 − .04 A(n·v, roughness) − B(n·v, roughness)
+    out = (1 − metallic) · albedo · T · E(n) + L(d, roughness) · (F0 · A(n·v, roughness) + B(n·v, roughness))
 
 (METHOD §6; Karis, *Real Shading in Unreal Engine 4*, 2013; Munkberg et al., nvdiffrec, CVPR 2022.) On the CPU in float32, forward and
 backward pass are one Numba kernel each; other devices and float64 use PyTorch. Shadowing and inter-reflection enter through the occlusion

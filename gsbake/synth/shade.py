@@ -1,7 +1,9 @@
 """Direct lighting of the analytic scene: a reference renderer that shares no code with the surfel rasteriser or the split sum.
 
 Microfacet model: GGX with height-correlated Smith shadowing (Heitz, *Understanding the masking-shadowing function*, JCGT 2014) and
-Schlick's Fresnel, `F0 = .04 (1 - m) + m albedo`, alpha = roughness²; plus Lambert `(1 - m) albedo / pi`. Light comes from a rectangle
+Schlick's Fresnel, `F0 = .04 (1 - m) + m albedo`, alpha = roughness²; plus Lambert `(1 - m) albedo / pi` times what the specular layer of a
+dielectric lets through, one minus its directional albedo (Kulla and Conty, *Revisiting physically based shading at Imageworks*, 2017).
+Light comes from a rectangle
 (stratified points, each with a shadow ray), a sun (one shadow ray) and an environment whose radiance `a + b z` is linear in the
 direction, so that its irradiance `pi (a + 2/3 b n_z)` is exact. Ambient visibility is sampled with hemisphere rays; the specular part is
 summed over visible half vectors (Dupuy and Benyoub, *Sampling visible GGX normals with spherical caps*, CGF 2023).
@@ -120,8 +122,12 @@ def brdf_cosine(
     n: tuple[float, float, float],
     v: tuple[float, float, float],
     surface: tuple[float, float, float, float, float],
+    transmitted: float,
 ) -> tuple[float, float, float]:
-    """BRDF times cos(theta_l) (3); unit directions to light and camera, unit normal n, surface = albedo (3), roughness, metallic."""
+    """BRDF times cos(theta_l) (3); unit directions to light and camera, unit normal n, surface = albedo (3), roughness, metallic.
+
+    `transmitted` is the share of diffuse reflection that the specular layer lets through.
+    """
     nl = n[0] * light[0] + n[1] * light[1] + n[2] * light[2]
     if nl <= 0:
         return 0.0, 0.0, 0.0
@@ -132,7 +138,7 @@ def brdf_cosine(
     lh = (light[0] * hx + light[1] * hy + light[2] * hz) / length
     specular = _microfacet(nl, nv, nh, surface[3] * surface[3])
     schlick = (1 - lh) ** 5
-    diffuse = (1 - surface[4]) / math.pi
+    diffuse = transmitted * (1 - surface[4]) / math.pi
     base = 0.04 * (1 - surface[4])
     r0, g0, b0 = base + surface[4] * surface[0], base + surface[4] * surface[1], base + surface[4] * surface[2]
     return (
@@ -164,6 +170,7 @@ def _area_light(
     surface: tuple[float, float, float, float, float],
     rig: LightRig,
     subset: int,
+    transmitted: float,
 ) -> tuple[float, float, float]:
     """Reflected radiance (3) of the area light, by every fourth of its points from `subset`, each with a shadow ray."""
     x, y, z = position
@@ -174,7 +181,7 @@ def _area_light(
         inverse = 1 / math.sqrt(squared)
         lx, ly, lz = lx * inverse, ly * inverse, lz * inverse
         emitted = -(lx * rig.area_normal[0] + ly * rig.area_normal[1] + lz * rig.area_normal[2])
-        fr, fg, fb = brdf_cosine((lx, ly, lz), n, v, surface)
+        fr, fg, fb = brdf_cosine((lx, ly, lz), n, v, surface, transmitted)
         if emitted > 0 and fr + fg + fb > 0 and not _occluded(x, y, z, lx, ly, lz):
             angle = SAMPLE_SUBSETS * rig.patch_area * emitted / squared  # solid angle of the patch
             radiance = rig.area_radiance
@@ -189,10 +196,11 @@ def _sun_light(
     v: tuple[float, float, float],
     surface: tuple[float, float, float, float, float],
     rig: LightRig,
+    transmitted: float,
 ) -> tuple[float, float, float]:
     """Reflected radiance (3) of the sun, with one shadow ray."""
     direction, irradiance = rig.sun_direction, rig.sun_irradiance
-    fr, fg, fb = brdf_cosine((direction[0], direction[1], direction[2]), n, v, surface)
+    fr, fg, fb = brdf_cosine((direction[0], direction[1], direction[2]), n, v, surface, transmitted)
     if fr + fg + fb > 0 and not _occluded(position[0], position[1], position[2], direction[0], direction[1], direction[2]):
         return fr * irradiance[0], fg * irradiance[1], fb * irradiance[2]
     return 0.0, 0.0, 0.0
@@ -224,8 +232,9 @@ def _environment_specular(
     surface: tuple[float, float, float, float, float],
     tangents: tuple[float, float, float, float, float, float],
     rig: LightRig,
-) -> tuple[float, float, float]:
-    """Unoccluded specular reflection (3) of the environment, by visible half vectors (Dupuy and Benyoub 2023) weighted with F G2 / G1."""
+) -> tuple[float, float, float, float]:
+    """Unoccluded specular reflection (3) of the environment, by visible half vectors (Dupuy and Benyoub 2023) weighted with F G2 / G1, and
+    the directional albedo of a dielectric."""
     tx, ty, tz, ux, uy, uz = tangents
     alpha = surface[3] * surface[3]
     a2 = alpha * alpha
@@ -236,7 +245,7 @@ def _environment_specular(
     inverse = 1 / math.sqrt(wx * wx + wy * wy + nv * nv)
     wx, wy, wz = wx * inverse, wy * inverse, nv * inverse
     smith_v = math.sqrt(a2 + (1 - a2) * nv * nv)
-    r = g = b = 0.0
+    r = g = b = reflected = 0.0
     for i in range(len(rig.half_vector_samples)):
         c = (1 - rig.half_vector_samples[i, 0]) * (1 + wz) - wz
         sin, phi = math.sqrt(max(1 - c * c, 0.0)), 2 * math.pi * rig.half_vector_samples[i, 1]
@@ -250,12 +259,13 @@ def _environment_specular(
             continue
         weight = nl * (smith_v + nv) / (nl * smith_v + nv * math.sqrt(a2 + (1 - a2) * nl * nl))
         schlick = (1 - vh) ** 5
+        reflected += weight * (0.04 + 0.96 * schlick)
         lz = 2 * vh * hz - v[2]
         r += weight * (r0 + (1 - r0) * schlick) * (rig.ambient[0] + rig.gradient[0] * lz)
         g += weight * (g0 + (1 - g0) * schlick) * (rig.ambient[1] + rig.gradient[1] * lz)
         b += weight * (b0 + (1 - b0) * schlick) * (rig.ambient[2] + rig.gradient[2] * lz)
     count = len(rig.half_vector_samples)
-    return r / count, g / count, b / count
+    return r / count, g / count, b / count, reflected / count
 
 
 @_compiled
@@ -273,16 +283,17 @@ def outgoing_radiance(
     """
     offset = 2e-3
     position = (point[0] + offset * n[0], point[1] + offset * n[1], point[2] + offset * n[2])
+    tangents = _tangents(n)
+    sr, sg, sb, reflected = _environment_specular(n, v, surface, tangents, rig)
+    transmitted = 1 - reflected
     r = g = b = 0.0
     if rig.area_radiance[0] + rig.area_radiance[1] + rig.area_radiance[2] > 0:
-        r, g, b = _area_light(position, n, v, surface, rig, subset)
+        r, g, b = _area_light(position, n, v, surface, rig, subset, transmitted)
     if rig.sun_irradiance[0] + rig.sun_irradiance[1] + rig.sun_irradiance[2] > 0:
-        sun_r, sun_g, sun_b = _sun_light(position, n, v, surface, rig)
+        sun_r, sun_g, sun_b = _sun_light(position, n, v, surface, rig, transmitted)
         r, g, b = r + sun_r, g + sun_g, b + sun_b
-    tangents = _tangents(n)
     visible = _ambient_visibility(position, n, tangents, rig, subset)
-    sr, sg, sb = _environment_specular(n, v, surface, tangents, rig)
-    diffuse, slope = 1 - surface[4], 2 / 3 * n[2]  # irradiance over pi is ambient + 2/3 gradient n_z
+    diffuse, slope = transmitted * (1 - surface[4]), 2 / 3 * n[2]  # irradiance over pi is ambient + 2/3 gradient n_z
     return (
         r + visible * (diffuse * surface[0] * (rig.ambient[0] + rig.gradient[0] * slope) + sr),
         g + visible * (diffuse * surface[1] * (rig.ambient[1] + rig.gradient[1] * slope) + sg),

@@ -2,7 +2,8 @@
 
 It shares no code with `gsbake.shading`: the BRDF of glTF 2.0 (appendix B: Lambert, GGX with the height-correlated Smith term, Schlick's
 Fresnel) is sampled half by the cosine and half by GGX's half vectors, combined by the balance heuristic (Veach & Guibas, *Optimally
-combining sampling techniques*, SIGGRAPH 1995). Nothing is prefiltered, no sum is split.
+combining sampling techniques*, SIGGRAPH 1995). Nothing is prefiltered, no sum is split. Diffuse reflection gets what the specular layer of a
+dielectric lets through, one minus its directional albedo (Kulla & Conty, *Revisiting physically based shading at Imageworks*, 2017).
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ def render(
     view, alpha = np.asarray(view, float), np.maximum(np.asarray(roughness, float), 0.05) ** 2
     tangent, across = frames(normal)
     nv = np.maximum((normal * view).sum(1), 1e-3)
-    total = np.zeros((n, 3))
+    specular, diffuse, reflected = np.zeros((n, 3)), np.zeros((n, 3)), np.zeros(n)
     for k in range(samples):
         u, turn = (k + draw.random(n)) / samples, 2 * np.pi * draw.random(n)
         if k % 2:
@@ -53,10 +54,13 @@ def render(
         smith = safe * np.sqrt(nv**2 * (1 - alpha**2) + alpha**2) + nv * np.sqrt(safe**2 * (1 - alpha**2) + alpha**2)
         f0 = 0.04 * (1 - metallic[:, None]) + metallic[:, None] * albedo
         fresnel = f0 + (1 - f0) * ((1 - vh) ** 5)[:, None]
-        value = (distribution * 0.5 / smith)[:, None] * fresnel + (1 - metallic[:, None]) * albedo / np.pi
         density = 0.5 * safe / np.pi + 0.5 * distribution * nh / (4 * vh)
-        total += np.where(up[:, None], value * (safe / density)[:, None] * environment(light), 0.0)
-    return total / samples
+        share, lobe = np.where(up, safe / density / samples, 0.0), distribution * 0.5 / smith
+        incident = share[:, None] * environment(light)
+        specular += lobe[:, None] * fresnel * incident
+        diffuse += (1 - metallic[:, None]) * albedo / np.pi * incident
+        reflected += share * lobe * (0.04 + 0.96 * (1 - vh) ** 5)
+    return np.asarray(specular + (1 - reflected)[:, None] * diffuse)
 
 
 def local(tangent: Doubles, across: Doubles, normal: Doubles, cosine: Doubles, turn: Doubles) -> Doubles:

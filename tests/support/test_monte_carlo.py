@@ -17,7 +17,8 @@ def test_lambert_under_a_linear_sky() -> None:
         return np.asarray((0.5 + 0.3 * directions[:, 2])[:, None] * np.ones(3))
 
     both = [render(UP, UP, a, np.ones(1), np.zeros(1), sky, 4096) for a in (0.6 * WHITE, BLACK)]
-    np.testing.assert_allclose(both[0] - both[1], 0.6 * (0.5 + 0.3 * 2 / 3), rtol=0.01)
+    reflected = render(UP, UP, BLACK, np.ones(1), np.zeros(1), lambda d: np.ones((len(d), 3)), 4096)
+    np.testing.assert_allclose(both[0] - both[1], 0.6 * (0.5 + 0.3 * 2 / 3) * (1 - reflected), rtol=0.01)
 
 
 def test_white_furnace() -> None:
@@ -25,3 +26,5 @@ def test_white_furnace() -> None:
     smooth, rough = (render(UP, view, WHITE, np.full(1, r), np.ones(1), lambda d: np.ones((len(d), 3)), 4096) for r in (0.15, 0.9))
     assert 0.97 < smooth.mean() < 1.001
     assert 0.4 < rough.mean() < 0.8  # one bounce of a rough metal loses the rest
+    dielectric = render(UP, view, WHITE, np.full(1, 0.3), np.zeros(1), lambda d: np.ones((len(d), 3)), 4096)
+    np.testing.assert_allclose(dielectric, 1, rtol=0.01)  # what the specular layer lets through is reflected

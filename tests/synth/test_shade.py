@@ -18,8 +18,10 @@ def unit(v: np.ndarray) -> np.ndarray:
     return v / np.linalg.norm(v, axis=-1, keepdims=True)
 
 
-def textbook(light: np.ndarray, n: np.ndarray, v: np.ndarray, albedo: np.ndarray, roughness: float, metallic: float) -> np.ndarray:
-    """D G F / (4 nl nv) with G from the two Smith lambdas, plus Lambert; times nl."""
+def textbook(
+    light: np.ndarray, n: np.ndarray, v: np.ndarray, albedo: np.ndarray, roughness: float, metallic: float, transmitted: float
+) -> np.ndarray:
+    """D G F / (4 nl nv) with G from the two Smith lambdas, plus attenuated Lambert; times nl."""
     h = unit(light + v)
     nl, nv, nh, vh = n @ light, n @ v, n @ h, v @ h
     a = roughness**2
@@ -29,7 +31,7 @@ def textbook(light: np.ndarray, n: np.ndarray, v: np.ndarray, albedo: np.ndarray
     g = 1 / (1 + lam[0] + lam[1])
     f0 = 0.04 * (1 - metallic) + metallic * albedo
     f = f0 + (1 - f0) * (1 - vh) ** 5
-    return nl * (d * g * f / (4 * nl * nv) + (1 - metallic) * albedo / np.pi)
+    return nl * (d * g * f / (4 * nl * nv) + transmitted * (1 - metallic) * albedo / np.pi)
 
 
 def test_brdf_matches_the_textbook() -> None:
@@ -38,8 +40,9 @@ def test_brdf_matches_the_textbook() -> None:
         n, light, v = (unit(draw.normal(size=3)) for _ in range(3))
         light, v = light * np.sign(n @ light), v * np.sign(n @ v)
         albedo, roughness, metallic = draw.random(3), draw.uniform(0.2, 1), draw.random()
-        got = brdf_cosine(tuple(light), tuple(n), tuple(v), (*albedo, roughness, metallic))
-        np.testing.assert_allclose(got, textbook(light, n, v, albedo, roughness, metallic), rtol=1e-9)
+        transmitted = draw.uniform(0.5, 1)
+        got = brdf_cosine(tuple(light), tuple(n), tuple(v), (*albedo, roughness, metallic), transmitted)
+        np.testing.assert_allclose(got, textbook(light, n, v, albedo, roughness, metallic, transmitted), rtol=1e-9)
 
 
 def mean_radiance(
@@ -59,6 +62,14 @@ def test_white_furnace() -> None:
     # A black dielectric reflects only its Fresnel part: at least F0 times what white metal keeps, far from 1.
     black = mean_radiance(SIDE, OUT, v, (0.0, 0.0, 0.0, 0.3, 0.0), rig)
     assert 0.035 < black.min() < 0.08
+    # What a dielectric's specular layer does not reflect reaches the diffuse one: white loses nothing.
+    white = mean_radiance(SIDE, OUT, v, (1.0, 1.0, 1.0, 0.3, 0.0), rig)
+    np.testing.assert_allclose(white, 1, rtol=1e-9)
+
+
+def transmitted(point: tuple[float, ...], n: tuple[float, ...], v: tuple[float, ...], roughness: float) -> np.ndarray:
+    """Share of diffuse reflection that a dielectric's specular layer lets through, by a white furnace."""
+    return 1 - mean_radiance(point, n, v, (0.0, 0.0, 0.0, roughness, 0.0), make_light_rig(ambient=(1, 1, 1)))
 
 
 def test_environment_specular_matches_monte_carlo() -> None:
@@ -69,7 +80,7 @@ def test_environment_specular_matches_monte_carlo() -> None:
     lights = unit(draw.normal(size=(40_000, 3)))
     lights *= np.sign(-lights[:, :1])  # the hemisphere about (-1, 0, 0)
     light_in = np.array([0.5, 0.5, 0.5]) + lights[:, 2:] * np.array([0.4, 0.0, -0.3])
-    values = np.array([brdf_cosine(tuple(d), OUT, tuple(v), surface) for d in lights])
+    values = np.array([brdf_cosine(tuple(d), OUT, tuple(v), surface, 1.0) for d in lights])
     expected = 2 * np.pi * np.mean(values * light_in, axis=0)
     np.testing.assert_allclose(mean_radiance(SIDE, OUT, tuple(v), surface, rig), expected, rtol=0.03)
 
@@ -80,12 +91,12 @@ def test_lambert_values() -> None:
     sun = make_light_rig(sun=(np.pi, np.pi, np.pi), sun_direction=tuple(direction))
     rough, black = (0.5, 0.5, 0.5, 1.0, 0.0), (0.0, 0.0, 0.0, 1.0, 0.0)
     diffuse = mean_radiance(SIDE, OUT, v, rough, sun) - mean_radiance(SIDE, OUT, v, black, sun)
-    np.testing.assert_allclose(diffuse, 0.5 * 0.6, rtol=1e-9)  # albedo cos(theta) E / pi
+    np.testing.assert_allclose(diffuse, 0.5 * 0.6 * transmitted(SIDE, OUT, v, 1.0), rtol=1e-9)  # albedo cos(theta) E / pi
     sky = make_light_rig(ambient=(1, 1, 1), gradient=(0.3, 0.3, 0.3))
     top_rim = (OX + 0.36, OY, 0.92)
     n = (0.0, 0.0, 1.0)
     diffuse = mean_radiance(top_rim, n, n, rough, sky) - mean_radiance(top_rim, n, n, black, sky)
-    np.testing.assert_allclose(diffuse, 0.5 * (1 + 2 / 3 * 0.3), rtol=1e-9)  # albedo (a + 2/3 b n_z)
+    np.testing.assert_allclose(diffuse, 0.5 * (1 + 2 / 3 * 0.3) * transmitted(top_rim, n, n, 1.0), rtol=1e-9)  # albedo (a + 2/3 b n_z)
 
 
 def test_area_light_has_its_form_factor() -> None:
@@ -103,7 +114,7 @@ def test_area_light_has_its_form_factor() -> None:
     out = tuple(n)
     bright, black = (mean_radiance(tuple(point), out, out, (a, a, a, 1.0, 0.0), rig) for a in (0.8, 0.0))
     diffuse = bright - black
-    np.testing.assert_allclose(diffuse, 0.8 / np.pi * abs(total) / 2, rtol=0.01)
+    np.testing.assert_allclose(diffuse, 0.8 / np.pi * abs(total) / 2 * transmitted(tuple(point), out, out, 1.0), rtol=0.01)
 
 
 @pytest.mark.parametrize(("sun", "lit"), [((0.0, 0.0, 1.0), True), ((1.0, 0.0, 0.05), False)])
