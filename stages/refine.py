@@ -29,7 +29,7 @@ STAGE = Stage(
     needs=("poses", "train"),
     settings=(
         "refine.*", "train.max_size", "train.holdout", "train.lr_*", "train.sharpness", "train.final_width", "surfels.*", "loss.*",
-        "coupling.*",        "skip.converged_steps",
+        "coupling.*", "skip.converged_steps",
     ),
     uses_device=True,
     seeded=True,

@@ -32,7 +32,8 @@ def oriented_points(surfels: Surfels) -> OrientedPoints:
     """Surfels inside the ball, moved by their SDF sample along their normal, with at least `MIN_OPACITY`; others are left out."""
     normal = surfels.normal().cpu().numpy().astype(np.float64)
     sdf = surfels.sdf.cpu().numpy().astype(np.float64).reshape(-1, 1)
-    points = surfels.position.cpu().numpy().astype(np.float64) - sdf * normal
+    with np.errstate(invalid="ignore"):  # what is not finite is left out below
+        points = surfels.position.cpu().numpy().astype(np.float64) - sdf * normal
     opacity = surfels.opacity().cpu().numpy().astype(np.float64).reshape(-1)
     weights = surfels.scale.cpu().numpy().astype(np.float64).prod(1) * opacity
     keep = np.isfinite(points).all(1) & np.isfinite(normal).all(1) & np.isfinite(weights)

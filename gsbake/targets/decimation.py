@@ -53,7 +53,7 @@ class WedgeMesh:
 
     @staticmethod
     def of(mesh: GltfMesh) -> WedgeMesh:
-        """The wedges of a mesh: its vertices, those alike in position and texture merged."""
+        """The wedges of a mesh: its vertices, those of equal position and texture coordinates merged."""
         keys = np.concatenate([mesh.position, mesh.uv], 1) + np.float32(0)  # −0 is +0
         _, first, wedge_of = np.unique(keys, axis=0, return_index=True, return_inverse=True)
         wedge_of = wedge_of.ravel()

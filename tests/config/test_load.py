@@ -46,16 +46,23 @@ CONDITIONS: dict[str, Condition] = {
 }
 
 
+#: Profiles of published systems.
+SYSTEMS = {
+    "dsdf", "gs-ror2", "3dgsr", "gsdf", "gs-octree", "gs-pull", "surfacesplat", "splatsdf", "gaussianroom", "ugsdf", "sdf-3dgan", "neus",
+    "volsdf",
+}  # fmt: skip
+
+
 def write(path: Path, text: str) -> str:
     path.write_text(text)
     return str(path)
 
 
 def test_shipped_profiles() -> None:
-    assert set(shipped()) == {"smoke", "preview", "relight", "quality", "scan"}
+    assert set(shipped()) == {"smoke", "preview", "relight", "quality", "scan"} | SYSTEMS
     loaded = {name: load_profile(name).profile for name in shipped()}
     assert all(p.description for p in loaded.values())
-    assert {name for name, p in loaded.items() if p.bake.materials == "fit"} == {"relight", "quality"}
+    assert {name for name, p in loaded.items() if p.bake.materials == "fit"} == {"relight", "quality"} | SYSTEMS
     assert {name for name, p in loaded.items() if p.bake.materials == "delight"} == {"scan"}
     cost = [loaded[name].train.iterations for name in ("smoke", "preview", "relight", "quality")]
     assert cost == sorted(cost) and cost[0] < cost[1]
@@ -170,7 +177,7 @@ def test_an_integer_too_long_to_convert_is_shown_in_part(tmp_path: Path) -> None
 def test_unknown_profile() -> None:
     with pytest.raises(UsageError, match="There is no profile 'relihgt': did you mean 'relight'?"):
         load_profile("relihgt")
-    with pytest.raises(UsageError, match="there are preview, quality, relight, scan, smoke"):
+    with pytest.raises(UsageError, match="there are 3dgsr, .*preview, quality, relight, scan, "):
         load_profile("/no/such.toml")
 
 

@@ -37,7 +37,7 @@ def interpolate_reference(points: Tensor, table: Tensor, levels: Levels) -> tupl
         top = (size - 1).to(points)
         x = torch.nan_to_num((points - lower) * scale, nan=0.0)
         inside = (x >= 0) & (x <= top) & (size > 1) & torch.isfinite(points)
-        x = torch.minimum(x.clamp_min(0), top)
+        x = torch.where(x < 0, torch.zeros_like(x), torch.where(x > top, top, x))
         base = torch.minimum(x.detach().long(), (size - 2).clamp_min(0))
         t = torch.where(size > 1, x - base.to(points), torch.zeros_like(x))
         slope = inside.to(points) * scale

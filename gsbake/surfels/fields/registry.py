@@ -63,16 +63,16 @@ def save_field(folder: Path, field: Field) -> None:
         save_file(tensors, str(folder / FILE), {"format": FORMAT + field.settings.model_dump_json()})
 
 
-def load_field(folder: Path, surfels: Surfels, profile: Any = None) -> Field:
+def load_field(folder: Path, surfels: Surfels, profile: Any = None, fine_tuning: bool = False) -> Field:
     """The field of the train or refine stage's `folder`, whose surfels these are, with the settings that it was made with.
 
-    `profile` gives the sections [coupling], [loss] and [train] where training goes on. Raises BadInputError for a file that this version
-    does not know.
+    `profile` gives the sections [coupling], [loss] and [train] where training goes on, `fine_tuning` whether its schedules have ended.
+    Raises BadInputError for a file that this version does not know.
     """
     coupling, loss, train = (Coupling(), Loss(), Train()) if profile is None else (profile.coupling, profile.loss, profile.train)
     path = folder / FILE
     if not path.exists():
-        return SamplesField(surfels, loss, train)
+        return SamplesField(surfels, loss, train, fine_tuning)
     try:
         with safe_open(str(path), "pt") as file:
             tensors = {k: file.get_tensor(k) for k in file.keys()}  # noqa: SIM118 (safetensors has no iterator)

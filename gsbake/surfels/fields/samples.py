@@ -35,9 +35,12 @@ class SamplesField(Field):
 
     name = "samples"
 
-    def __init__(self, surfels: Surfels, loss: Any, train: Any = None) -> None:
-        """`loss` and `train` are the profile's sections: the weights of the median and projection losses, and the unit of the sharpness."""
-        self.surfels, self.loss, self.train = surfels, loss, train
+    def __init__(self, surfels: Surfels, loss: Any, train: Any = None, fine_tuning: bool = False) -> None:
+        """`loss` and `train` are the profile's sections: the weights of the median and projection losses, and the unit of the sharpness.
+
+        With `fine_tuning` opacity keeps the width that training has ended with.
+        """
+        self.surfels, self.loss, self.train, self.fine_tuning = surfels, loss, train, fine_tuning
         self._index: tuple[cKDTree, Tensor, Tensor, Tensor] | None = None
 
     def follow(self, surfels: Surfels) -> None:
@@ -123,7 +126,7 @@ class SamplesField(Field):
         if self.train is None or self.train.sharpness == "unit":
             return None
         spacing, final = typical_spacing(step.surfels), self.train.final_width
-        widest = max(self.train.band, final)
+        widest = final if self.fine_tuning else max(self.train.band, final)
         return final * spacing, spacing * (final + (widest - final) * (1 - step.share))
 
     def mesh(self, lattice: BlockLattice, truncation: float) -> NDArray[np.float32]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -94,9 +94,7 @@ def refine_surfels(
     surfels = Surfels.load(trained / "surfels.safetensors")
     light = EnvironmentLight.load(trained / "light.safetensors") if (trained / "light.safetensors").exists() else None
     with monitor.part("prune and densify"):
-        # fine-tuning keeps the width that training has ended with
-        train = options.training.train.model_copy(update={"band": 0.0})
-        field = load_field(trained, surfels, replace(options.training, train=train))
+        field = load_field(trained, surfels, options.training, fine_tuning=True)
         surfels, counts = prune_and_densify(surfels, field, posed, options.refine, options.training.train.max_size, seed)
         field.follow(surfels)
     run = Execution(out, scratch, seed, threads, device, monitor)

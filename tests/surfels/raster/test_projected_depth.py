@@ -16,7 +16,7 @@ RADIUS, SIZE = 0.6, 64
 def shell(offset: float) -> Surfels:
     """A ball whose surfels all lie `offset` off it and know it."""
     p = fibonacci_sphere(4000)
-    s = create((RADIUS + offset) * p, p, RADIUS * spacing(p), None, "colour", 0, 0.0, 4.0)
+    s = create((RADIUS + offset) * p, p, 2 * RADIUS * spacing(p), None, "colour", 0, 0.0, 4.0)
     s.sdf = torch.full_like(s.sdf, offset)
     return s
 
