@@ -23,9 +23,9 @@ together in this way; visibility per texel and weights per view are added by the
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import torch
@@ -35,69 +35,21 @@ from gsbake.imaging.metrics import decibels
 from gsbake.materials import fit_kernel
 from gsbake.materials.bilateral import EdgeAwareFilter
 from gsbake.materials.emission import find_emission
+from gsbake.materials.fit_surface import FitSurface, Fitted
 from gsbake.materials.light_intensity import LightAdjustment, adjust_radiance, search_light
 from gsbake.materials.metallic import PhotoSamples, find_metals
 from gsbake.materials.options import FitOptions, FitSchedule, Priors
 from gsbake.materials.photo_batch import EMISSION, INDIRECT, OUTGOING, VISIBILITY, FitStep, KernelTables, PhotoBatch
 from gsbake.materials.pixels import Pixels
+from gsbake.materials.remaining_shading import MATCHED_POINTS, remaining_shading, with_irradiance_factor
 from gsbake.materials.sparsity_prior import KERNEL_WIDTHS, common_materials
 from gsbake.shading.cubemap import solid_angles
 from gsbake.shading.environment import EnvironmentLight
 from gsbake.shading.light_tables import prefilter_cube_map
 from gsbake.shading.neutral_light import neutral_light_loss
 from gsbake.texturing.resampling import DETAIL_OFFSET, MAX_DETAIL_RATIO
-from gsbake.texturing.texels import Texels
 
 Floats = NDArray[np.float32]
-
-
-@dataclass(frozen=True)
-class Fitted:
-    """Result of a fit.
-
-    `values` (n, 5): linear base colour, roughness, metallic of each texel; `normal_offset` (n, 3) to be added to its unit normal; `weight`
-    (n,) of all pixels that show it; `emission` (n, 3) its emitted radiance; the `light` in the mesh's frame; `held_out_psnr` in dB over the
-    pixels of held-out photos (None without any); the number of `emissive_regions`; `light_adjustments`, one per search for the light's
-    intensity.
-    """
-
-    values: Floats
-    normal_offset: Floats
-    weight: Floats
-    emission: Floats
-    light: EnvironmentLight
-    held_out_psnr: float | None
-    emissive_regions: int
-    light_adjustments: tuple[LightAdjustment, ...]
-
-
-class Transport(Protocol):
-    """Visibility and indirect light of the texels; see `gsbake.materials.visibility.Visibility`."""
-
-    def visible_share(self, radiance: NDArray[Any]) -> Floats:
-        """Unoccluded share (n,) of the irradiance by luminance under the cube map `radiance`."""
-
-    def indirect_irradiance(self, irradiance: NDArray[Any], reflectance: NDArray[Any]) -> Floats:
-        """Indirect irradiance / π (n, 3) of texels with `reflectance` (n, 3) under direct `irradiance` / π (n, 3)."""
-
-
-@dataclass(frozen=True)
-class FitSurface:
-    """The n texels of a texture with their geometry.
-
-    `position`, unit `normal` (n, 3) in the mesh's frame; `pairs` (m, 2) neighbouring texels, shuffled as `gsbake.materials.adjacency` does;
-    `occlusion` (n,) ambient occlusion, 1 = open; `base_color` (n, 3) the initial linear base colour. With `transport` shadows follow the
-    light, with `indirect` texels light each other as well.
-    """
-
-    texels: Texels
-    position: NDArray[Any]
-    pairs: NDArray[np.int64]
-    normal: NDArray[Any]
-    occlusion: NDArray[Any]
-    base_color: NDArray[Any]
-    transport: Transport | None = None
-    indirect: bool = True
 
 
 class MaterialFit:
@@ -170,6 +122,7 @@ class MaterialFit:
         order: list[int] = []
         self._common, self._residual = np.zeros((0, 4), np.float32), np.zeros(2)
         weight = self._texel_weight(batches)
+        given = self._tables() if schedule.fixed_light else None
         for step in range(steps if batches else 0):
             update_common = step % o.sparsity_interval == 0
             if schedule.emission and step == int(o.emission_search_at * steps):
@@ -187,7 +140,7 @@ class MaterialFit:
             if schedule.sparsity and self._priors.sparsity and update_common and step >= o.sparsity_from * steps:
                 self._common = self._find_common_materials()
             order = order or generator.permutation(len(batches)).tolist()
-            self._step(batches[order.pop()], schedule.rate * o.final_rate ** (step / steps))
+            self._step(batches[order.pop()], schedule.rate * o.final_rate ** (step / steps), given)
             if each is not None:
                 each(step + 1, steps)
         values, emission = self._values[:, :5].copy(), self._transport[:, EMISSION].copy()
@@ -206,23 +159,30 @@ class MaterialFit:
             weight[touched] += np.add.reduceat(share * batch.weight[pixel], start[:-1])
         return weight.astype(np.float32)
 
-    def _step(self, batch: PhotoBatch, decay: float) -> None:
-        """One Adam step on the pixels of one photo, with learning rates times `decay`."""
-        o, n = self._options, len(self._raw)
+    def _step(self, batch: PhotoBatch, decay: float, given: KernelTables | None) -> None:
+        """One Adam step on the pixels of one photo, with learning rates times `decay`; of the texels alone under a `given` light."""
+        o = self._options
+        if given is not None:
+            self._shade(batch, given)
+            self._update_texels(decay)
+            return
         radiance = self._light.radiance()
         tables = prefilter_cube_map(radiance)
-        sums = self._step_buffers(
-            batch, self._values, KernelTables.of(tables), self._transport, o.residual_weight, o.robust_scale, n / len(batch)
-        )
-        self._residual += sums[1:]
+        self._shade(batch, KernelTables.of(tables))
         self._adam_light.zero_grad()
         self._adam_light.param_groups[0]["lr"] = o.light_rate * decay
         loss = (tables.table * torch.from_numpy(self._step_buffers.table.sum(0))).sum()
         if self._priors.neutral_light:
-            loss = loss + n * self._priors.neutral_light * neutral_light_loss(radiance)
+            loss = loss + len(self._raw) * self._priors.neutral_light * neutral_light_loss(radiance)
         loss.backward()
         self._adam_light.step()
         self._update_texels(decay)
+
+    def _shade(self, batch: PhotoBatch, tables: KernelTables) -> None:
+        """Shade the pixels of a photo, leave the gradients in the buffers and add to the sums of the residual."""
+        o = self._options
+        factor = len(self._raw) / len(batch)
+        self._residual += self._step_buffers(batch, self._values, tables, self._transport, o.residual_weight, o.robust_scale, factor)[1:]
 
     def _update_texels(self, decay: float) -> None:
         """One Adam step on all texels, from the gradient of the photo and those of the priors."""
@@ -292,11 +252,15 @@ class MaterialFit:
         """Which texels (n,) do not emit."""
         return np.asarray(self._transport[:, EMISSION].sum(1) == 0)
 
+    def _dielectric(self) -> NDArray[np.bool_]:
+        """Which texels (n,) are dielectric and do not emit."""
+        return np.asarray((self._values[:, 4] < self._options.max_dielectric_metallic) & self._non_emissive())
+
     @torch.no_grad()
     def _search_light(self, batches: list[PhotoBatch], generator: np.random.Generator, tint: bool, rough: bool) -> LightAdjustment:
         """Search for the light's intensity and contrast and for a roughness shift, apply them, and adapt base colours."""
         o, values = self._options, self._values
-        dielectric = (values[:, 4] < o.max_dielectric_metallic) & self._non_emissive()
+        dielectric = self._dielectric()
         if dielectric.mean() < o.min_dielectric_share:
             return self._anchor_metals()
         share = min(1.0, o.intensity_pixels / max(1, sum(map(len, batches))))
@@ -320,20 +284,44 @@ class MaterialFit:
             tables = KernelTables.of(light.prefilter())
             return [b.samples(values[:, 5:], tables, transport) for b in subset]
 
-        found = search_light(samples_under, values[:, 3].copy(), tint, rough)
+        mean_base = float(np.exp(np.log(values[dielectric, :3].max(1) + o.log_offset).mean()))
+        found = search_light(samples_under, values[:, 3].copy(), tint, rough, mean_base)
         if found.improvement <= 0:
             return found
-        before = self._irradiance() * self._transport[:, :1]
-        self._light.raw.copy_(adjusted(found.intensity, found.contrast).raw)
+        values[dielectric, 3] = found.shifted_roughness(values[dielectric, 3])
+        self._change_light(adjusted(found.intensity, found.contrast), np.flatnonzero(dielectric))
+        return found
+
+    @torch.no_grad()
+    def _change_light(self, light: EnvironmentLight, texel: NDArray[np.int64]) -> None:
+        """Replace the light, and change the base colours of the texels (m,) so that their diffuse colours stay."""
+        o = self._options
+        before = self._irradiance() * self._transport[:, :1] + self._transport[:, INDIRECT]
+        self._light.raw.copy_(light.raw)
         self._adam_light.state.clear()
         self._update_transport()
-        after = self._irradiance() * self._transport[:, :1]
-        at = np.flatnonzero(dielectric)
-        new = values[at, :5]
-        new[:, :3] = np.clip(new[:, :3] * before[at] / np.maximum(after[at], 1e-6), o.min_base_color, o.base_color_range[1])
-        new[:, 3] = found.shifted_roughness(new[:, 3])
-        self._reinitialise(at, new)
-        return found
+        after = self._irradiance() * self._transport[:, :1] + self._transport[:, INDIRECT]
+        new = self._values[texel, :5]
+        new[:, :3] = np.clip(new[:, :3] * before[texel] / np.maximum(after[texel], 1e-6), o.min_base_color, o.base_color_range[1])
+        self._reinitialise(texel, new)
+
+    @torch.no_grad()
+    def move_shading_to_light(self, seed: int) -> None:
+        """Move the shading that is left in the base colours of dielectrics to the light; not where less than half is dielectric."""
+        dielectric = self._dielectric()
+        if dielectric.mean() < self._options.min_dielectric_share:
+            return
+        generator, texel = np.random.default_rng(seed), np.flatnonzero(dielectric)
+        unit = self._normal / np.maximum(np.linalg.norm(self._normal, axis=1, keepdims=True), 1e-12)
+        coefficients = remaining_shading(self._values[texel, :3], unit[texel], np.asarray(self._surface.position)[texel], generator)
+        matched = unit[generator.choice(texel, min(MATCHED_POINTS, len(texel)), replace=False)]
+        normals = torch.from_numpy(np.ascontiguousarray(matched))
+
+        def irradiance(radiance: Floats) -> Floats:
+            return np.asarray(prefilter_cube_map(torch.from_numpy(radiance)).diffuse(normals).numpy())
+
+        light = with_irradiance_factor(self._radiance(), coefficients, matched, irradiance)
+        self._change_light(EnvironmentLight.from_radiance(light), texel)
 
     def _anchor_metals(self) -> LightAdjustment:
         """Scale the light and base colours so that metals are as bright as metals usually are: their reflections leave the scale open."""

@@ -18,7 +18,7 @@ from gsbake.capture.view_dependence import is_diffuse
 from gsbake.config.schema import Bake
 from gsbake.geometry.cameras import Camera
 from gsbake.materials.adjacency import neighbours
-from gsbake.materials.fit import FitSurface, Fitted
+from gsbake.materials.fit_surface import FitSurface, Fitted
 from gsbake.materials.initialisation import ChosenFit
 from gsbake.materials.levels import FitLevel, InterpolatedTransport, coarse_pixels, coarse_surface
 from gsbake.materials.map_selection import drop_unneeded_maps

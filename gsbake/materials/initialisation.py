@@ -12,7 +12,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from gsbake.materials.fit import Fitted, MaterialFit
+from gsbake.materials.fit import MaterialFit
+from gsbake.materials.fit_surface import Fitted
 from gsbake.materials.levels import FitLevel
 from gsbake.materials.options import FitSchedule
 

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsbake.materials.adjacency import neighbours
-from gsbake.materials.fit import FitSurface, Transport
+from gsbake.materials.fit_surface import FitSurface, Transport
 from gsbake.materials.pixels import Pixels
 from gsbake.texturing.resampling import CoarseTexture
 

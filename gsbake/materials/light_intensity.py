@@ -17,6 +17,10 @@ smooth material would show, and photos do not, favour a dim, uniform environment
 return. Base colours are solved robustly by reweighting, so that misplaced reflections do not decide. Residuals are of sRGB values, averaged
 over blocks of a twelfth of the object: a sharp reflection that is misplaced by a few pixels would otherwise favour a darker light, by
 regression dilution (Fuller, *Measurement Error Models*, 1987).
+
+On rough materials reflections hardly tell the intensity, and the residual is flat over a factor of three. There a prior decides: the
+mean base colours of objects are log-normal (`TYPICAL_BASE_COLOUR`, `SPREAD`), and the residuals count as `OBSERVATIONS` independent ones
+of a Laplace distribution, so −log p = OBSERVATIONS · log residual + ½ (log(mean / TYPICAL_BASE_COLOUR) / SPREAD)².
 """
 
 from __future__ import annotations
@@ -45,6 +49,10 @@ TINT_FACTOR = 1.1
 LIMITS = (3.0, 2.0, 3.0)
 #: Relative decrease of the residual that a step must bring; a step with more roughness; the result of the second search.
 MIN_DECREASE, MIN_ROUGHER_DECREASE, MIN_SECOND_DECREASE = 0.002, 0.01, 0.03
+#: Log-normal prior of the geometric mean of an object's base colours (strongest channel): median, and standard deviation of the logarithm.
+TYPICAL_BASE_COLOUR, SPREAD = 0.3, 0.66
+#: Number of independent residuals that evidence for the intensity counts as: errors of the model are shared by all pixels.
+OBSERVATIONS = 6.0
 #: Rounds of reweighting, and the residual of an sRGB value (0..1) from which pixels weigh less.
 REWEIGHTING_ROUNDS, ROBUST_SCALE = 2, 0.02
 
@@ -52,7 +60,7 @@ REWEIGHTING_ROUNDS, ROBUST_SCALE = 2, 0.02
 @dataclass(frozen=True)
 class LightAdjustment:
     """Result of `search_light`: factors `intensity` (3,) and exponent `contrast` on the environment, `roughness_shift` of logit(roughness)
-    of dielectrics, and `improvement`, the relative decrease of the residual."""
+    of dielectrics, and `improvement`, the relative decrease of the residual, prior included."""
 
     intensity: Floats
     contrast: float
@@ -90,13 +98,17 @@ def adjust_radiance(radiance: NDArray[Any], intensity: NDArray[Any], contrast: f
 
 
 def search_light(
-    samples: Callable[[Floats, float], Sequence[PhotoSamples]], roughness: NDArray[np.float32], tint: bool = True, rough: bool = True
+    samples: Callable[[Floats, float], Sequence[PhotoSamples]],
+    roughness: NDArray[np.float32],
+    tint: bool = True,
+    rough: bool = True,
+    mean_base: float | None = None,
 ) -> LightAdjustment:
     """The intensity of each colour channel, the contrast and the roughness shift with the lowest residual.
 
     `samples` gives the pixels of all photos under the environment of an intensity (3,) and a contrast; `roughness` (n,) is that of the
     texels. Without `tint` the ratio of the channels is fixed. Without `rough` the roughness is fixed; with it, a second search starts at
-    `SECOND_START`.
+    `SECOND_START`. With `mean_base`, the geometric mean of present base colours (strongest channel), their prior counts as well.
     """
     residuals: dict[_Candidate, Floats] = {}
     lit: dict[tuple[float, ...], Sequence[PhotoSamples]] = {}
@@ -109,6 +121,10 @@ def search_light(
             residuals[candidate] = _residual(lit[light], shift_roughness(roughness, ROUGHNESS_STEP * candidate.roughness_steps))
         return residuals[candidate]
 
+    def cost(candidate: _Candidate) -> float:
+        prior = 0.0 if mean_base is None else 0.5 * (np.log(mean_base / candidate.brightness / TYPICAL_BASE_COLOUR) / SPREAD) ** 2
+        return float(residual(candidate).sum() * np.exp(prior / OBSERVATIONS))
+
     def descend(best: _Candidate) -> _Candidate:
         moved = True
         while moved:
@@ -116,7 +132,7 @@ def search_light(
             for direction in (direction for direction in DIRECTIONS if rough or not direction[2]):
                 bound = 1 - (MIN_ROUGHER_DECREASE if direction[2] else MIN_DECREASE)
                 tried = best.step(*direction)
-                while tried.within_limits and residual(tried).sum() < bound * residual(best).sum():
+                while tried.within_limits and cost(tried) < bound * cost(best):
                     best, tried, moved = tried, tried.step(*direction), True
         return best
 
@@ -124,10 +140,10 @@ def search_light(
     best = descend(start)
     if rough:
         second = descend(start.step(*SECOND_START))
-        best = second if residual(second).sum() < (1 - MIN_SECOND_DECREASE) * residual(best).sum() else best
+        best = second if cost(second) < (1 - MIN_SECOND_DECREASE) * cost(best) else best
     if tint:
         best = _tinted(best, residual)
-    improvement = float(1 - residual(best).sum() / max(float(residual(start).sum()), 1e-12))
+    improvement = 1 - cost(best) / max(cost(start), 1e-12)
     return LightAdjustment(best.intensity, CONTRAST_EXPONENT**best.contrast_steps, ROUGHNESS_STEP * best.roughness_steps, improvement)
 
 
@@ -143,6 +159,11 @@ class _Candidate:
     @property
     def intensity(self) -> Floats:
         return INTENSITY_FACTOR**self.intensity_steps * np.power(TINT_FACTOR, np.array(self.tint, np.float64))
+
+    @property
+    def brightness(self) -> float:
+        """Geometric mean of the channels' intensities."""
+        return float(np.exp(np.log(self.intensity).mean()))
 
     @property
     def within_limits(self) -> bool:

@@ -29,7 +29,7 @@ class FitSchedule:
 
     Metals are searched for at the shares `metal_searches_at` of all steps, but not on an object that is `diffuse`. Without `emission`
     nothing is emissive, without `intensity` the light's intensity is left to gradient steps, without `sparsity` the sparsity prior is off.
-    `rate` is a factor on all learning rates.
+    `rate` is a factor on all learning rates; with `fixed_light` the light is given.
     """
 
     iterations: int
@@ -40,6 +40,7 @@ class FitSchedule:
     sparsity: bool = True
     diffuse: bool = False
     rate: float = 1.0
+    fixed_light: bool = False
 
 
 @dataclass(frozen=True)
@@ -102,6 +103,8 @@ class FitOptions:
     metal_quantile: float = 0.5
     metal_base_color: float = 0.4
     max_metal_factor: float = 4.0
+    #: Added to base colours before logarithms are averaged: black places do not decide.
+    log_offset: float = 0.01
     #: Texels below this metallic take part as dielectric.
     max_dielectric_metallic: float = 0.3
     #: Searches that include the light's tint on a diffuse object: its reflections hardly determine the tint, which then drifts.

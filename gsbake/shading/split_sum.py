@@ -99,9 +99,8 @@ def mirror_reflection(
 
 
 def transmitted_share(normal: torch.Tensor, view: torch.Tensor, roughness: torch.Tensor) -> torch.Tensor:
-    """Share (n,) of diffuse reflection that a dielectric's specular layer lets through, 1 − (.04 A + B); constant for gradients."""
-    with torch.no_grad():
-        scale, bias = brdf.scale_and_bias(_soft_cosine((_unit(normal) * view).sum(dim=1)), roughness)
+    """Share (n,) of diffuse reflection that a dielectric's specular layer lets through, 1 − (.04 A + B)."""
+    scale, bias = brdf.scale_and_bias(_soft_cosine((_unit(normal) * view).sum(dim=1)), roughness)
     return 1.0 - 0.04 * scale - bias
 
 

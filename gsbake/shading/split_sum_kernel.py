@@ -190,7 +190,8 @@ def forward(
                 irradiance = _bilinear(table, base2, stride2, fx2, fy2, ch)
                 f0 = _F0 * (_1 - metal) + metal * albedo[i, ch]
                 light = lower + t * (upper - lower)
-                out[i, ch] = visibility_d[i] * (_1 - metal) * albedo[i, ch] * transmitted * irradiance + visibility_s[i] * light * (f0 * scale + bias)
+                diffuse = (_1 - metal) * albedo[i, ch] * transmitted * irradiance
+                out[i, ch] = visibility_d[i] * diffuse + visibility_s[i] * light * (f0 * scale + bias)
 
 
 @njit(parallel=True, **_FLAGS)

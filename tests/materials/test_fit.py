@@ -19,7 +19,8 @@ from gsbake.geometry.cameras import Camera
 from gsbake.geometry.raycast import RayCaster
 from gsbake.imaging.srgb import decode, encode
 from gsbake.materials.adjacency import neighbours
-from gsbake.materials.fit import FitSurface, MaterialFit
+from gsbake.materials.fit import MaterialFit
+from gsbake.materials.fit_surface import FitSurface
 from gsbake.materials.initialisation import trial_fits
 from gsbake.materials.levels import FitLevel, InterpolatedTransport, coarse_pixels, coarse_surface, coarse_texels
 from gsbake.materials.options import FitSchedule, Priors

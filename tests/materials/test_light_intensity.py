@@ -199,6 +199,6 @@ def test_second_search_finds_a_clearly_deeper_minimum(depth: float, there: bool)
 
 
 def test_misplaced_reflections_do_not_darken_the_light() -> None:
-    together, alone = Plastic(normal_error=6), Plastic(normal_error=6, single=True)
+    together, alone = Plastic(normal_error=8), Plastic(normal_error=8, single=True)
     assert together.search(TRUE).intensity.mean() > 0.9
     assert alone.search(TRUE).intensity.mean() < 0.9

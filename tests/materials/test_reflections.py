@@ -13,7 +13,8 @@ from gsbake.config.schema import Bake
 from gsbake.geometry.raycast import RayCaster
 from gsbake.imaging.srgb import encode
 from gsbake.materials.adjacency import neighbours
-from gsbake.materials.fit import FitSurface, MaterialFit
+from gsbake.materials.fit import MaterialFit
+from gsbake.materials.fit_surface import FitSurface
 from gsbake.materials.options import FitSchedule, Priors
 from gsbake.materials.pixels import PixelReader, Pixels
 from gsbake.materials.reflections import ReflectionTracer

@@ -50,7 +50,7 @@ def test_white_furnace() -> None:
 
 
 def test_sphere_against_the_rendering_equation() -> None:
-    """Monte Carlo of the whole BRDF (Lambert + GGX, Smith, Schlick), cosine-sampled, on the analytic light."""
+    """Monte Carlo of the whole BRDF (attenuated Lambert + GGX, Smith, Schlick), cosine-sampled, on the analytic light."""
     tables = EnvironmentLight.from_function(window, 32).prefilter()
     rng = np.random.default_rng(3)
     xy = rng.uniform(-0.85, 0.85, (400, 2))
@@ -72,7 +72,9 @@ def test_sphere_against_the_rendering_equation() -> None:
             visibility = 0.5 / (nl * math.sqrt(nv**2 * (1 - alpha**2) + alpha**2) + nv * np.sqrt(nl**2 * (1 - alpha**2) + alpha**2))
             f0 = 0.04 * (1 - metallic) + metallic * albedo
             fresnel = f0 + (1 - f0) * (1 - vh[:, None]) ** 5
-            brdf = (1 - metallic) * albedo / math.pi + fresnel * (density * visibility)[:, None]
+            lobe = density * visibility
+            transmitted = 1 - math.pi * ((0.04 + 0.96 * (1 - vh) ** 5) * lobe).mean()  # what the specular layer lets through
+            brdf = transmitted * (1 - metallic) * albedo / math.pi + fresnel * lobe[:, None]
             truth[i] = math.pi * (brdf * window(light)).mean(axis=0)
         flat = torch.ones(len(normal))
         got = shade(

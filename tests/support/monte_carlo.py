@@ -2,8 +2,8 @@
 
 It shares no code with `gsbake.shading`: the BRDF of glTF 2.0 (appendix B: Lambert, GGX with the height-correlated Smith term, Schlick's
 Fresnel) is sampled half by the cosine and half by GGX's half vectors, combined by the balance heuristic (Veach & Guibas, *Optimally
-combining sampling techniques*, SIGGRAPH 1995). Nothing is prefiltered, no sum is split. Diffuse reflection gets what the specular layer of a
-dielectric lets through, one minus its directional albedo (Kulla & Conty, *Revisiting physically based shading at Imageworks*, 2017).
+combining sampling techniques*, SIGGRAPH 1995). Nothing is prefiltered, no sum is split. Diffuse reflection gets what the specular layer of
+a dielectric lets through, one minus its directional albedo (Kulla & Conty, *Revisiting physically based shading at Imageworks*, 2017).
 """
 
 from __future__ import annotations

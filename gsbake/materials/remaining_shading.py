@@ -1,0 +1,112 @@
+"""Shading that a fit has left in base colours, found by comparing points of the surface, and moved to the light.
+
+Photos of a rough object under one light fit as well with shading in the base colours as in the light: for any irradiance E'(n), base
+colours times E / E' give the same diffuse colours. Most objects have few base colours, though, whatever their orientation. So the error of
+the light's irradiance, log E'(n)/E(n) = Σ_k e_k Y_k(n) in each channel with the eight spherical harmonics of orders 1 and 2 (Ramamoorthi
+& Hanrahan, JOSA A 2001), is where
+
+    Σ_ij w_ij |log b_i/b_j − Σ_k e_k (Y_k(n_i) − Y_k(n_j))| + ridge |e|²
+
+is least over pairs of points, half of them near each other and half anywhere on the object. Weights w_ij fall with the difference of
+chromaticity and of brightness that is left (Geman–McClure), so that pairs of different base colours do not take part (Retinex with
+chromaticity: Grosse et al., ICCV 2009; global sparsity of reflectance: Gehler et al., *Recovering intrinsic images with a global sparsity
+prior on reflectance*, NIPS 2011). Gauss-Newton with iteratively reweighted least squares.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from gsbake.materials.delighting import harmonics
+from gsbake.shading.cubemap import directions
+
+Doubles = NDArray[np.float64]
+
+#: Points that are compared, each with so many others anywhere, and with so many of the nearest within this share of the diagonal.
+POINTS, PARTNERS, NEIGHBOURS, NEIGHBOUR_RADIUS = 4000, 64, 48, 0.15
+#: Difference of log chromaticity from which two base colours are taken as different; the same of log brightness, anywhere and nearby.
+CHROMATICITY_SCALE, BRIGHTNESS_SCALE, NEARBY_BRIGHTNESS_SCALE = 0.06, 0.1, 0.2
+#: Added to linear base colours before the logarithm; differences of logarithms below the second are noise.
+LOG_OFFSET, NOISE_FLOOR = 0.004, 0.03
+#: Ridge weight of the coefficients, rounds of reweighting, and damping of a step.
+RIDGE, ROUNDS, DAMPING = 1e-3, 25, 0.7
+#: Points at which the irradiance of a changed light is matched, Gauss-Newton steps, their ridge weight and largest exponent.
+MATCHED_POINTS, MATCHING_STEPS, MATCHING_RIDGE, MAX_EXPONENT = 4000, 4, 1e-3, 1.0
+
+
+def remaining_shading(base_color: NDArray[Any], normal: NDArray[Any], position: NDArray[Any], generator: np.random.Generator) -> Doubles:
+    """Coefficients e (8, 3) of the log shading that is left in the linear base colours (n, 3) of points with unit normals (n, 3) and
+    positions (n, 3); zeros where there are fewer than two points."""
+    found = np.zeros((8, 3))
+    if len(base_color) < 2:
+        return found
+    chosen = generator.choice(len(base_color), min(POINTS, len(base_color)), replace=False)
+    logs = np.log(np.maximum(np.asarray(base_color[chosen], np.float64), 0) + LOG_OFFSET)
+    basis = harmonics(normal[chosen])
+    first, second, share, scale = _pairs(np.asarray(position[chosen], np.float64), generator)
+    slope, difference = basis[first] - basis[second], logs[first] - logs[second]
+    for _ in range(ROUNDS):
+        rest = difference - slope @ found
+        brightness = rest.mean(1)
+        chromaticity = np.linalg.norm(rest - brightness[:, None], axis=1)
+        similar = share * np.exp(-((chromaticity / CHROMATICITY_SCALE) ** 2)) / (1 + (brightness / scale) ** 2)
+        for channel in range(3):
+            weight = similar / np.maximum(np.abs(rest[:, channel]), NOISE_FLOOR)
+            ridge = RIDGE * max(float(weight.sum()), 1e-12)
+            normal_matrix = (slope * weight[:, None]).T @ slope + ridge * np.eye(8)
+            step = slope.T @ (weight * rest[:, channel]) - ridge * found[:, channel]
+            found[:, channel] += DAMPING * np.linalg.solve(normal_matrix, step)
+    return found
+
+
+def _pairs(position: Doubles, generator: np.random.Generator) -> tuple[NDArray[np.int64], NDArray[np.int64], Doubles, Doubles]:
+    """Indices (m,), (m,) of pairs of points at `position` (n, 3), the weight (m,) of each, and the scale (m,) of its brightness difference.
+
+    Nearby pairs weigh as much together as those anywhere.
+    """
+    count = len(position)
+    far = np.repeat(np.arange(count), PARTNERS), generator.integers(0, count, count * PARTNERS)
+    wanted, radius = min(NEIGHBOURS + 1, count), NEIGHBOUR_RADIUS * float(np.linalg.norm(np.ptp(position, axis=0)))
+    found = cKDTree(position).query(position, k=wanted, distance_upper_bound=radius)[1].astype(np.int64).ravel()
+    own = np.repeat(np.arange(count), wanted)
+    valid = (found < count) & (own < found)
+    near = own[valid], found[valid]
+    sizes = (len(far[0]), len(near[0]))
+    share = np.repeat([1 / max(1, n) for n in sizes], sizes)
+    scale = np.repeat([BRIGHTNESS_SCALE, NEARBY_BRIGHTNESS_SCALE], sizes)
+    return np.concatenate([far[0], near[0]]), np.concatenate([far[1], near[1]]), share, scale
+
+
+def with_irradiance_factor(
+    radiance: NDArray[Any], coefficients: Doubles, normal: NDArray[Any], irradiance: Callable[[NDArray[np.float32]], NDArray[Any]]
+) -> NDArray[np.float32]:
+    """The environment `radiance` (6, s, s, 3) changed smoothly so that its irradiance is multiplied by exp(Σ_k e_k Y_k(n)), with the mean
+    over the unit normals (n, 3) kept.
+
+    `irradiance` gives the irradiance (n, 3) at the normals under an environment. The radiance is multiplied by exp(Σ_k q_k Y_k(d)) of
+    orders 0 to 2, whose q are found by Gauss-Newton steps on the relative error of the irradiance.
+    """
+    shape = radiance.shape
+    target = np.exp(harmonics(normal) @ coefficients)
+    target = np.asarray(irradiance(np.asarray(radiance, np.float32)), np.float64) * target / target.mean(0)
+    light = np.asarray(radiance, np.float64).reshape(-1, 3)
+    around = directions(shape[1]).reshape(-1, 3)
+    basis = np.column_stack([np.ones(len(around)), harmonics(around)])
+    ridge = MATCHING_RIDGE * len(normal) * np.diag([0.0] + [1.0] * 8)
+
+    def lit(light: Doubles) -> Doubles:
+        return np.asarray(irradiance(light.reshape(shape).astype(np.float32)), np.float64) / np.maximum(target, 1e-12)
+
+    for _ in range(MATCHING_STEPS):
+        error = 1 - lit(light)
+        slopes = np.stack([lit(light * basis[:, k : k + 1]) for k in range(basis.shape[1])], 2)  # (n, 3, 9)
+        for channel in range(3):
+            slope = slopes[:, channel]
+            q = np.linalg.solve(slope.T @ slope + ridge, slope.T @ error[:, channel])
+            light[:, channel] *= np.exp(np.clip(basis @ q, -MAX_EXPONENT, MAX_EXPONENT))
+    return light.reshape(shape).astype(np.float32)
