@@ -52,7 +52,7 @@ MIN_DECREASE, MIN_ROUGHER_DECREASE, MIN_SECOND_DECREASE = 0.002, 0.01, 0.03
 #: Log-normal prior of the geometric mean of an object's base colours (strongest channel): median, and standard deviation of the logarithm.
 TYPICAL_BASE_COLOUR, SPREAD = 0.3, 0.66
 #: Number of independent residuals that evidence for the intensity counts as: errors of the model are shared by all pixels.
-OBSERVATIONS = 6.0
+OBSERVATIONS = 8.0
 #: Rounds of reweighting, and the residual of an sRGB value (0..1) from which pixels weigh less.
 REWEIGHTING_ROUNDS, ROBUST_SCALE = 2, 0.02
 

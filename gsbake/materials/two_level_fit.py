@@ -20,7 +20,7 @@ TRIAL_SHARE, COARSE_SHARE, FINE_SHARE = 0.25, 0.5, 0.25
 #: How often shading left in base colours is moved to the light at the end of the coarse level, and the steps after each, as a share of
 #: the iterations, in which texels adapt to it, with their factor on the learning rates. Gradient steps would move the light back: that
 #: base colours have no shading is not part of their loss.
-SHADING_ROUNDS, ADAPT_SHARE, ADAPT_RATE = 3, 0.075, 0.5
+SHADING_ROUNDS, ADAPT_SHARE, ADAPT_RATE = 4, 0.05, 0.5
 #: When metals are searched for on the fine level, as a share of its steps.
 FINE_METAL_SEARCHES_AT = (0.3,)
 
