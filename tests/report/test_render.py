@@ -106,7 +106,8 @@ def test_mirrored_tangent_frame() -> None:
         return Asset(plain.position, plain.normal, tangent, plain.uv, plain.faces, plain.base_color, plain.orm, plain.normal_map)
 
     got = diffuse(mirrored, LitShader(linear_light(0.5, (0, 0.3, 0))))
-    through = float(transmitted_share(torch.tensor([[0.0, 0.6, 0.8]]), torch.tensor([[0.0, 0.0, 1.0]]), torch.ones(1)))  # of the specular layer
+    tilted, view = torch.tensor([[0.0, 0.6, 0.8]]), torch.tensor([[0.0, 0.0, 1.0]])
+    through = float(transmitted_share(tilted, view, torch.ones(1)))
     np.testing.assert_allclose(got, 0.6 * (0.5 - 2 / 3 * 0.6 * 0.3) * through, rtol=0.02)
 
 
