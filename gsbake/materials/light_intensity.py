@@ -19,8 +19,10 @@ over blocks of a twelfth of the object: a sharp reflection that is misplaced by 
 regression dilution (Fuller, *Measurement Error Models*, 1987).
 
 On rough materials reflections hardly tell the intensity, and the residual is flat over a factor of three. There a prior decides: the
-mean base colours of objects are log-normal (`TYPICAL_BASE_COLOUR`, `SPREAD`), and the residuals count as `OBSERVATIONS` independent ones
-of a Laplace distribution, so −log p = OBSERVATIONS · log residual + ½ (log(mean / TYPICAL_BASE_COLOUR) / SPREAD)².
+logarithms of mean base colours of objects follow Student's t with two degrees of freedom (some objects are black), and the residuals count
+as `OBSERVATIONS` independent ones of a Laplace distribution, so with z = log(mean / TYPICAL_BASE_COLOUR) / SPREAD
+
+    −log p = OBSERVATIONS · log residual + 3/2 log(1 + z²/2)
 """
 
 from __future__ import annotations
@@ -49,10 +51,10 @@ TINT_FACTOR = 1.1
 LIMITS = (3.0, 2.0, 3.0)
 #: Relative decrease of the residual that a step must bring; a step with more roughness; the result of the second search.
 MIN_DECREASE, MIN_ROUGHER_DECREASE, MIN_SECOND_DECREASE = 0.002, 0.01, 0.03
-#: Log-normal prior of the geometric mean of an object's base colours (strongest channel): median, and standard deviation of the logarithm.
+#: Prior of the geometric mean of an object's base colours (strongest channel): median, and scale of the logarithm.
 TYPICAL_BASE_COLOUR, SPREAD = 0.3, 0.66
 #: Number of independent residuals that evidence for the intensity counts as: errors of the model are shared by all pixels.
-OBSERVATIONS = 8.0
+OBSERVATIONS = 5.0
 #: Rounds of reweighting, and the residual of an sRGB value (0..1) from which pixels weigh less.
 REWEIGHTING_ROUNDS, ROBUST_SCALE = 2, 0.02
 
@@ -122,8 +124,8 @@ def search_light(
         return residuals[candidate]
 
     def cost(candidate: _Candidate) -> float:
-        prior = 0.0 if mean_base is None else 0.5 * (np.log(mean_base / candidate.brightness / TYPICAL_BASE_COLOUR) / SPREAD) ** 2
-        return float(residual(candidate).sum() * np.exp(prior / OBSERVATIONS))
+        z = 0.0 if mean_base is None else float(np.log(mean_base / candidate.brightness / TYPICAL_BASE_COLOUR)) / SPREAD
+        return float(residual(candidate).sum() * (1 + z * z / 2) ** (1.5 / OBSERVATIONS))
 
     def descend(best: _Candidate) -> _Candidate:
         moved = True
