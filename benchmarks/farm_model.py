@@ -35,10 +35,11 @@ class StageCost:
 @dataclass(frozen=True)
 class Farm:
     """What the simulation assumes; times in seconds, rates in bytes per second.
- `start` is the time from a slot's allocation to the first stage, `submit` the coordinator's time per job, `plan` its time per capture
-before the first job, `look` the interval between its looks at the queue. Nodes fail every `node_hours` hours on average, are noticed after
-`notice` and back after `repair`; `interrupted` is the share of jobs that end with exit code 75. `spread` is the standard deviation of the
-logarithm of a capture's size, `noise` that of a stage's time.
+
+    `start` is the time from a slot's allocation to the first stage, `submit` the coordinator's time per job, `plan` its time per capture
+    before the first job, `look` the interval between its looks at the queue. Nodes fail every `node_hours` hours on average, are noticed
+    after `notice` and back after `repair`; `interrupted` is the share of jobs that end with exit code 75. `spread` is the standard
+    deviation of the logarithm of a capture's size, `noise` that of a stage's time.
     """
 
     nodes: int

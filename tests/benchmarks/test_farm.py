@@ -8,9 +8,10 @@ from dataclasses import asdict
 import pytest
 
 from benchmarks.farm import farm, run, table
-from benchmarks.farm_costs import Costs, Kind, read_costs
+from benchmarks.farm_costs import Costs, Kind, bytes_read, read_costs
 from benchmarks.farm_model import Farm, StageCost, simulate
 from gsbake.batch.jobs import group_stages
+from gsbake.stages import REGISTRY
 
 CHAIN = [StageCost("a", 30.0, 0.0, 0.0), StageCost("b", 70.0, 0.0, 0.0)]
 
@@ -80,3 +81,12 @@ def test_tables_from_a_file_of_costs(tmp_path) -> None:  # type: ignore[no-untyp
     assert read == costs
     row = run("size", 20, farm(read, 2), 60.0, read, 2)
     assert 0.5 < row.efficiency < 1 and "| 20 | 2 | 60 s | 10 |" in table([row])
+
+
+def test_bytes_that_a_stage_reads() -> None:
+    sizes = {name: 10.0**k for k, name in enumerate(REGISTRY.names)}
+    for stage in REGISTRY.up_to():
+        needed = [name for name in REGISTRY.names if name in stage.needs]
+        found = bytes_read(stage.name, sizes, dict.fromkeys(stage.sources, 0.5))
+        assert found == sum(sizes[name] for name in needed) + 0.5 * len(stage.sources)
+    assert bytes_read("ingest", sizes, {"photos": 7.0}) >= 7.0
