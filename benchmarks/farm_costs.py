@@ -30,6 +30,7 @@ from benchmarks.timeline import BUILT_IN, ROOT
 from gsbake.api import RunOptions, open_session
 from gsbake.batch import workflow
 from gsbake.batch.captures import BatchOptions, plan_captures
+from gsbake.batch.jobs import LEVELS
 from gsbake.capture.sources import PHOTO_FOLDERS
 from gsbake.pipeline.store import Artifact
 from gsbake.python_process import python_command, python_environment
@@ -107,10 +108,27 @@ def snakemake_cpu(count: int, folder: Path) -> float:
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
     jobs = [
-        {"id": f"j{n}", "needs": [f"j{n - 1}"] if n % 3 else [], "threads": 1, "memory_mb": 1, "minutes": 1, "shell": ":"}
+        {
+            "id": f"j{n}",
+            "needs": [f"j{n - 1}"] if n % 3 else [],
+            "threads": 1,
+            "memory_mb": 1,
+            "minutes": 1,
+            "shell": ":",
+            "level": n % LEVELS,
+        }
         for n in range(count)
     ]
-    body = {"jobs": jobs, "grow": False, "most_memory_mb": 1000, "nodes": 1, "records": str(folder), "resources": {}}
+    body = {
+        "jobs": jobs,
+        "grow": False,
+        "most_memory_mb": 1000,
+        "nodes": 1,
+        "records": str(folder),
+        "resources": {},
+        "levels": LEVELS,
+        "nice": 1,
+    }
     (folder / "jobs.json").write_text(json.dumps(body))
     command = python_command(
         "-m", "snakemake", "--snakefile", str(Path(workflow.__file__).with_name("workflow.smk")), "--directory", str(folder),
