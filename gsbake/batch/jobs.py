@@ -19,7 +19,7 @@ PACK_SECONDS = 120.0
 #: A job's time limit is this many times the expected time, and at least the minutes below.
 _LIMIT_FACTOR, _LEAST_MINUTES = 3.0, 10
 #: Classes of jobs by what is expected to be left of their captures; the longest start first.
-LEVELS = 16
+LEVELS = 64
 
 
 @dataclass(frozen=True)

@@ -44,8 +44,6 @@ _POLL, _SLURM_POLL, _QUEUE_POLL = 0.2, 1.0, 5.0
 _STOP_TIMEOUT, _IDLE_TIMEOUT = 45.0, 5.0
 #: Seconds without a job in Slurm's queue after which a waiting Snakemake has lost sight of something.
 STALL_TIMEOUT = 60.0
-#: `sbatch --nice` of a level: where Slurm orders jobs by their number alone, more than the jobs that are in its queue at a time.
-_NICE = 200
 
 
 @dataclass(frozen=True)
@@ -210,7 +208,7 @@ def _prepare(jobs: Sequence[Job], options: BatchOptions, execution: Execution, w
         "root": str(options.root), "profile": options.profile, "overrides": list(options.overrides), "seed": options.seed,
         "store": options.store, "stages": api.REGISTRY.references, "grow": cluster is not None, "most_memory_mb": memory, "nodes": nodes,
         "records": str(options.root / FOLDER / "records"), "resources": chosen, "levels": LEVELS,
-        "nice": _NICE, "jobs": rows,
+        "nice": 0 if cluster is None else cluster.nice, "jobs": rows,
     }  # fmt: skip
     write_atomic(path, json.dumps(document))
     return [
