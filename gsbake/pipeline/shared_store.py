@@ -245,9 +245,7 @@ class SharedStore:
         """Most bytes that the store may hold; None without a limit."""
         try:
             found = json.loads(self._patiently(lambda: self._fs.cat_file(f"{self._root}/{_SETTINGS}")))["quota_bytes"]
-        except FileNotFoundError:
-            return None
-        except (ValueError, KeyError, TypeError):
+        except (FileNotFoundError, ValueError, KeyError, TypeError):
             return None
         return int(found) if isinstance(found, int) else None
 
