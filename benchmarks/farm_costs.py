@@ -18,7 +18,7 @@ import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -30,6 +30,7 @@ from benchmarks.timeline import BUILT_IN, ROOT
 from gsbake.api import RunOptions, open_session
 from gsbake.batch import workflow
 from gsbake.batch.captures import BatchOptions, plan_captures
+from gsbake.batch.jobs import LEVELS
 from gsbake.capture.sources import PHOTO_FOLDERS
 from gsbake.pipeline.store import Artifact
 from gsbake.python_process import python_command, python_environment
@@ -83,15 +84,19 @@ def measure_kind(folder: Path, profile: str, out: Path) -> Kind:
     }
     stages = tuple(
         StageCost(
-            state.name, round(clock.total([state]), 2),
-            sum(sizes[need] for need in REGISTRY[state.name].needs) + sum(source_bytes.get(s, 0.0) for s in REGISTRY[state.name].sources),
-            sizes[state.name],
+            state.name, round(clock.total([state]), 2), bytes_read(state.name, sizes, source_bytes), sizes[state.name]
         )
         for state in states
     )  # fmt: skip
     peaks = tuple(round(state.artifact.manifest["peak_bytes"] / 1e6, 1) for state in states if state.artifact is not None)
     name = folder.parent.name if folder.name in PHOTO_FOLDERS else folder.name
     return Kind(name, profile, len(names.get("photos", ())), int(source_bytes["photos"]), stages, peaks)
+
+
+def bytes_read(stage: str, artifacts: Mapping[str, float], sources: Mapping[str, float]) -> float:
+    """Bytes that a stage reads: the artifacts of the stages that it needs, and its sources."""
+    declared = REGISTRY.load(stage)
+    return sum(artifacts[need] for need in declared.needs) + sum(sources.get(name, 0.0) for name in declared.sources)
 
 
 def _size(artifact: Artifact) -> float:
@@ -103,10 +108,27 @@ def snakemake_cpu(count: int, folder: Path) -> float:
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
     jobs = [
-        {"id": f"j{n}", "needs": [f"j{n - 1}"] if n % 3 else [], "threads": 1, "memory_mb": 1, "minutes": 1, "shell": ":"}
+        {
+            "id": f"j{n}",
+            "needs": [f"j{n - 1}"] if n % 3 else [],
+            "threads": 1,
+            "memory_mb": 1,
+            "minutes": 1,
+            "shell": ":",
+            "level": n % LEVELS,
+        }
         for n in range(count)
     ]
-    body = {"jobs": jobs, "grow": False, "most_memory_mb": 1000, "nodes": 1, "records": str(folder), "resources": {}}
+    body = {
+        "jobs": jobs,
+        "grow": False,
+        "most_memory_mb": 1000,
+        "nodes": 1,
+        "records": str(folder),
+        "resources": {},
+        "levels": LEVELS,
+        "nice": 1,
+    }
     (folder / "jobs.json").write_text(json.dumps(body))
     command = python_command(
         "-m", "snakemake", "--snakefile", str(Path(workflow.__file__).with_name("workflow.smk")), "--directory", str(folder),

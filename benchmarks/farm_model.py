@@ -1,10 +1,10 @@
 """Discrete-event simulation of a batch on a farm: nodes with slots, one coordinator, one shared store, failures.
 
 A capture is a chain of jobs, a job some stages in order. A job waits for the coordinator (which submits one job after another) and for a
-free slot (first come, first served), starts, and for each stage reads its inputs from the store, computes, and writes its output there.
-Transfers share the store's bandwidth equally, each up to the share of its slot in the node's network. When a node fails, the stage in
-progress of each of its jobs is lost and what was stored stays; the jobs go to the end of the queue once the loss was noticed. The
-coordinator notices the end of a job at its next look.
+free slot (first the job with most expected seconds to the end of its capture, in the classes of `gsbake.batch.jobs.start_levels`), starts,
+and for each stage reads its inputs from the store, computes, and writes its output there. Transfers share the store's bandwidth equally,
+each up to the share of its slot in the node's network. When a node fails, the stage in progress of each of its jobs is lost and what was
+stored stays; the jobs go back into the queue once the loss was noticed. The coordinator notices the end of a job at its next look.
 
 The clock of equal shares is that of processor-sharing queues: a virtual time that runs at the common rate, at which each transfer ends
 after its own number of bytes (Kleinrock, Queueing Systems II, 1976, section 4.4).
@@ -19,7 +19,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from gsbake.batch.jobs import group_stages
+from gsbake.batch.jobs import LEVELS, group_stages
 
 
 @dataclass(frozen=True)
@@ -35,10 +35,12 @@ class StageCost:
 @dataclass(frozen=True)
 class Farm:
     """What the simulation assumes; times in seconds, rates in bytes per second.
- `start` is the time from a slot's allocation to the first stage, `submit` the coordinator's time per job, `plan` its time per capture
-before the first job, `look` the interval between its looks at the queue. Nodes fail every `node_hours` hours on average, are noticed after
-`notice` and back after `repair`; `interrupted` is the share of jobs that end with exit code 75. `spread` is the standard deviation of the
-logarithm of a capture's size, `noise` that of a stage's time.
+
+    `start` is the time from a slot's allocation to the first stage, `submit` the coordinator's time per job, `plan` its time per capture
+    before the first job, `look` the interval between its looks at the queue. Nodes fail every `node_hours` hours on average, are noticed
+    after `notice` and back after `repair`; `interrupted` is the share of jobs that end with exit code 75. `spread` is the standard
+    deviation of the logarithm of a capture's size, `noise` that of a stage's time, `misjudged` that of a capture's expected time over its
+    true one.
     """
 
     nodes: int
@@ -55,6 +57,7 @@ logarithm of a capture's size, `noise` that of a stage's time.
     interrupted: float = 0.0
     spread: float = 0.0
     noise: float = 0.0
+    misjudged: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -77,7 +80,8 @@ class Result:
 
 @dataclass
 class _Job:
-    """A job: capture, number within it, remaining stages with their own seconds and bytes, and where it runs."""
+    """A job: capture, number within it, remaining stages with their own seconds and bytes, where it runs, the expected seconds to the end
+    of its capture, and their class."""
 
     capture: int
     number: int
@@ -86,6 +90,8 @@ class _Job:
     node: int = -1
     phase_start: float = 0.0
     phases: deque[tuple[str, float]] = field(default_factory=deque)
+    left: float = 0.0
+    level: int = 0
 
 
 class _Store:
@@ -139,7 +145,7 @@ class _Store:
 
 
 def simulate(
-    captures: int, kinds: Sequence[Sequence[StageCost]], farm: Farm, pack_seconds: float, seed: int = 0, *, longest_first: bool = False
+    captures: int, kinds: Sequence[Sequence[StageCost]], farm: Farm, pack_seconds: float, seed: int = 0, *, longest_first: bool = True
 ) -> Result:
     """Bake captures, whose kinds alternate, with jobs of at least `pack_seconds` expected seconds."""
     return _Simulation(captures, kinds, farm, pack_seconds, seed, longest_first).run()
@@ -160,16 +166,24 @@ class _Simulation:
             stages = kinds[capture % len(kinds)]
             size = float(np.exp(farm.spread * self._rng.standard_normal() - farm.spread**2 / 2))
             seconds = [s.seconds * size * float(np.exp(farm.noise * self._rng.standard_normal() - farm.noise**2 / 2)) for s in stages]
-            groups = group_stages([s.seconds * size for s in stages], pack_seconds)
+            believed = size * float(np.exp(farm.misjudged * self._rng.standard_normal()))
+            expected = [s.seconds * believed for s in stages]
+            groups = group_stages(expected, pack_seconds)
             work = [(seconds[k], stages[k].read_bytes * size, stages[k].written_bytes * size) for k in range(len(stages))]
-            self._chains.append([_Job(capture, n, deque(work[k] for k in group)) for n, group in enumerate(groups)])
+            self._chains.append(
+                [_Job(capture, n, deque(work[k] for k in group), left=sum(expected[group.start :])) for n, group in enumerate(groups)]
+            )
         if longest_first:
-            self._chains.sort(key=lambda chain: -sum(seconds for job in chain for seconds, _, _ in job.stages))
+            jobs = sorted((job for chain in self._chains for job in chain), key=lambda job: -job.left)
+            for rank, job in enumerate(jobs):
+                job.level = rank * LEVELS // len(jobs)
+            self._chains.sort(key=lambda chain: chain[0].level)
         self._chain_of = {chain[0].capture: chain for chain in self._chains}
         self._jobs = sum(map(len, self._chains))
         self._left = captures
         self._end = 0.0
-        self._queue: deque[_Job] = deque()
+        self._queue: list[tuple[int, int, _Job]] = []
+        self._queued = 0
         self._free = deque(node for _ in range(farm.slots) for node in range(farm.nodes))
         self._down = [False] * farm.nodes
         self._running: list[list[_Job]] = [[] for _ in range(farm.nodes)]
@@ -205,7 +219,8 @@ class _Simulation:
         self._at(self._coordinator_free, lambda time: self._enqueue(time, job))
 
     def _enqueue(self, now: float, job: _Job) -> None:
-        self._queue.append(job)
+        self._queued += 1
+        heapq.heappush(self._queue, (job.level, self._queued, job))
         self._allocate(now)
 
     def _allocate(self, now: float) -> None:
@@ -213,7 +228,7 @@ class _Simulation:
             node = self._free.popleft()
             if self._down[node]:
                 continue  # it comes back with all its slots
-            job = self._queue.popleft()
+            job = heapq.heappop(self._queue)[2]
             job.node = node
             self._running[node].append(job)
             job.phases = deque([("start", self._farm.start)])

@@ -18,6 +18,8 @@ from gsbake.errors import UsageError
 _ANSWER_TIMEOUT, _CANCEL_TIMEOUT = 60.0, 60.0
 #: Seconds from a job's submission to the first look at its state; Snakemake doubles the pause and more while nothing ends.
 FIRST_LOOK = 10
+#: More than the jobs that a batch usually has in the queue at a time.
+_BASIC_NICE = 200
 
 
 @dataclass(frozen=True)
@@ -30,13 +32,14 @@ class SlurmOptions:
 
 @dataclass(frozen=True)
 class Cluster:
-    """What is asked once: the command that knows the states of ended jobs, the number of nodes, the memory of the largest in MB, and all
-    their cores."""
+    """What is asked once: the command that knows the states of ended jobs, the number of nodes, the memory of the largest in MB, all
+    their cores, and the `sbatch --nice` by which a job stands behind those of the level before it."""
 
     status_command: str
     nodes: int
     largest_mb: int
     cores: int
+    nice: int = 1
 
 
 def ask_cluster(options: SlurmOptions) -> Cluster:
@@ -56,7 +59,10 @@ def ask_cluster(options: SlurmOptions) -> Cluster:
     # Without accounting, sacct only fails, and Snakemake would wait for ever.
     accounted = re.search(r"^AccountingStorageType\s*=\s*(?!accounting_storage/none|\(null\))\S", config, re.MULTILINE)
     status_command = "sacct" if accounted and shutil.which("sacct") else "squeue"
-    return Cluster(status_command, len(nodes), max(mb for mb, _ in nodes.values()), sum(cores for _, cores in nodes.values()))
+    # priority/basic lowers the priority by 1 with each job submitted; elsewhere jobs of a user start as equals.
+    nice = _BASIC_NICE if re.search(r"^PriorityType\s*=\s*priority/basic", config, re.MULTILINE) else 1
+    memory, cores = zip(*nodes.values(), strict=True)
+    return Cluster(status_command, len(nodes), max(memory), sum(cores), nice)
 
 
 def job_prefix(root: Path) -> str:

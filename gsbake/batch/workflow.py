@@ -27,7 +27,7 @@ from gsbake import api
 from gsbake.atomic import write_atomic
 from gsbake.batch import slurm
 from gsbake.batch.captures import BatchOptions
-from gsbake.batch.jobs import Job
+from gsbake.batch.jobs import LEVELS, Job, start_levels
 from gsbake.batch.records import FOLDER, Record, RecordReader
 from gsbake.errors import UsageError
 from gsbake.pipeline.supervise import StopSignals
@@ -194,10 +194,12 @@ def _prepare(jobs: Sequence[Job], options: BatchOptions, execution: Execution, w
         choice = {"slurm_partition": execution.slurm.partition, "slurm_account": execution.slurm.account}
         chosen = {name: value for name, value in choice.items() if value is not None}
         extra = ["--jobs", str(execution.workers), "--latency-wait", "60", *slurm.snakemake_arguments(cluster, prefix)]
+    levels = start_levels(jobs)
     rows = [
         {
             "id": job.id, "photos": job.photos, "out": job.out, "capture": job.capture, "stages": job.stages, "needs": job.needs,
             "threads": job.threads, "memory_mb": min(job.memory_mb, memory), "minutes": job.minutes,
+            "level": levels[job.id],
             "shell": shlex.join(python_command("-m", "gsbake.batch.job", str(path), job.id)),
         }
         for job in jobs
@@ -205,7 +207,8 @@ def _prepare(jobs: Sequence[Job], options: BatchOptions, execution: Execution, w
     document = {
         "root": str(options.root), "profile": options.profile, "overrides": list(options.overrides), "seed": options.seed,
         "store": options.store, "stages": api.REGISTRY.references, "grow": cluster is not None, "most_memory_mb": memory, "nodes": nodes,
-        "records": str(options.root / FOLDER / "records"), "resources": chosen, "jobs": rows,
+        "records": str(options.root / FOLDER / "records"), "resources": chosen, "levels": LEVELS,
+        "nice": 0 if cluster is None else cluster.nice, "jobs": rows,
     }  # fmt: skip
     write_atomic(path, json.dumps(document))
     return [

@@ -1,5 +1,6 @@
-# Workflow of `gsbake batch`: one rule, whose wildcard is a job of the file that the coordinator wrote (gsbake/batch/workflow.py): some
-# stages of a capture. Rules of their own for all jobs would take a time that grows with the square of their number.
+# Workflow of `gsbake batch`: one rule for each level of priority, whose wildcard is a job of the file that the coordinator wrote
+# (gsbake/batch/workflow.py): some stages of a capture. Rules of their own for all jobs would take a time that grows with the square of
+# their number. Priority is that of a rule; Snakemake starts a job of a lower level first.
 # The marker of a finished job only orders the jobs of this run; whether a stage is done is what gsbake's store says.
 import json
 from pathlib import Path
@@ -16,27 +17,36 @@ def memory_mb(wildcards, attempt):
 
 
 def slurm_options(wildcards, attempt):
-    """Keeps a job away from nodes on which it was interrupted: one with a full disk would take, and fail, every job of the batch."""
+    """The order of the batch's jobs in Slurm's queue, and the nodes on which this one was interrupted: a node with a full disk would take,
+    and fail, every job of the batch."""
+    nice = f"--nice={BATCH['nice'] * JOBS[wildcards.job]['level']}"
     try:
         failed = json.loads((Path(BATCH["records"]) / f"{wildcards.job}.json").read_text(encoding="utf-8"))["failed_on"]
     except (OSError, ValueError, KeyError):
-        return ""
-    return f"--exclude={','.join(failed)}" if failed and len(failed) < BATCH["nodes"] else ""
+        return nice
+    return f"{nice} --exclude={','.join(failed)}" if failed and len(failed) < BATCH["nodes"] else nice
+
+
+def marker(name):
+    return f"{name}.{JOBS[name]['level']}.done"
 
 
 rule all:
-    input: [f"{name}.done" for name in JOBS]
+    input: [marker(name) for name in JOBS]
 
 
-rule stages:
-    input: lambda wildcards: [f"{need}.done" for need in JOBS[wildcards.job]["needs"]]
-    output: touch("{job}.done")
-    wildcard_constraints: job="[A-Za-z0-9_]+"
-    threads: lambda wildcards: JOBS[wildcards.job]["threads"]
-    resources:
-        mem_mb=memory_mb,
-        runtime=lambda wildcards, attempt: JOBS[wildcards.job]["minutes"] * attempt,
-        slurm_extra=slurm_options,
-        **BATCH["resources"],
-    params: command=lambda wildcards: JOBS[wildcards.job]["shell"]
-    shell: "{params.command}"
+for LEVEL in sorted({job["level"] for job in JOBS.values()}):
+    rule:
+        name: f"level_{LEVEL}"
+        input: lambda wildcards: [marker(need) for need in JOBS[wildcards.job]["needs"]]
+        output: touch(f"{{job}}.{LEVEL}.done")
+        wildcard_constraints: job="[A-Za-z0-9_]+"
+        priority: BATCH["levels"] - LEVEL
+        threads: lambda wildcards: JOBS[wildcards.job]["threads"]
+        resources:
+            mem_mb=memory_mb,
+            runtime=lambda wildcards, attempt: JOBS[wildcards.job]["minutes"] * attempt,
+            slurm_extra=slurm_options,
+            **BATCH["resources"],
+        params: command=lambda wildcards: JOBS[wildcards.job]["shell"]
+        shell: "{params.command}"

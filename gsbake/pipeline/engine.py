@@ -198,7 +198,10 @@ class Engine:
         if self.shared is None or state.artifact is None or state.cache_key is None:
             return None
         try:
+            damaged = len(self.shared.damaged)
             refused = self.shared.put(state.artifact, stop.check)
+            for name in self.shared.damaged[damaged:]:
+                self._warn_of_store(stage.name, f"{name} was damaged and replaced.")
             if refused == "full":
                 self._warn_of_store(stage.name, "it is full; the output stays on this machine. `gsbake cache gc --store` makes room.")
             theirs = None if refused else self.shared.digest_of(state.cache_key, stop.check)

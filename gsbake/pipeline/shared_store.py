@@ -13,6 +13,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
+import tempfile
 import time
 import uuid
 from collections.abc import Callable, Iterable, Mapping
@@ -151,7 +152,7 @@ class SharedStore:
                 return "full"
             for digest, (path, size) in files.items():
                 check()
-                if not self._exists(self._blob_path(digest), size, check):
+                if not self._has_blob(digest, size, check):
                     self._write(path, self._blob_path(digest), check)
             self._write(artifact.folder / MANIFEST, entry, check, exclusive=True)
         except PermissionError:
@@ -244,9 +245,7 @@ class SharedStore:
         """Most bytes that the store may hold; None without a limit."""
         try:
             found = json.loads(self._patiently(lambda: self._fs.cat_file(f"{self._root}/{_SETTINGS}")))["quota_bytes"]
-        except FileNotFoundError:
-            return None
-        except (ValueError, KeyError, TypeError):
+        except (FileNotFoundError, ValueError, KeyError, TypeError):
             return None
         return int(found) if isinstance(found, int) else None
 
@@ -286,6 +285,11 @@ class SharedStore:
             return True
         self._discard(path)
         return False
+
+    def _has_blob(self, digest: str, size: int, check: Callable[[], None]) -> bool:
+        """Whether a blob is there and intact; read, because an artifact may come again for other damage, and few blobs are there before."""
+        with tempfile.TemporaryDirectory() as folder:
+            return self._exists(self._blob_path(digest), size, check) and self._read_blob(digest, size, Path(folder) / "blob", check)
 
     def _discard(self, path: str) -> None:
         """Delete a damaged blob or entry. Where that is refused, the damage stays and is found again."""

@@ -18,7 +18,7 @@ from gsbake.errors import UsageError
 from tests.cli.conftest import Run
 
 Fake = Callable[..., None]
-CONFIG = "Configuration data as of now\nAccountingStorageType = {}\nMinJobAge = 300 sec\n"
+CONFIG = "Configuration data as of now\nAccountingStorageType = {}\nMinJobAge = 300 sec\nPriorityType = {}\n"
 
 
 @pytest.fixture
@@ -36,13 +36,16 @@ def fake(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Fake:
     return write
 
 
-@pytest.mark.parametrize(("storage", "command"), [("accounting_storage/none", "squeue"), ("accounting_storage/slurmdbd", "sacct")])
-def test_a_cluster(fake: Fake, storage: str, command: str) -> None:
+@pytest.mark.parametrize(
+    ("storage", "priority", "command", "nice"),
+    [("accounting_storage/none", "priority/basic", "squeue", 200), ("accounting_storage/slurmdbd", "priority/multifactor", "sacct", 1)],
+)
+def test_a_cluster(fake: Fake, storage: str, priority: str, command: str, nice: int) -> None:
     for name in ("sbatch", "sacct"):
         fake(name)
-    fake("scontrol", CONFIG.format(storage))
+    fake("scontrol", CONFIG.format(storage, priority))
     fake("sinfo", "n1 6000 4\nn2 24000+ 16\nn2 24000+ 16\n")  # a node of two partitions is listed twice
-    assert slurm.ask_cluster(SlurmOptions()) == Cluster(command, 2, 24000, 20)
+    assert slurm.ask_cluster(SlurmOptions()) == Cluster(command, 2, 24000, 20, nice)
 
 
 def test_a_cluster_that_cannot_be_used(fake: Fake) -> None:
@@ -51,7 +54,7 @@ def test_a_cluster_that_cannot_be_used(fake: Fake) -> None:
     fake("sinfo", "")
     with pytest.raises(UsageError, match="does not answer"):
         slurm.ask_cluster(SlurmOptions())
-    fake("scontrol", CONFIG.format("(null)"))
+    fake("scontrol", CONFIG.format("(null)", "priority/basic"))
     with pytest.raises(UsageError, match="no nodes in the partition night"):
         slurm.ask_cluster(SlurmOptions(partition="night"))
 
@@ -91,11 +94,11 @@ def test_the_document_of_the_jobs(run: Run, tmp_path: Path, monkeypatch: pytest.
     from gsbake.batch.captures import BatchOptions
 
     job = Job("c0_x", "x", "/p", "/o", ("mesh",), (), (), 1, 9000, 60.0, 10)
-    cluster = Cluster("squeue", 2, 6000, 8)
+    cluster = Cluster("squeue", 2, 6000, 8, 200)
     execution = Execution(8, cluster, SlurmOptions("night", "studio"), 32)
     arguments = workflow._prepare([job], BatchOptions(tmp_path, "smoke"), execution, tmp_path, "gsbake-1")
     document = json.loads((tmp_path / "jobs.json").read_text())
-    assert document["jobs"][0]["memory_mb"] == 6000 and document["nodes"] == 2
+    assert document["jobs"][0]["memory_mb"] == 6000 and document["nodes"] == 2 and document["nice"] == 200
     assert document["resources"] == {"slurm_partition": "night", "slurm_account": "studio"}
     assert arguments[arguments.index("--jobs") + 1] == "32" and "--slurm-requeue" in arguments
 

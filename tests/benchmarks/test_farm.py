@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import json
 from dataclasses import asdict
+from statistics import mean
 
 import pytest
 
 from benchmarks.farm import farm, run, table
-from benchmarks.farm_costs import Costs, Kind, read_costs
+from benchmarks.farm_costs import Costs, Kind, bytes_read, read_costs
 from benchmarks.farm_model import Farm, StageCost, simulate
 from gsbake.batch.jobs import group_stages
+from gsbake.stages import REGISTRY
 
 CHAIN = [StageCost("a", 30.0, 0.0, 0.0), StageCost("b", 70.0, 0.0, 0.0)]
 
@@ -79,4 +81,25 @@ def test_tables_from_a_file_of_costs(tmp_path) -> None:  # type: ignore[no-untyp
     read = read_costs(tmp_path / "costs.json")
     assert read == costs
     row = run("size", 20, farm(read, 2), 60.0, read, 2)
-    assert 0.5 < row.efficiency < 1 and "| 20 | 2 | 60 s | 10 |" in table([row])
+    assert 0.5 < row.efficiency < 1 and "| 20 | 2 | 60 s | longest first | 10 |" in table([row])
+
+
+def test_bytes_that_a_stage_reads() -> None:
+    sizes = {name: 10.0**k for k, name in enumerate(REGISTRY.names)}
+    for stage in REGISTRY.up_to():
+        needed = [name for name in REGISTRY.names if name in stage.needs]
+        found = bytes_read(stage.name, sizes, dict.fromkeys(stage.sources, 0.5))
+        assert found == sum(sizes[name] for name in needed) + 0.5 * len(stage.sources)
+    assert bytes_read("ingest", sizes, {"photos": 7.0}) >= 7.0
+
+
+def test_the_longest_start_first() -> None:
+    """Seven jobs on three slots: longest first takes 11/9 of the shortest time, its worst case for three (Graham 1969, theorem 3)."""
+    kinds = [[StageCost("a", seconds, 0.0, 0.0)] for seconds in (300.0, 400.0, 300.0, 500.0, 400.0, 300.0, 500.0)]
+    assert simulate(7, kinds, Farm(nodes=3, slots=1), 0.0).makespan == pytest.approx(1100.0)
+    assert simulate(7, kinds, Farm(nodes=3, slots=1), 0.0, longest_first=False).makespan == pytest.approx(1200.0)
+    known, guessed = Farm(nodes=5, spread=0.5), Farm(nodes=5, spread=0.5, misjudged=2.0)
+    assert (
+        mean(simulate(50, [CHAIN], guessed, 0.0, seed).makespan / simulate(50, [CHAIN], known, 0.0, seed).makespan for seed in range(9))
+        > 1.02
+    )

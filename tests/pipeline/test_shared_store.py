@@ -144,6 +144,30 @@ def test_fifty_corruptions_are_found_and_replaced(tmp_path: Path) -> None:
     assert seen >= names and not store(str(shared)).verify(tmp_path).damaged
 
 
+@pytest.mark.parametrize("entry_too", [False, True])
+def test_all_damage_of_an_artifact_is_replaced_at_once(url: str, tmp_path: Path, entry_too: bool) -> None:
+    """Also where its size is right, and nothing has read the file."""
+    key, local = CacheKey("sum", 1, {}, {"words": "w"}), Store(tmp_path / "out")
+    temporary = local.temporary("sum", key.digest)
+    for name in "abc":
+        (temporary / name).write_text(f"the words of {name}")
+    made = local.publish(temporary, local.folder("sum", key.digest), {"stage": "sum", "key": key.digest, "settings": {}})
+    assert store(url).put(made) is None
+    damaged = store(url)
+    for name in "abc":
+        damaged._fs.pipe_file(damaged._blob_path(made.files[name]), f"the wards of {name}".encode())
+    if entry_too:
+        damaged._fs.pipe_file(damaged._entry_path("sum", key.digest), b"{")
+    reader = store(url)
+    (tmp_path / "one").mkdir()
+    assert reader.fetch(key, tmp_path / "one") is None and reader.put(made) is None
+    assert len(reader.damaged) == 4
+    (tmp_path / "two").mkdir()
+    assert store(url).fetch(key, tmp_path / "two") is not None
+    (tmp_path / "scratch").mkdir()
+    assert not store(url).verify(tmp_path / "scratch").damaged
+
+
 def test_a_run_computes_damaged_stages_again(photos: Path, tmp_path: Path) -> None:
     shared = tmp_path / "shared"
     bake(tmp_path / "one", photos, str(shared))

@@ -73,7 +73,7 @@ def test_a_node_has_a_full_disk(cluster: Cluster, captures: list[Path], plain: P
     batch.finish()
     batch.check(plain)
     log = (root / ".batch" / "snakemake.log").read_text()
-    assert "slurm_extra=--exclude=node2" in log and "--exclude=node1" not in log
+    assert "--exclude=node2" in log and "--exclude=node1" not in log
 
 
 @pytest.fixture
