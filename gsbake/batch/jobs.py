@@ -79,8 +79,8 @@ def make_jobs(
 def start_levels(jobs: Sequence[Job]) -> dict[str, int]:
     """{job: level}, 0 for what starts first: the jobs with most expected seconds to the end of their capture, in classes of equal size.
 
-    Longest first keeps the workers busy to the end: a long capture that starts last would be waited for alone (Graham, Bounds on
-    multiprocessing timing anomalies, 1969, section 5).
+    Longest first keeps the workers busy to the end: a long capture that starts last would be waited for alone (Graham, *Bounds on
+    Multiprocessing Timing Anomalies*, 1969, section 5).
     """
     left: dict[str, float] = {}  # of the job and all that need it
     after: dict[str, float] = {}

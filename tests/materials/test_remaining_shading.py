@@ -20,7 +20,7 @@ def ball(count: int = 3000) -> NDArray[np.float64]:
     return np.asarray(normal / np.linalg.norm(normal, axis=1, keepdims=True))
 
 
-def painted(normal: NDArray[np.float64]) -> NDArray[np.float64]:
+def two_colours(normal: NDArray[np.float64]) -> NDArray[np.float64]:
     """Two base colours in stripes that do not follow the normal."""
     stripe = np.sin(9 * np.arctan2(normal[:, 1], normal[:, 0]) + 7 * normal[:, 2])[:, None] > 0
     return np.where(stripe, [0.6, 0.2, 0.1], [0.1, 0.3, 0.4])
@@ -28,7 +28,7 @@ def painted(normal: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def test_shading_of_two_colours_is_found() -> None:
     normal = ball()
-    shaded = painted(normal) * np.exp(harmonics(normal) @ TRUE)
+    shaded = two_colours(normal) * np.exp(harmonics(normal) @ TRUE)
     found = remaining_shading(shaded, normal, normal, np.random.default_rng(0))
     left = harmonics(normal) @ (found - TRUE)
     assert (left - left.mean(0)).std() < 0.02
@@ -37,7 +37,7 @@ def test_shading_of_two_colours_is_found() -> None:
 
 def test_base_colours_without_shading_stay() -> None:
     normal = ball()
-    found = remaining_shading(painted(normal), normal, normal, np.random.default_rng(0))
+    found = remaining_shading(two_colours(normal), normal, normal, np.random.default_rng(0))
     assert np.abs(harmonics(normal) @ found).max() < 0.02
 
 
