@@ -83,9 +83,9 @@ class Field(ABC):
         """Centres (n, 3) of the surfels moved to the zero level set."""
         return self.project(surfels.position)
 
+    @abstractmethod
     def sample_near_zero(self, count: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         """At most `count` random points (n, 3) on the zero level set, evenly spread over it, and the outward unit normals (n, 3) there."""
-        raise NotImplementedError(f"the field {self.name!r} cannot be sampled")
 
     @abstractmethod
     def losses(self, step: TrainingStep, view: TrainView) -> Tensor | None:
