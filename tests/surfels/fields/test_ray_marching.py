@@ -27,6 +27,10 @@ class Ball(Field):
     def gradient(self, points: torch.Tensor) -> torch.Tensor:
         return torch.nn.functional.normalize(points, dim=1)
 
+    def sample_near_zero(self, count, generator):  # type: ignore[no-untyped-def]
+        normal = torch.nn.functional.normalize(torch.randn((count, 3), generator=generator), dim=1)
+        return RADIUS * normal, normal
+
     def losses(self, step, view):  # type: ignore[no-untyped-def]
         return None
 
