@@ -15,8 +15,11 @@ before. Where other programs run, wall seconds say little; these figures do not 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import csv
+import ctypes
 import os
+import resource
 import shutil
 import subprocess
 import sys
@@ -34,6 +37,9 @@ from gsbake.synth.capture import write_capture
 RESULTS = ROOT / "benchmarks" / "results" / "batch.csv"
 WAYS = ("loop", "one", "two")
 WORKERS = {"loop": 1, "one": 1, "two": 2}
+
+#: Option of prctl(2).
+PR_SET_CHILD_SUBREAPER = 36
 
 
 @dataclass(frozen=True)
@@ -62,15 +68,28 @@ class Ratios:
     wall_workers: float
 
 
+def adopt_orphans() -> None:
+    """Make this process the parent of descendants whose own parent ends first, so that `timed` can count what they used (Linux)."""
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
+
+
 def timed(command: Sequence[str]) -> tuple[float, float]:
-    """Wall and CPU seconds of a command with all that it starts. Raises RuntimeError when it fails."""
-    start = time.perf_counter()
-    process = subprocess.Popen(command, env=python_environment({"OMP_WAIT_POLICY": "PASSIVE"}), stdout=subprocess.DEVNULL)
-    _, status, used = os.wait4(process.pid, 0)
-    process.returncode = os.waitstatus_to_exitcode(status)
-    if process.returncode:
-        raise RuntimeError(f"exit code {process.returncode}: {' '.join(command)}")
-    return time.perf_counter() - start, used.ru_utime + used.ru_stime
+    """Wall seconds of a command, and CPU seconds of it with all that it started. Raises RuntimeError when it fails.
+
+    Processes that outlive the command are waited for: those whose parent does not wait for them would not be counted.
+    """
+    adopt_orphans()
+    start, before = time.perf_counter(), resource.getrusage(resource.RUSAGE_CHILDREN)
+    code = subprocess.run(command, env=python_environment({"OMP_WAIT_POLICY": "PASSIVE"}), stdout=subprocess.DEVNULL).returncode
+    wall = time.perf_counter() - start
+    if code:
+        raise RuntimeError(f"exit code {code}: {' '.join(command)}")
+    with contextlib.suppress(ChildProcessError):
+        while True:
+            os.wait()
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return wall, after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
 
 
 def measure(way: str, number: int, captures: Sequence[Path], profile: str, out: Path) -> Row:
