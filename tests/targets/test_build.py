@@ -68,6 +68,31 @@ def test_budgets_are_kept(folders: dict[str, Path], tmp_path: Path) -> None:
     assert "jpeg" in result["images"]
 
 
+def test_a_mesh_that_its_seams_keep_too_large_gets_new_charts(folders: dict[str, Path], tmp_path: Path) -> None:
+    """A tenth of the triangles, which the seams of the bake do not allow: the maps are carried over to new charts."""
+    from gsbake.config import targets as table
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(table.BUDGETS, "banner", table.Budget(0.02, 120, 512, 512))
+        result = build_targets(folders, tmp_path, TargetOptions(Targets(files=("banner",))))["targets"]["asset_banner.glb"]
+    assert result["bytes"] <= 20_000 and result["triangles"] <= 120
+    asset, mesh = read_glb(tmp_path / "asset_banner.glb"), as_mesh(tmp_path / "asset_banner.glb")
+    base, coded = asset.image("base_color"), asset.image("normal")
+    assert base is not None and coded is not None
+    texels, p = unit_points(mesh, base.shape[0])
+    inside = texels.inside
+    # The ball of so few triangles lies up to a twentieth inside the true one, whose colours it has.
+    direction = p / np.linalg.norm(p, axis=1, keepdims=True)
+    error = np.abs(decode_bytes(base).reshape(-1, 3)[texels.index] - colour(direction * bumpy(direction)[:, None]))[inside]
+    assert error.mean() < 0.02
+    small = rasterise(mesh.uv, mesh.faces, coded.shape[0])
+    n, t = (small.interpolate(values, mesh.faces) for values in (mesh.normal, mesh.tangent))
+    shaded = frame_to_world(coded.reshape(-1, 3)[small.index] / 127.5 - 1, n, t)
+    true = true_normals(unit_points(mesh, coded.shape[0])[1])
+    assert degrees_between(shaded, true)[small.inside].mean() < 0.6 * degrees_between(n.astype(float), true)[small.inside].mean()
+    assert gltf_issues(tmp_path / "asset_banner.glb") == []
+
+
 def test_a_budget_that_cannot_be_met_is_refused(folders: dict[str, Path], tmp_path: Path) -> None:
     from gsbake.config import targets as table
 
@@ -82,6 +107,23 @@ def unit_points(mesh: GltfMesh | Any, size: int) -> tuple[Any, np.ndarray]:
     texels = rasterise(mesh.uv, mesh.faces, size)
     p = texels.interpolate(mesh.position, mesh.faces).astype(float)
     return texels, TO_WORLD.inverse().apply(np.stack([p[:, 0], -p[:, 2], p[:, 1]], 1))
+
+
+def true_normals(p: np.ndarray) -> np.ndarray:
+    """Normals of the bumpy ball, in the asset's frame, in the directions of points in the unit frame."""
+    direction = p / np.linalg.norm(p, axis=1, keepdims=True)
+    step = 1e-4
+    moved = [direction + s * step * e for e in np.eye(3) for s in (1, -1)]
+    radii = [bumpy(d / np.linalg.norm(d, axis=1, keepdims=True)) for d in moved]
+    slope = np.stack([(radii[2 * k] - radii[2 * k + 1]) / (2 * step) for k in range(3)], 1)
+    true = (direction - slope / bumpy(direction)[:, None]) @ TO_WORLD.rotation.T
+    true = np.stack([true[:, 0], true[:, 2], -true[:, 1]], 1)
+    return np.asarray(true / np.linalg.norm(true, axis=1, keepdims=True))
+
+
+def degrees_between(normals: np.ndarray, true: np.ndarray) -> np.ndarray:
+    unit = normals / np.linalg.norm(normals, axis=1, keepdims=True)
+    return np.asarray(np.degrees(np.arccos(np.clip(np.einsum("nd,nd->n", unit, true), -1, 1))))
 
 
 def as_mesh(path: Path) -> GltfMesh:
@@ -105,18 +147,10 @@ def test_levels_show_the_same_surface(built: tuple[Path, dict[str, Any]], name: 
     assert error.mean() < 0.01
     n, t = (texels.interpolate(values, mesh.faces) for values in (mesh.normal, mesh.tangent))
     shaded = frame_to_world(coded.reshape(-1, 3)[texels.index] / 127.5 - 1, n, t)
-    direction = p / np.linalg.norm(p, axis=1, keepdims=True)
-    step = 1e-4
-    moved = [direction + s * step * e for e in np.eye(3) for s in (1, -1)]
-    radii = [bumpy(d / np.linalg.norm(d, axis=1, keepdims=True)) for d in moved]
-    slope = np.stack([(radii[2 * k] - radii[2 * k + 1]) / (2 * step) for k in range(3)], 1)
-    true = (direction - slope / bumpy(direction)[:, None]) @ TO_WORLD.rotation.T
-    true = np.stack([true[:, 0], true[:, 2], -true[:, 1]], 1)
-    true /= np.linalg.norm(true, axis=1, keepdims=True)
+    true = true_normals(p)
 
     def degrees(normals: np.ndarray) -> np.ndarray:
-        unit = normals / np.linalg.norm(normals, axis=1, keepdims=True)
-        return np.degrees(np.arccos(np.clip(np.einsum("nd,nd->n", unit, true), -1, 1)))[inside]
+        return degrees_between(normals, true)[inside]
 
     assert degrees(shaded).mean() < 2.0
     if "lod1" in name:
