@@ -13,12 +13,16 @@ import trimesh
 from gsbake.config.schema import Export, Targets
 from gsbake.errors import BadInputError
 from gsbake.geometry.tangents import frame_to_world
-from gsbake.gltf.document import Document
+from gsbake.gltf.audit import MAX_NON_UNIT, non_unit_share
+from gsbake.gltf.document import Document, decode_image
+from gsbake.gltf.encode import TextureMaps, quantise
 from gsbake.gltf.read import read_glb
 from gsbake.gltf.scene import open_scene
 from gsbake.gltf.write import GltfMesh
 from gsbake.imaging.srgb import decode_bytes
 from gsbake.targets.build import TargetOptions, build_targets
+from gsbake.targets.images import encode_jpeg, fit_images
+from gsbake.targets.maps import resized
 from gsbake.texturing.texels import rasterise
 from tests.support.node import gltf_issues
 from tests.support.recorder import Recorder
@@ -230,3 +234,23 @@ def test_the_same_input_gives_the_same_bytes(folders: dict[str, Path], built: tu
     build_targets(folders, tmp_path, options)
     for name in ("asset_banner.glb", "asset_ktx2_meshopt.glb", "asset_ar.usdz"):
         assert (tmp_path / name).read_bytes() == (built[0] / name).read_bytes(), name
+
+
+def test_a_step_that_bends_normals_is_passed_over() -> None:
+    """Noisy normals: JPEG of low quality would fit into the bytes, and fails the audit; fewer texels at a better quality do not."""
+    rng = np.random.default_rng(0)
+
+    def maps(edge: int) -> TextureMaps:
+        tilt = rng.normal(size=(128, 128, 2)).astype(np.float32)
+        coarse = resized(np.dstack([0.5 * tilt, np.ones((128, 128), np.float32)]), edge)
+        normal = coarse / np.linalg.norm(coarse, axis=2, keepdims=True)
+        flat = np.full((edge, edge, 3), 0.5, np.float32)
+        return quantise(flat, flat, 0.5 + 0.5 * normal)
+
+    low = encode_jpeg(np.asarray(maps(128).normal), 82)
+    assert non_unit_share(decode_image(low, "normal map")[..., :3]) > MAX_NON_UNIT
+    budget = len(low) + 4000  # which the step of that quality keeps
+    images, step, _ = fit_images(maps, 128, budget, None)
+    assert images.normal is not None and step.linear[:2] == (1, "jpeg")
+    assert non_unit_share(decode_image(images.normal, "normal map")[..., :3]) < MAX_NON_UNIT
+    assert sum(len(image or b"") for image in (images.base_color, images.orm, images.normal)) <= budget
