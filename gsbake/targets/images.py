@@ -11,7 +11,6 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cache
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
@@ -20,6 +19,7 @@ from gsbake.gltf.audit import MAX_NON_UNIT, non_unit_share
 from gsbake.gltf.document import decode_image
 from gsbake.gltf.encode import Bytes, TextureMaps, reduce_precision
 from gsbake.gltf.write import GltfTextures
+from gsbake.imaging.jpeg import encode_jpeg
 from gsbake.imaging.ktx2 import encode_ktx2
 from gsbake.imaging.png import encode_png
 
@@ -117,16 +117,6 @@ def _encode(image: Bytes, role: str, codec: str, quality: int) -> bytes:
         case "etc1s" | "uastc":
             return encode_ktx2(image, "etc1s" if codec == "etc1s" else "uastc", quality, srgb=role in ("base_color", "emissive"))
     raise ValueError(f"there is no codec {codec}")
-
-
-def encode_jpeg(image: NDArray[np.uint8], quality: int) -> bytes:
-    """JPEG of grey (h, w) or RGB (h, w, 3) pixels, every channel at full resolution."""
-    pixels = image if image.ndim == 2 else np.ascontiguousarray(image[..., ::-1])
-    options = [cv2.IMWRITE_JPEG_QUALITY, quality, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, 0x111111, cv2.IMWRITE_JPEG_OPTIMIZE, 1]
-    done, data = cv2.imencode(".jpg", pixels, options)
-    if not done:
-        raise RuntimeError(f"could not encode an image of shape {image.shape} as JPEG")
-    return bytes(data.tobytes())
 
 
 def _webp(image: NDArray[np.uint8], **options: object) -> bytes:

@@ -19,9 +19,10 @@ from gsbake.gltf.encode import TextureMaps, quantise
 from gsbake.gltf.read import read_glb
 from gsbake.gltf.scene import open_scene
 from gsbake.gltf.write import GltfMesh
+from gsbake.imaging.jpeg import encode_jpeg
 from gsbake.imaging.srgb import decode_bytes
 from gsbake.targets.build import TargetOptions, build_targets
-from gsbake.targets.images import encode_jpeg, fit_images
+from gsbake.targets.images import fit_images
 from gsbake.targets.maps import resized
 from gsbake.texturing.texels import rasterise
 from tests.support.node import gltf_issues
