@@ -260,9 +260,9 @@ class MaterialFit:
     def _search_light(self, batches: list[PhotoBatch], generator: np.random.Generator, tint: bool, rough: bool) -> LightAdjustment:
         """Search for the light's intensity and contrast and for a roughness shift, apply them, and adapt base colours."""
         o, values = self._options, self._values
-        dielectric = self._dielectric()
-        if dielectric.mean() < o.min_dielectric_share:
+        if not self.mostly_dielectric:
             return self._anchor_metals()
+        dielectric = self._dielectric()
         share = min(1.0, o.intensity_pixels / max(1, sum(map(len, batches))))
         chosen = dielectric & (generator.random(len(dielectric)) < share)
         subset = [part for b in batches if len(part := b.select(chosen))]
@@ -305,13 +305,15 @@ class MaterialFit:
         new[:, :3] = np.clip(new[:, :3] * before[texel] / np.maximum(after[texel], 1e-6), o.min_base_color, o.base_color_range[1])
         self._reinitialise(texel, new)
 
+    @property
+    def mostly_dielectric(self) -> bool:
+        """Whether so much is dielectric that its diffuse colours tell of the light."""
+        return bool(self._dielectric().mean() >= self._options.min_dielectric_share)
+
     @torch.no_grad()
     def move_shading_to_light(self, seed: int) -> None:
-        """Move the shading that is left in the base colours of dielectrics to the light; not where less than half is dielectric."""
-        dielectric = self._dielectric()
-        if dielectric.mean() < self._options.min_dielectric_share:
-            return
-        generator, texel = np.random.default_rng(seed), np.flatnonzero(dielectric)
+        """Move the shading that is left in the base colours of dielectrics to the light."""
+        generator, texel = np.random.default_rng(seed), np.flatnonzero(self._dielectric())
         unit = self._normal / np.maximum(np.linalg.norm(self._normal, axis=1, keepdims=True), 1e-12)
         coefficients = remaining_shading(self._values[texel, :3], unit[texel], np.asarray(self._surface.position)[texel], generator)
         matched = unit[generator.choice(texel, min(MATCHED_POINTS, len(texel)), replace=False)]

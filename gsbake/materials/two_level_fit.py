@@ -17,9 +17,9 @@ from gsbake.texturing.resampling import CoarseTexture
 
 #: Steps of a trial, of the continued fit on the coarse level, and on the fine one, as shares of the iterations.
 TRIAL_SHARE, COARSE_SHARE, FINE_SHARE = 0.25, 0.5, 0.25
-#: How often shading left in base colours is moved to the light at the end of the coarse level, and the steps after each, as a share of
-#: the iterations, in which texels adapt to it, with their factor on the learning rates. Gradient steps would move the light back: that
-#: base colours have no shading is not part of their loss.
+#: How often shading left in base colours is moved to the light at the end of the coarse level, where most is dielectric, and the steps
+#: after each, as a share of the iterations, in which texels adapt to it, with their factor on the learning rates. From there the light is
+#: given: gradient steps would move it back, as that base colours have no shading is not part of their loss.
 SHADING_ROUNDS, ADAPT_SHARE, ADAPT_RATE = 4, 0.05, 0.5
 #: When metals are searched for on the fine level, as a share of its steps.
 FINE_METAL_SEARCHES_AT = (0.3,)
@@ -55,12 +55,13 @@ def fit_two_levels(coarse: FitLevel, fine: FitLevel, texture: CoarseTexture, pla
     trials = trial_fits(make, coarse, steps(TRIAL_SHARE), plan.seed, plan.diffuse, each("trial fits"))
     schedule = FitSchedule(steps(COARSE_SHARE), plan.seed, diffuse=plan.diffuse)
     choice = best_fit(trials, coarse, schedule, each("material fit, coarse level"))
-    given = replace(schedule, emission=False, intensity=False, fixed_light=True)
-    adapt = replace(given, iterations=steps(ADAPT_SHARE), metal_searches_at=(), rate=ADAPT_RATE)
-    for turn in range(SHADING_ROUNDS):
-        choice.fit.move_shading_to_light(plan.seed + turn)
-        choice.fit.run(coarse.fitted, [], adapt, each("material fit, coarse level"))
-    choice.fit.move_shading_to_light(plan.seed + SHADING_ROUNDS)
+    refine = replace(schedule, emission=False, intensity=False, metal_searches_at=FINE_METAL_SEARCHES_AT, iterations=steps(FINE_SHARE))
+    if choice.fit.mostly_dielectric:
+        refine = replace(refine, fixed_light=True)
+        adapt = replace(refine, iterations=steps(ADAPT_SHARE), metal_searches_at=(), rate=ADAPT_RATE)
+        for turn in range(SHADING_ROUNDS):
+            choice.fit.move_shading_to_light(plan.seed + turn)
+            choice.fit.run(coarse.fitted, [], adapt, each("material fit, coarse level"))
+        choice.fit.move_shading_to_light(plan.seed + SHADING_ROUNDS)
     fit = choice.fit.continued_on(fine.surface, texture.up)
-    refine = replace(given, iterations=steps(FINE_SHARE), metal_searches_at=FINE_METAL_SEARCHES_AT)
     return replace(choice, fit=fit, fitted=fit.run(fine.fitted, fine.held_out, refine, each("material fit, fine level")))
