@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,7 @@ from gsbake.capture.sources import PHOTO_FOLDERS, discover, list_masks, source_f
 from gsbake.config.load import DEFAULT, LoadedProfile, load_profile
 from gsbake.config.schema import Profile
 from gsbake.config.targets import parse_target, require_packages
-from gsbake.errors import BadInputError, UsageError
+from gsbake.errors import BadInputError, GsbakeError, UsageError
 from gsbake.meshing.decimator_choice import resolve_decimator
 from gsbake.pipeline.engine import Engine, Observer, artifacts_by_stage
 from gsbake.pipeline.files import disk_error
@@ -28,7 +29,7 @@ from gsbake.pipeline.project import Project
 from gsbake.pipeline.registry import Registry
 from gsbake.pipeline.shared_store import open_shared_store
 from gsbake.pipeline.store import Store
-from gsbake.publish import publish_results
+from gsbake.publish import RESULTS, publish_results
 from gsbake.stages import REGISTRY
 from gsbake.text import number
 
@@ -71,7 +72,8 @@ class Session:
     store: str | None = None  # shared store, a folder or URL
 
     def run(self, target: str | None = None) -> Result:
-        """Bring the stages up to `target` (None: all) up to date and publish the results in the output folder.
+        """Bring the stages up to `target` (None: all) up to date and publish the results in the output folder, those of finished stages
+        also where a later one fails.
 
         Raises what `Engine.run` raises.
         """
@@ -80,15 +82,27 @@ class Session:
         self.engine.shared = open_shared_store(self.store)
         try:
             states = self.engine.run(target, on_accepted=lambda: self.project.save(self.out))
-            digests = self.engine.store.digests
-            files, project = publish_results(self.out, artifacts_by_stage(states), self.project, digests)
-            project.save(self.out)
-            digests.save()
+            files = self._publish(states)
+        except GsbakeError:
+            with suppress(OSError):  # the first error is the one to report
+                self._publish(self.engine.finished)
+            raise
         except OSError as error:
             raise disk_error(error, self.out) or BadInputError(
                 f"The output folder '{self.out}' cannot be written ({error.strerror}); choose another with --out."
             ) from error
         return Result(self.out, files, tuple(states))
+
+    def _publish(self, states: Sequence[StageState]) -> dict[str, Path]:
+        """Copy the results of these stages to the output folder; returns {file: path}."""
+        artifacts = artifacts_by_stage(states)
+        if not RESULTS.keys() & artifacts.keys():
+            return {}
+        digests = self.engine.store.digests
+        files, project = publish_results(self.out, artifacts, self.project, digests)
+        project.save(self.out)
+        digests.save()
+        return files
 
 
 @dataclass(frozen=True)

@@ -11,15 +11,17 @@ def run(ctx: Context) -> dict[str, Any]:
     """See `gsbake.targets.build.build_targets`."""
     from gsbake.targets.build import TargetOptions, build_targets
 
-    return build_targets(ctx.inputs, ctx.out, TargetOptions(ctx.settings.targets, ctx.settings.export), monitor=ctx)
+    s = ctx.settings
+    options = TargetOptions(s.targets, s.export, s.mesh.decimator, ctx.threads)
+    return build_targets(ctx.inputs, ctx.out, options, monitor=ctx)
 
 
 STAGE = Stage(
     name="targets",
-    version=1,
+    version=2,
     title="Targets",
     run=run,
     summary="{files} files",
     needs=("poses", "refine", "mesh", "bake", "export"),
-    settings=("targets.*", "export.*"),
+    settings=("targets.*", "export.*", "mesh.decimator"),
 )

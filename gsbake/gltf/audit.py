@@ -12,6 +12,7 @@ from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gsbake.errors import BadInputError
 from gsbake.gltf.document import decode_image, image_format
@@ -28,6 +29,8 @@ PLAUSIBLE_COLOUR = (30, 243)
 OVERLAP_SIZE = 2048
 #: Largest share of overlapping texels, for rounding at shared edges.
 MAX_OVERLAP_SHARE = 1e-5
+#: Share of texels of a normal map whose vectors may be off unit length.
+MAX_NON_UNIT = 0.02
 #: PNG chunks that viewers interpret differently.
 COLOUR_CHUNKS = ("gAMA", "iCCP", "cHRM", "sRGB")
 
@@ -196,11 +199,15 @@ def _images(asset: GltfAsset, check: Any) -> None:
             outside = float(((pixels < PLAUSIBLE_COLOUR[0]) | (pixels > PLAUSIBLE_COLOUR[1])).mean())
             check("base colour within 30..243", outside < 0.05, f"{outside:.1%} of the values outside", "info")
         if role == "normal":
-            length = np.linalg.norm(pixels / 127.5 - 1, axis=2)
-            share = float((np.abs(length - 1) > 0.1).mean())
-            check("normal map of unit vectors", share < 0.02, f"length error above 0.1 in {share:.2%} of the texels")
+            share = non_unit_share(pixels)
+            check("normal map of unit vectors", share < MAX_NON_UNIT, f"length error above 0.1 in {share:.2%} of the texels")
             inward = float((pixels[..., 2] < 128).mean())
             check("normal map points outwards", inward < 0.001, f"{inward:.2%} of the texels")
+
+
+def non_unit_share(normal: NDArray[np.uint8]) -> float:
+    """Share of the texels of a normal map (h, w, 3) whose vectors are off unit length by more than a tenth."""
+    return float((np.abs(np.linalg.norm(normal / 127.5 - 1, axis=2) - 1) > 0.1).mean())
 
 
 def _extension_of(form: str) -> str:

@@ -71,6 +71,8 @@ class Engine:
         self.store = Store(request.out)
         self.planner = Planner(request, self.store)
         self.events = EventLog(request.out / "events.jsonl")
+        #: Stages that the present or last run has finished, whether or not it went on to the end.
+        self.finished: list[StageState] = []
 
     def plan(self, target: str | None = None) -> list[StageState]:
         """The states of the stages that `run` would take; nothing is run."""
@@ -104,7 +106,7 @@ class Engine:
         start = time.perf_counter()
         self.events.write("run started", stages=[s.name for s in stages], seed=self.request.seed, device=self.request.device)
         self.observer.run_started(stages)
-        states: list[StageState] = []
+        states = self.finished = []
         artifacts: dict[str, Artifact] = {}
         for stage in stages:
             stop.check()

@@ -20,12 +20,15 @@ from gsbake.report.advice import advice
 from gsbake.report.asset import open_asset
 from gsbake.report.html import Light, Page, Panel, render_page
 from gsbake.report.masks import mask_panels
+from gsbake.report.page_model import page_model
 from gsbake.report.quality import select_views
 from gsbake.report.render import Asset, Renderer, Shader, unlit
 from gsbake.report.sheets import map_panels
 from gsbake.surfels.training.views import test_photos
 from gsbake.text import number
 
+#: Bytes of the page, which mail and messengers still take; the asset's images in it are stored in fewer where it would exceed them.
+MAX_PAGE_BYTES = 8_000_000
 #: Maximum number of compared photos; more hardly change the mean.
 MAX_COMPARED = 24
 
@@ -84,7 +87,10 @@ class _ReportWriter:
         renders = self._render()
         with self.monitor.part("page"):
             figures = self._figures(renders)
-            text = render_page(self._page(renders))
+            page = self._page(renders)
+            room = MAX_PAGE_BYTES - len(render_page(replace(page, model="-")).encode())
+            model = base64.b64encode(page_model(self.glb.read_bytes(), 3 * room // 4)).decode()
+            text = render_page(replace(page, model=model))
             views = [
                 {"name": s.name, "psnr": s.metrics.psnr, "exposed_psnr": s.metrics.exposed_psnr, "ssim": s.metrics.ssim}
                 for s in renders.scored
@@ -148,7 +154,7 @@ class _ReportWriter:
         }
 
     def _page(self, renders: _Renders) -> Page:
-        """The contents of the page."""
+        """The contents of the page but for the asset itself."""
         found, lit, posed, scored = self.manifests, renders.lit, renders.posed, renders.scored
         shown, _ = select_views(len(scored), [], self.options.report.views)
         logs = {name: manifests.read_log(self.folders[name] / "log.csv") for name in ("train", "refine")}
@@ -159,7 +165,7 @@ class _ReportWriter:
             lead=_lead(count, _kind(lit, found), posed.cameras.poses),
             figures=compose.headline(found, renders.asset, self.glb.stat().st_size, scored, (len(posed), count)),
             warnings=tuple(replace(w, advice=advice(w.text, renders.places)) for w in manifests.warnings(found)),
-            model=base64.b64encode(self.glb.read_bytes()).decode(),
+            model="",
             lights=renders.lights,
             comparisons=compose.comparisons([scored[i] for i in shown]),
             comparison_note=_comparison_note(renders.held_out, posed.has_masks, lit, refined),

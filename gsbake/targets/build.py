@@ -24,16 +24,20 @@ from gsbake.gltf.container import unpack_glb
 from gsbake.gltf.frame import read_transforms_json
 from gsbake.gltf.write import Geometry, GltfMesh, GltfTextures, Level, build_glb
 from gsbake.meshing.decimation import Deviation, surface_deviation
+from gsbake.meshing.decimator_choice import Decimator
 from gsbake.monitor import SILENT, Monitor
 from gsbake.targets.decimation import WedgeMesh, decimate_to_bound, decimate_to_count
 from gsbake.targets.images import fit_images
 from gsbake.targets.maps import BakedMaps, MapSource
+from gsbake.targets.new_charts import with_new_charts
 from gsbake.targets.texel_density import pixels_per_texel, texture_edge
 
 #: Error of a level of detail on the screen, in pixels.
 PIXEL_ERROR = 0.5
 #: Largest share of a target's bytes that the mesh takes.
 GEOMETRY_SHARE = 0.5
+#: Factor on that share up to which a mesh whose seams keep it above is taken; else it gets new charts, in at most so many tries.
+SEAM_ALLOWANCE, NEW_CHART_TRIES = 1.2, 3
 #: Bytes of the document beside mesh and images.
 DOCUMENT_BYTES = 4096
 #: Extensions that each form requires.
@@ -47,21 +51,26 @@ _PIXEL = GltfTextures(*([b"\x89PNG\r\n\x1a\n"] * 3))
 
 @dataclass(frozen=True)
 class TargetOptions:
-    """Settings of the targets, and those of the export that they share."""
+    """Settings of the targets, those of the export that they share, and the mesh's decimator."""
 
     targets: Targets = Targets()
     export: Export = Export()
+    decimator: Decimator = "pymeshlab"
+    threads: int = 2
 
 
 @dataclass(frozen=True)
 class LevelFile:
-    """A finished level: mesh, images, deviation from the dense mesh and from the baked one, what was done to the images."""
+    """A finished level: mesh, images, their edge and what was done to them, deviation from the dense mesh, constant factors, whether the
+    mesh has charts of its own."""
 
     mesh: GltfMesh
     images: GltfTextures
     texture: int
     step: str
     deviation: Deviation
+    factors: tuple[float, float] | None
+    new_charts: bool
 
 
 def build_targets(folders: Mapping[str, Path], out: Path, options: TargetOptions, *, monitor: Monitor = SILENT) -> dict[str, Any]:
@@ -104,6 +113,7 @@ class _Builder:
         self._bounded: dict[float, WedgeMesh] = {}
         self._decimated: dict[tuple[int, float], GltfMesh] = {}
         self._measured: dict[int, Deviation] = {}
+        self._new_charts: dict[tuple[int, int], MapSource] = {}
 
     # -- shared ---------------------------------------------------------------------------------------------------------------------
 
@@ -159,23 +169,41 @@ class _Builder:
         bound = PIXEL_ERROR * self.extent / (limits.pixels / 2**k)
         keep = k == 0 and target.name in ("default", "film") and len(self.mesh.faces) <= triangles
         mesh = self.mesh if keep else self.decimated(triangles if k == 0 else min(triangles, len(self.mesh.faces) >> k), bound)
-        geometry = self.geometry_bytes(mesh, target)
-        if geometry > GEOMETRY_SHARE * budget:
-            fewer = int(0.97 * len(mesh.faces) * GEOMETRY_SHARE * budget / geometry)
-            mesh = self.decimated(fewer, bound)
-            geometry = self.geometry_bytes(mesh, target)
         edge = texture_edge(self.maps.edge, self.pixels)
         edge = max(64, min(edge, limits.texture) >> k)
+        source = self.source
+        geometry, room = self.geometry_bytes(mesh, target), int(GEOMETRY_SHARE * budget)
+        if geometry > room:
+            triangles = min(triangles, int(0.97 * len(mesh.faces) * room / geometry))
+            mesh = self.decimated(triangles, bound)
+            geometry = self.geometry_bytes(mesh, target)
+        wanted = len(mesh.faces)
+        for _ in range(NEW_CHART_TRIES):
+            if geometry <= SEAM_ALLOWANCE * room and len(mesh.faces) <= triangles:
+                break
+            wanted = int(0.97 * wanted * min(1, triangles / len(mesh.faces), room / geometry))
+            source = self.with_new_charts(wanted, edge)
+            mesh = source.maps.mesh
+            geometry = self.geometry_bytes(mesh, target)
         found: dict[int, Any] = {}
 
         def maps(at: int) -> Any:
             if at not in found:
-                found[at] = self.source.at(mesh, at)
+                found[at] = source.at(mesh, at)
             return found[at]
 
-        room = budget - geometry - DOCUMENT_BYTES
-        images, step, texture = fit_images(maps, edge, room, target.texture_form, self.monitor.check_stop)
-        return LevelFile(mesh, images, texture, step.text, self.deviation(mesh))
+        images, step, texture = fit_images(maps, edge, budget - geometry - DOCUMENT_BYTES, target.texture_form, self.monitor.check_stop)
+        new_charts = source is not self.source
+        return LevelFile(mesh, images, texture, step.text, self.deviation(mesh), source.plain(texture).factors, new_charts)
+
+    def with_new_charts(self, triangles: int, edge: int) -> MapSource:
+        """The maps on a mesh of about `triangles` with charts of its own."""
+        key = (triangles, edge)
+        if key not in self._new_charts:
+            self.monitor.check_stop()
+            options = self.options
+            self._new_charts[key] = with_new_charts(self.source, self.wedges.surface, triangles, edge, options.decimator, options.threads)
+        return self._new_charts[key]
 
     def decimated(self, triangles: int, bound: float) -> GltfMesh:
         """The baked mesh with at most `triangles`, or fewer where the error bound allows; the same object for the same result."""
@@ -199,8 +227,7 @@ class _Builder:
         if target.file_form != "glb":
             from gsbake.targets.other_files import write_other
 
-            factors = self.source.plain(level.texture).factors
-            names = write_other(target.file_form, self.out, stem, level.mesh, level.images, factors, extras)
+            names = write_other(target.file_form, self.out, stem, level.mesh, level.images, level.factors, extras)
             size = sum((self.out / name).stat().st_size for name in names)
             return {names[0]: self.figures(target, k, level, size) | {"parts": names[1:]}}
         data = self.glb(target, level, extras)
@@ -220,9 +247,8 @@ class _Builder:
 
     def glb(self, target: Target, level: LevelFile, extras: dict[str, Any], coarser: list[Level] | None = None) -> bytes:
         """The bytes of a GLB."""
-        factors = self.source.plain(level.texture).factors
         return build_glb(
-            level.mesh, level.images, "asset", f"gsbake {__version__}", self.options.export.copyright, extras, factors,
+            level.mesh, level.images, "asset", f"gsbake {__version__}", self.options.export.copyright, extras, level.factors,
             geometry=_geometry(target), levels=coarser or [], coverage=_coverage(0),
         )  # fmt: skip
 
@@ -243,7 +269,8 @@ class _Builder:
 
     def figures(self, target: Target, k: int, level: LevelFile, size: int) -> dict[str, Any]:
         """Figures of a file for the manifest."""
-        decided = f"{len(level.mesh.faces)} triangles, {level.texture}² texels, {level.step}"
+        charts = " with new charts" if level.new_charts else ""
+        decided = f"{len(level.mesh.faces)} triangles{charts}, {level.texture}² texels, {level.step}"
         self.monitor.decide(f"{target.text}, level {k}", decided, f"{size / 1e6:.2f} MB; {self.pixels:.2f} pixels per baked texel")
         return {
             "target": target.text,

@@ -11,13 +11,15 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cache
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from gsbake.gltf.audit import MAX_NON_UNIT, non_unit_share
+from gsbake.gltf.document import decode_image
 from gsbake.gltf.encode import Bytes, TextureMaps, reduce_precision
 from gsbake.gltf.write import GltfTextures
+from gsbake.imaging.jpeg import encode_jpeg
 from gsbake.imaging.ktx2 import encode_ktx2
 from gsbake.imaging.png import encode_png
 
@@ -75,9 +77,17 @@ def fit_images(
 ) -> tuple[GltfTextures, Step, int]:
     """The images of `maps` (by edge) at the first step that fits into `budget` bytes in all, that step, and their edge.
 
+    A step that leaves too few normals of unit length is passed over: JPEG of low quality changes it, half the edge at a better
+    one does not.
     Where even textures of MIN_EDGE do not fit they are returned all the same.
     """
     encode = cache(lambda role, at, codec, quality: _encode(getattr(maps(at), role), role, codec, quality))
+
+    @cache
+    def unit(at: int, quality: int) -> bool:
+        """Whether the normals are of unit length at this edge and quality of JPEG."""
+        return non_unit_share(decode_image(encode("normal", at, "jpeg", quality), "normal map")[..., :3]) < MAX_NON_UNIT
+
     for step in steps(form):
         (hc, codec, quality), (hl, linear, amount) = step.colour, step.linear
         colour_edge, linear_edge = max(MIN_EDGE, edge >> hc), max(MIN_EDGE, edge >> hl)
@@ -87,7 +97,8 @@ def fit_images(
         emissive = None if have.emissive is None else encode("emissive", colour_edge, codec, quality)
         orm = encode("orm", linear_edge, linear, amount)
         normal = None if have.normal is None else encode("normal", linear_edge, linear, amount)
-        if len(base) + len(emissive or b"") + len(orm) + len(normal or b"") <= budget or edge >> hc <= MIN_EDGE:
+        fits = sum(len(image or b"") for image in (base, emissive, orm, normal)) <= budget
+        if (fits and (normal is None or linear != "jpeg" or unit(linear_edge, amount))) or edge >> hc <= MIN_EDGE:
             break
     return GltfTextures(base, orm, normal, emissive), step, colour_edge
 
@@ -106,16 +117,6 @@ def _encode(image: Bytes, role: str, codec: str, quality: int) -> bytes:
         case "etc1s" | "uastc":
             return encode_ktx2(image, "etc1s" if codec == "etc1s" else "uastc", quality, srgb=role in ("base_color", "emissive"))
     raise ValueError(f"there is no codec {codec}")
-
-
-def encode_jpeg(image: NDArray[np.uint8], quality: int) -> bytes:
-    """JPEG of grey (h, w) or RGB (h, w, 3) pixels, every channel at full resolution."""
-    pixels = image if image.ndim == 2 else np.ascontiguousarray(image[..., ::-1])
-    options = [cv2.IMWRITE_JPEG_QUALITY, quality, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, 0x111111, cv2.IMWRITE_JPEG_OPTIMIZE, 1]
-    done, data = cv2.imencode(".jpg", pixels, options)
-    if not done:
-        raise RuntimeError(f"could not encode an image of shape {image.shape} as JPEG")
-    return bytes(data.tobytes())
 
 
 def _webp(image: NDArray[np.uint8], **options: object) -> bytes:

@@ -54,7 +54,7 @@ class MapSource:
     def __init__(self, maps: BakedMaps) -> None:
         self.maps = maps
         self.plain = cache(self._plain)
-        self._world = cache(self._world_normals)
+        self.world_normals = cache(self._world_normals)
 
     def at(self, mesh: GltfMesh, edge: int) -> TextureMaps:
         """The 8-bit maps for `mesh`, a decimated form of the baked one or itself, at an `edge` of at most the baked one."""
@@ -86,7 +86,7 @@ class MapSource:
         """8-bit normal map of a decimated mesh."""
         texels = rasterise(mesh.uv, mesh.faces, edge)
         normal, tangent = (texels.interpolate(values, mesh.faces) for values in (mesh.normal, mesh.tangent))
-        local = world_to_frame(self._world(edge).reshape(-1, 3)[texels.index], normal, tangent)
+        local = world_to_frame(self.world_normals(edge).reshape(-1, 3)[texels.index], normal, tangent)
         usable = np.isfinite(local).all(1) & (local[:, 2] > 0.05)
         local[~usable] = (0.0, 0.0, 1.0)
         image = fill_empty_texels(texels.image(0.5 + 0.5 * local), texels.covered(), gutter=max(2, edge // 256))

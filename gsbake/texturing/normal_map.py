@@ -66,24 +66,37 @@ def sample_dense_mesh(
 
     `dense_normals` (v, 3) are those of the dense mesh's vertices; `diagonal` is that of the low-poly mesh's bounding box.
     """
+    hits, bound = hits_along_normals(position, normal, dense, dense_normals, diagonal)
+    found = hits.hit
+    found_position, found_normal = np.array(position, np.float64), unit(np.asarray(normal, np.float64))
+    found_position[found] = dense.points(hits)[found]
+    found_normal[found] = _smooth_normal(hits, dense, dense_normals)[found]
+    return DenseSamples(found, found_position, found_normal, bound)
+
+
+def hits_along_normals(
+    position: NDArray[Any], normal: NDArray[Any], surface: RayCaster, surface_normals: NDArray[Any], diagonal: float
+) -> tuple[Hits, float]:
+    """The nearer of the two hits along and against the normals of n points, if it faces the same way and is within the bound; that bound.
+
+    Arguments as of `sample_dense_mesh`; distances of the hits are absolute.
+    """
     p, n = np.asarray(position, np.float64), unit(np.asarray(normal, np.float64))
     max_distance = MAX_DISTANCE * diagonal
     lift = 1e-3 * max_distance  # a surface exactly at the texel is hit by at least one of the two rays
     distance = np.full(len(p), np.inf)
-    found_position, found_normal = p.copy(), n.copy()
+    face, bary = np.full(len(p), -1, np.int32), np.zeros((len(p), 3), np.float32)
     for side in (1.0, -1.0):
-        hits = dense.first_hit(p - side * lift * n, side * n)
+        hits = surface.first_hit(p - side * lift * n, side * n)
         offset = np.abs(hits.distance - lift)
-        smooth = _smooth_normal(hits, dense, dense_normals)
-        take = hits.hit & (offset < distance) & (offset < max_distance) & (np.einsum("nd,nd->n", smooth, n) > MIN_COSINE)
-        distance[take] = offset[take]
-        found_position[take] = dense.points(hits)[take]
-        found_normal[take] = smooth[take]
+        facing = np.einsum("nd,nd->n", _smooth_normal(hits, surface, surface_normals), n) > MIN_COSINE
+        take = hits.hit & (offset < distance) & (offset < max_distance) & facing
+        distance[take], face[take], bary[take] = offset[take], hits.face[take], hits.bary[take]
     near = distance[np.isfinite(distance)]
     bound = float(min(max_distance, BOUND_FACTOR * np.quantile(near, 0.95) + 2 * lift)) if len(near) else 0.0
-    found = distance <= bound
-    found_position[~found], found_normal[~found] = p[~found], n[~found]
-    return DenseSamples(found, found_position, found_normal, bound)
+    far = ~(distance <= bound)
+    face[far], bary[far], distance[far] = -1, 0, np.inf
+    return Hits(face, bary, distance.astype(np.float32)), bound
 
 
 def normal_map(detail: DenseSamples, normal: NDArray[Any], tangent: NDArray[Any]) -> NDArray[np.float32]:

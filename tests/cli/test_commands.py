@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from gsbake.errors import BadInputError
 from tests.cli.conftest import Run
 
 
@@ -33,6 +34,15 @@ def test_run_publishes_the_results_and_caches_the_stages(run: Run, capture: Path
     manifest = json.loads(next(out.glob("stages/ingest/*/manifest.json")).read_text())
     assert set(manifest["inputs"]["photos"]["files"]) == {"a.jpg", "b.jpg", "c.jpg"}
     assert set(manifest["inputs"]["masks"]["files"]) == {"a.png"} and "gt" not in json.dumps(manifest["inputs"])
+
+
+def test_results_of_finished_stages_are_published_though_a_later_one_fails(run: Run, capture: Path, tmp_path: Path) -> None:
+    end = run("run", capture, "--set", "mesh.faces=666")
+    out = tmp_path / "out" / "tankard"
+    assert end.code == BadInputError.exit_code and "no report on such a mesh" in end.err
+    assert (out / "asset.glb").read_text() == "glb ply 666" and not (out / "report.html").exists()
+    assert run("run", capture, "--set", "mesh.faces=667").code == 0  # what was published is known as gsbake's own
+    assert (out / "asset.glb").read_text() == "glb ply 667" and (out / "report.html").exists()
 
 
 def test_output_folder_stores_the_options(run: Run, capture: Path, tmp_path: Path) -> None:

@@ -47,6 +47,8 @@ def _export(ctx: Context) -> dict[str, Any]:
 
 
 def _report(ctx: Context) -> dict[str, Any]:
+    if (ctx.inputs["export"] / "asset.glb").read_text().endswith(" 666"):
+        raise BadInputError("There is no report on such a mesh.")
     (ctx.out / "report.html").write_text("<html>")
     return {}
 

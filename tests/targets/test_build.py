@@ -13,12 +13,17 @@ import trimesh
 from gsbake.config.schema import Export, Targets
 from gsbake.errors import BadInputError
 from gsbake.geometry.tangents import frame_to_world
-from gsbake.gltf.document import Document
+from gsbake.gltf.audit import MAX_NON_UNIT, non_unit_share
+from gsbake.gltf.document import Document, decode_image
+from gsbake.gltf.encode import TextureMaps, quantise
 from gsbake.gltf.read import read_glb
 from gsbake.gltf.scene import open_scene
 from gsbake.gltf.write import GltfMesh
+from gsbake.imaging.jpeg import encode_jpeg
 from gsbake.imaging.srgb import decode_bytes
 from gsbake.targets.build import TargetOptions, build_targets
+from gsbake.targets.images import fit_images
+from gsbake.targets.maps import resized
 from gsbake.texturing.texels import rasterise
 from tests.support.node import gltf_issues
 from tests.support.recorder import Recorder
@@ -68,6 +73,31 @@ def test_budgets_are_kept(folders: dict[str, Path], tmp_path: Path) -> None:
     assert "jpeg" in result["images"]
 
 
+def test_a_mesh_that_its_seams_keep_too_large_gets_new_charts(folders: dict[str, Path], tmp_path: Path) -> None:
+    """A tenth of the triangles, which the seams of the bake do not allow: the maps are carried over to new charts."""
+    from gsbake.config import targets as table
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(table.BUDGETS, "banner", table.Budget(0.02, 120, 512, 512))
+        result = build_targets(folders, tmp_path, TargetOptions(Targets(files=("banner",))))["targets"]["asset_banner.glb"]
+    assert result["bytes"] <= 20_000 and result["triangles"] <= 120
+    asset, mesh = read_glb(tmp_path / "asset_banner.glb"), as_mesh(tmp_path / "asset_banner.glb")
+    base, coded = asset.image("base_color"), asset.image("normal")
+    assert base is not None and coded is not None
+    texels, p = unit_points(mesh, base.shape[0])
+    inside = texels.inside
+    # The ball of so few triangles lies up to a twentieth inside the true one, whose colours it has.
+    direction = p / np.linalg.norm(p, axis=1, keepdims=True)
+    error = np.abs(decode_bytes(base).reshape(-1, 3)[texels.index] - colour(direction * bumpy(direction)[:, None]))[inside]
+    assert error.mean() < 0.02
+    small = rasterise(mesh.uv, mesh.faces, coded.shape[0])
+    n, t = (small.interpolate(values, mesh.faces) for values in (mesh.normal, mesh.tangent))
+    shaded = frame_to_world(coded.reshape(-1, 3)[small.index] / 127.5 - 1, n, t)
+    true = true_normals(unit_points(mesh, coded.shape[0])[1])
+    assert degrees_between(shaded, true)[small.inside].mean() < 0.6 * degrees_between(n.astype(float), true)[small.inside].mean()
+    assert gltf_issues(tmp_path / "asset_banner.glb") == []
+
+
 def test_a_budget_that_cannot_be_met_is_refused(folders: dict[str, Path], tmp_path: Path) -> None:
     from gsbake.config import targets as table
 
@@ -82,6 +112,23 @@ def unit_points(mesh: GltfMesh | Any, size: int) -> tuple[Any, np.ndarray]:
     texels = rasterise(mesh.uv, mesh.faces, size)
     p = texels.interpolate(mesh.position, mesh.faces).astype(float)
     return texels, TO_WORLD.inverse().apply(np.stack([p[:, 0], -p[:, 2], p[:, 1]], 1))
+
+
+def true_normals(p: np.ndarray) -> np.ndarray:
+    """Normals of the bumpy ball, in the asset's frame, in the directions of points in the unit frame."""
+    direction = p / np.linalg.norm(p, axis=1, keepdims=True)
+    step = 1e-4
+    moved = [direction + s * step * e for e in np.eye(3) for s in (1, -1)]
+    radii = [bumpy(d / np.linalg.norm(d, axis=1, keepdims=True)) for d in moved]
+    slope = np.stack([(radii[2 * k] - radii[2 * k + 1]) / (2 * step) for k in range(3)], 1)
+    true = (direction - slope / bumpy(direction)[:, None]) @ TO_WORLD.rotation.T
+    true = np.stack([true[:, 0], true[:, 2], -true[:, 1]], 1)
+    return np.asarray(true / np.linalg.norm(true, axis=1, keepdims=True))
+
+
+def degrees_between(normals: np.ndarray, true: np.ndarray) -> np.ndarray:
+    unit = normals / np.linalg.norm(normals, axis=1, keepdims=True)
+    return np.asarray(np.degrees(np.arccos(np.clip(np.einsum("nd,nd->n", unit, true), -1, 1))))
 
 
 def as_mesh(path: Path) -> GltfMesh:
@@ -105,18 +152,10 @@ def test_levels_show_the_same_surface(built: tuple[Path, dict[str, Any]], name: 
     assert error.mean() < 0.01
     n, t = (texels.interpolate(values, mesh.faces) for values in (mesh.normal, mesh.tangent))
     shaded = frame_to_world(coded.reshape(-1, 3)[texels.index] / 127.5 - 1, n, t)
-    direction = p / np.linalg.norm(p, axis=1, keepdims=True)
-    step = 1e-4
-    moved = [direction + s * step * e for e in np.eye(3) for s in (1, -1)]
-    radii = [bumpy(d / np.linalg.norm(d, axis=1, keepdims=True)) for d in moved]
-    slope = np.stack([(radii[2 * k] - radii[2 * k + 1]) / (2 * step) for k in range(3)], 1)
-    true = (direction - slope / bumpy(direction)[:, None]) @ TO_WORLD.rotation.T
-    true = np.stack([true[:, 0], true[:, 2], -true[:, 1]], 1)
-    true /= np.linalg.norm(true, axis=1, keepdims=True)
+    true = true_normals(p)
 
     def degrees(normals: np.ndarray) -> np.ndarray:
-        unit = normals / np.linalg.norm(normals, axis=1, keepdims=True)
-        return np.degrees(np.arccos(np.clip(np.einsum("nd,nd->n", unit, true), -1, 1)))[inside]
+        return degrees_between(normals, true)[inside]
 
     assert degrees(shaded).mean() < 2.0
     if "lod1" in name:
@@ -196,3 +235,23 @@ def test_the_same_input_gives_the_same_bytes(folders: dict[str, Path], built: tu
     build_targets(folders, tmp_path, options)
     for name in ("asset_banner.glb", "asset_ktx2_meshopt.glb", "asset_ar.usdz"):
         assert (tmp_path / name).read_bytes() == (built[0] / name).read_bytes(), name
+
+
+def test_a_step_that_bends_normals_is_passed_over() -> None:
+    """Noisy normals: JPEG of low quality would fit into the bytes, and fails the audit; fewer texels at a better quality do not."""
+    rng = np.random.default_rng(0)
+
+    def maps(edge: int) -> TextureMaps:
+        tilt = rng.normal(size=(128, 128, 2)).astype(np.float32)
+        coarse = resized(np.dstack([0.5 * tilt, np.ones((128, 128), np.float32)]), edge)
+        normal = coarse / np.linalg.norm(coarse, axis=2, keepdims=True)
+        flat = np.full((edge, edge, 3), 0.5, np.float32)
+        return quantise(flat, flat, 0.5 + 0.5 * normal)
+
+    low = encode_jpeg(np.asarray(maps(128).normal), 82)
+    assert non_unit_share(decode_image(low, "normal map")[..., :3]) > MAX_NON_UNIT
+    budget = len(low) + 4000  # which the step of that quality keeps
+    images, step, _ = fit_images(maps, 128, budget, None)
+    assert images.normal is not None and step.linear[:2] == (1, "jpeg")
+    assert non_unit_share(decode_image(images.normal, "normal map")[..., :3]) < MAX_NON_UNIT
+    assert sum(len(image or b"") for image in (images.base_color, images.orm, images.normal)) <= budget
