@@ -6,20 +6,21 @@ step costs a quarter. The fine level continues from the result for a few steps: 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 from gsbake.materials.fit import MaterialFit
-from gsbake.materials.initialisation import ChosenFit, best_fit, trial_fits
+from gsbake.materials.initialisation import DEFAULT_START, METAL_SEARCHES_AT, ChosenFit, best_fit, trial_fits
 from gsbake.materials.levels import FitLevel
 from gsbake.materials.options import FitSchedule, Priors
+from gsbake.shading.light_motion import Motion
 from gsbake.texturing.resampling import CoarseTexture
 
 #: Steps of a trial, of the continued fit on the coarse level, and on the fine one, as shares of the iterations.
 TRIAL_SHARE, COARSE_SHARE, FINE_SHARE = 0.25, 0.5, 0.25
-#: How often shading left in base colours is moved to the light at the end of the coarse level, where most is dielectric, and the steps
-#: after each, as a share of the iterations, in which texels adapt to it, with their factor on the learning rates. From there the light is
-#: given: gradient steps would move it back, as that base colours have no shading is not part of their loss.
+#: How often shading left in base colours is moved to the light at the end of the coarse level, where most is dielectric and the light
+#: stands, and the steps after each, as a share of the iterations, in which texels adapt to it, with their factor on the learning rates.
+#: From there the light is given: gradient steps would move it back, as that base colours have no shading is not part of their loss.
 SHADING_ROUNDS, ADAPT_SHARE, ADAPT_RATE = 4, 0.05, 0.5
 #: When metals are searched for on the fine level, as a share of its steps.
 FINE_METAL_SEARCHES_AT = (0.3,)
@@ -40,6 +41,18 @@ class FitPlan:
     diffuse: bool = False
 
 
+def compare_light_motions(levels: Mapping[Motion, FitLevel], plan: FitPlan, progress: Progress) -> dict[Motion, float]:
+    """Validation PSNR in dB of a trial on each of the coarse `levels`, whose photos differ in how the light moves."""
+    steps, (metallic, roughness) = max(1, round(TRIAL_SHARE * plan.iterations)), DEFAULT_START
+    schedule = FitSchedule(steps, plan.seed, METAL_SEARCHES_AT, emission=False, intensity=False, sparsity=False, diffuse=plan.diffuse)
+    found: dict[Motion, float] = {}
+    for motion, level in levels.items():
+        fit = MaterialFit(level.surface, plan.light_size, plan.priors, roughness, metallic)
+        fitted = fit.run(level.fitted, level.held_out, schedule, lambda done, total: progress("trial fits of moving lights", done, total))
+        found[motion] = fitted.held_out_psnr or 0.0
+    return found
+
+
 def fit_two_levels(coarse: FitLevel, fine: FitLevel, texture: CoarseTexture, plan: FitPlan, progress: Progress) -> ChosenFit:
     """The fit on the `fine` level, whose texels `texture` reduces to those of `coarse`."""
 
@@ -56,7 +69,7 @@ def fit_two_levels(coarse: FitLevel, fine: FitLevel, texture: CoarseTexture, pla
     schedule = FitSchedule(steps(COARSE_SHARE), plan.seed, diffuse=plan.diffuse)
     choice = best_fit(trials, coarse, schedule, each("material fit, coarse level"))
     refine = replace(schedule, emission=False, intensity=False, metal_searches_at=FINE_METAL_SEARCHES_AT, iterations=steps(FINE_SHARE))
-    if choice.fit.mostly_dielectric:
+    if choice.fit.mostly_dielectric and not choice.fit.moving_light:
         refine = replace(refine, fixed_light=True)
         adapt = replace(refine, iterations=steps(ADAPT_SHARE), metal_searches_at=(), rate=ADAPT_RATE)
         for turn in range(SHADING_ROUNDS):
