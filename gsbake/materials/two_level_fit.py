@@ -8,9 +8,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 
 from gsbake.materials.fit import MaterialFit
-from gsbake.materials.initialisation import DEFAULT_START, METAL_SEARCHES_AT, ChosenFit, best_fit, trial_fits
+from gsbake.materials.fit_surface import Fitted
+from gsbake.materials.initialisation import DEFAULT_START, ChosenFit, Trials, best_fit, trial_fits, trial_schedule
 from gsbake.materials.levels import FitLevel
 from gsbake.materials.options import FitSchedule, Priors
 from gsbake.shading.light_motion import Motion
@@ -40,24 +42,28 @@ class FitPlan:
     seed: int = 0
     diffuse: bool = False
 
+    def steps(self, share: float) -> int:
+        """Steps of a share of the iterations; at least one."""
+        return max(1, round(share * self.iterations))
 
-def compare_light_motions(levels: Mapping[Motion, FitLevel], plan: FitPlan, progress: Progress) -> dict[Motion, float]:
-    """Validation PSNR in dB of a trial on each of the coarse `levels`, whose photos differ in how the light moves."""
-    steps, (metallic, roughness) = max(1, round(TRIAL_SHARE * plan.iterations)), DEFAULT_START
-    schedule = FitSchedule(steps, plan.seed, METAL_SEARCHES_AT, emission=False, intensity=False, sparsity=False, diffuse=plan.diffuse)
-    found: dict[Motion, float] = {}
+
+def compare_light_motions(levels: Mapping[Motion, FitLevel], plan: FitPlan, progress: Progress) -> dict[Motion, tuple[MaterialFit, Fitted]]:
+    """Trials from the default start on the coarse `levels`, whose photos differ in how the light moves."""
+    steps, (metallic, roughness) = plan.steps(TRIAL_SHARE), DEFAULT_START
+    schedule = trial_schedule(steps, plan.seed, plan.diffuse)
+    found: dict[Motion, tuple[MaterialFit, Fitted]] = {}
     for motion, level in levels.items():
         fit = MaterialFit(level.surface, plan.light_size, plan.priors, roughness, metallic)
-        fitted = fit.run(level.fitted, level.held_out, schedule, lambda done, total: progress("trial fits of moving lights", done, total))
-        found[motion] = fitted.held_out_psnr or 0.0
+        each: Callable[[int, int], None] = partial(progress, "trial fits of moving lights")
+        found[motion] = fit, fit.run(level.fitted, level.held_out, schedule, each)
     return found
 
 
-def fit_two_levels(coarse: FitLevel, fine: FitLevel, texture: CoarseTexture, plan: FitPlan, progress: Progress) -> ChosenFit:
-    """The fit on the `fine` level, whose texels `texture` reduces to those of `coarse`."""
-
-    def steps(share: float) -> int:
-        return max(1, round(share * plan.iterations))
+def fit_two_levels(
+    coarse: FitLevel, fine: FitLevel, texture: CoarseTexture, plan: FitPlan, progress: Progress, known: Trials | None = None
+) -> ChosenFit:
+    """The fit on the `fine` level, whose texels `texture` reduces to those of `coarse`; `known` are trials that are already there."""
+    steps = plan.steps
 
     def each(name: str) -> Callable[[int, int], None]:
         return lambda done, total: progress(name, done, total)
@@ -65,7 +71,7 @@ def fit_two_levels(coarse: FitLevel, fine: FitLevel, texture: CoarseTexture, pla
     def make(metallic: float, roughness: float) -> MaterialFit:
         return MaterialFit(coarse.surface, plan.light_size, plan.priors, roughness, metallic)
 
-    trials = trial_fits(make, coarse, steps(TRIAL_SHARE), plan.seed, plan.diffuse, each("trial fits"))
+    trials = trial_fits(make, coarse, steps(TRIAL_SHARE), plan.seed, plan.diffuse, each("trial fits"), known)
     schedule = FitSchedule(steps(COARSE_SHARE), plan.seed, diffuse=plan.diffuse)
     choice = best_fit(trials, coarse, schedule, each("material fit, coarse level"))
     refine = replace(schedule, emission=False, intensity=False, metal_searches_at=FINE_METAL_SEARCHES_AT, iterations=steps(FINE_SHARE))
