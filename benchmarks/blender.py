@@ -63,6 +63,8 @@ def _picture(rgba: np.ndarray) -> RenderedImage:
 def figures(out: Path, python: str, views: int) -> tuple[float, float]:
     """Mean PSNR in dB of Blender's pictures and of our own over test photos of the run in `out`."""
     stages = {name: _newest(out, name) for name in ("poses", "refine", "bake", "export")}
+    if (stages["bake"] / "light_motion.json").exists():
+        raise SystemExit(f"{out}: the light moves from photo to photo; light.hdr is that of the first one alone.")
     posed = PosedPhotos.open(stages["poses"], stages["refine"])
     cameras = read_transforms_json(stages["export"] / "cameras.json")
     holdout = json.loads((stages["bake"] / "manifest.json").read_text())["settings"].get("train.holdout", 8)

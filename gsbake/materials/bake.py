@@ -69,8 +69,8 @@ def bake_textures(
     """Unwrap the mesh of the folder `mesh` and bake its textures from the photos into the folder `out`; return the figures.
 
     Written: `mesh.safetensors` (the unwrapped mesh with its tangent frames), `base_color.exr`, `orm.exr`, `coverage.exr`, where needed
-    `normal.exr` and `emissive.exr`, with materials `light.safetensors`. Raises BadInputError when the mesh is damaged, does not fit the
-    atlas, or is visible in no photo.
+    `normal.exr` and `emissive.exr`, with materials `light.safetensors`, where the light moves `light_motion.json`. Raises BadInputError
+    when the mesh is damaged, does not fit the atlas, or is visible in no photo.
     """
     return _Baking(PosedPhotos.open(poses, surfels), surfels, mesh, out, options or BakeOptions(), seed, threads, monitor).run()
 
@@ -182,6 +182,8 @@ class _Baking:
             with monitor.part("fit"):
                 fitted = fit_materials(surface, self.posed, projected, detail, occlusion, fit, self.seed, monitor)
             fitted.light.save(light)
+            if fitted.light_motion.rotations is not None:
+                fitted.light_motion.save(self.out / "light_motion.json")
             return Textures(fitted.textures, fitted.normal, fitted.figures)
         return Textures(projected, detail, {})
 

@@ -77,7 +77,7 @@ def find_irradiance(colour: NDArray[Any], normal: NDArray[Any], position: NDArra
 
     `colour` (n, 3) linear, `normal` (n, 3) unit, `position` (n, 3), `occlusion` (n,) ambient occlusion, 1 = open.
     """
-    a, b = _pairs(np.asarray(position, np.float64))
+    a, b = nearby_pairs(np.asarray(position, np.float64), NEIGHBOURS, NEIGHBOUR_RADIUS)
     logs = np.log(np.maximum(colour, 0).astype(np.float64) + LOG_OFFSET)
     brightness = logs.mean(1)
     chroma = logs - brightness[:, None]
@@ -112,12 +112,13 @@ def remove_shading(
     return np.clip(base, 0, 1).astype(np.float32), intensity
 
 
-def _pairs(position: Floats) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Indices (m,), (m,) of neighbouring points at `position` (n, 3), every pair once."""
+def nearby_pairs(position: Floats, neighbours: int, radius_share: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Indices (m,), (m,) of points at `position` (n, 3) that are among the nearest `neighbours` of one another within `radius_share` of the
+    diagonal, every pair once."""
     if len(position) < 2:
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
-    radius = NEIGHBOUR_RADIUS * float(np.linalg.norm(np.ptp(position, axis=0)))
-    count = min(NEIGHBOURS + 1, len(position))
+    radius = radius_share * float(np.linalg.norm(np.ptp(position, axis=0)))
+    count = min(neighbours + 1, len(position))
     near = cKDTree(position).query(position, k=count, distance_upper_bound=radius)[1].astype(np.int64)
     own = np.repeat(np.arange(len(position)), count)
     other = near.ravel()

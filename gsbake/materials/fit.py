@@ -39,12 +39,13 @@ from gsbake.materials.fit_surface import FitSurface, Fitted
 from gsbake.materials.light_intensity import LightAdjustment, adjust_radiance, search_light
 from gsbake.materials.metallic import PhotoSamples, find_metals
 from gsbake.materials.options import FitOptions, FitSchedule, Priors
-from gsbake.materials.photo_batch import EMISSION, INDIRECT, OUTGOING, VISIBILITY, FitStep, KernelTables, PhotoBatch
+from gsbake.materials.photo_batch import EMISSION, INDIRECT, OUTGOING, VISIBILITY, FitStep, KernelTables, PhotoBatch, PhotoLights
 from gsbake.materials.pixels import Pixels
 from gsbake.materials.remaining_shading import MATCHED_POINTS, remaining_shading, with_irradiance_factor
 from gsbake.materials.sparsity_prior import KERNEL_WIDTHS, common_materials
 from gsbake.shading.cubemap import solid_angles
 from gsbake.shading.environment import EnvironmentLight
+from gsbake.shading.light_motion import mean_radiance, rotated
 from gsbake.shading.light_tables import prefilter_cube_map
 from gsbake.shading.neutral_light import neutral_light_loss
 from gsbake.texturing.resampling import DETAIL_OFFSET, MAX_DETAIL_RATIO
@@ -81,6 +82,7 @@ class MaterialFit:
         self._transport[:, :2] = surface.occlusion[:, None]
         self._light = EnvironmentLight(light_size)
         self._common = np.zeros((0, 4), np.float32)
+        self._rotations: list[NDArray[np.float64] | None] = []  # of the fitted photos' lights
         self._residual = np.zeros(2)  # sums of weighted squared errors and of weights
         self._adam_light = torch.optim.Adam([self._light.raw], lr=o.light_rate, betas=o.betas)
 
@@ -122,7 +124,8 @@ class MaterialFit:
         order: list[int] = []
         self._common, self._residual = np.zeros((0, 4), np.float32), np.zeros(2)
         weight = self._texel_weight(batches)
-        given = self._tables() if schedule.fixed_light else None
+        self._rotations = [batch.to_light for batch in batches]
+        given = PhotoLights(self._light.radiance().detach()) if schedule.fixed_light else None
         for step in range(steps if batches else 0):
             update_common = step % o.sparsity_interval == 0
             if schedule.emission and step == int(o.emission_search_at * steps):
@@ -159,15 +162,15 @@ class MaterialFit:
             weight[touched] += np.add.reduceat(share * batch.weight[pixel], start[:-1])
         return weight.astype(np.float32)
 
-    def _step(self, batch: PhotoBatch, decay: float, given: KernelTables | None) -> None:
+    def _step(self, batch: PhotoBatch, decay: float, given: PhotoLights | None) -> None:
         """One Adam step on the pixels of one photo, with learning rates times `decay`; of the texels alone under a `given` light."""
         o = self._options
         if given is not None:
-            self._shade(batch, given)
+            self._shade(batch, given.tables(batch.to_light))
             self._update_texels(decay)
             return
         radiance = self._light.radiance()
-        tables = prefilter_cube_map(radiance)
+        tables = prefilter_cube_map(rotated(radiance, batch.to_light))
         self._shade(batch, KernelTables.of(tables))
         self._adam_light.zero_grad()
         self._adam_light.param_groups[0]["lr"] = o.light_rate * decay
@@ -220,7 +223,7 @@ class MaterialFit:
         transport = self._surface.transport
         if transport is None:
             return
-        visible = transport.visible_share(self._radiance())
+        visible = transport.visible_share(self._mean_radiance())
         self._transport[:, VISIBILITY] = visible
         if self._surface.indirect:
             # Albedo of both lobes together, (1 − m) base colour + F0: indirect light is not sharp enough to depend on roughness.
@@ -231,17 +234,21 @@ class MaterialFit:
             self._transport[:, OUTGOING] = reflectance * (irradiance + indirect) + self._transport[:, EMISSION]
 
     def _radiance(self) -> Floats:
-        """The environment map (6, size, size, 3)."""
+        """The environment map (6, size, size, 3) in the frame in which it stands."""
         return np.asarray(self._light.radiance().detach().numpy())
+
+    def _mean_radiance(self) -> Floats:
+        """The environment map (6, size, size, 3) in the object's frame, the mean over photos where the light moves."""
+        return mean_radiance(self._radiance(), self._rotations)
 
     @torch.no_grad()
     def _irradiance(self) -> Floats:
-        """Irradiance / π (n, 3) of unoccluded texels."""
-        return np.asarray(self._light.prefilter().diffuse(torch.from_numpy(self._normal)).numpy())
+        """Irradiance / π (n, 3) of unoccluded texels, the mean over photos where the light moves."""
+        return np.asarray(prefilter_cube_map(torch.from_numpy(self._mean_radiance())).diffuse(torch.from_numpy(self._normal)).numpy())
 
-    @torch.no_grad()
-    def _tables(self) -> KernelTables:
-        return KernelTables.of(self._light.prefilter())
+    def _lights(self) -> PhotoLights:
+        """The present light as photos see it."""
+        return PhotoLights(self._light.radiance().detach())
 
     def _find_common_materials(self) -> Floats:
         """The common material (n, 4) that the sparsity prior draws each texel to; emissive texels, whose base colour hardly shows, keep
@@ -260,12 +267,13 @@ class MaterialFit:
     def _search_light(self, batches: list[PhotoBatch], generator: np.random.Generator, tint: bool, rough: bool) -> LightAdjustment:
         """Search for the light's intensity and contrast and for a roughness shift, apply them, and adapt base colours."""
         o, values = self._options, self._values
-        dielectric = self._dielectric()
-        if dielectric.mean() < o.min_dielectric_share:
+        if not self.mostly_dielectric:
             return self._anchor_metals()
+        dielectric = self._dielectric()
         share = min(1.0, o.intensity_pixels / max(1, sum(map(len, batches))))
         chosen = dielectric & (generator.random(len(dielectric)) < share)
-        subset = [part for b in batches if len(part := b.select(chosen))]
+        step = -(-len(batches) // o.moving_light_photos) if self.moving_light else 1
+        subset = [part for b in batches[::step] if len(part := b.select(chosen))]
         if not subset:
             return LightAdjustment(np.ones(3), 1.0, 0.0, 0.0)
         radiance, area = self._radiance(), solid_angles(self._light.size)
@@ -279,10 +287,10 @@ class MaterialFit:
             transport = self._transport.copy()
             if self._surface.transport is not None:
                 if contrast not in visible:
-                    visible[contrast] = self._surface.transport.visible_share(light.radiance().numpy())
+                    visible[contrast] = self._surface.transport.visible_share(mean_radiance(light.radiance().numpy(), self._rotations))
                 transport[:, VISIBILITY] = visible[contrast]
-            tables = KernelTables.of(light.prefilter())
-            return [b.samples(values[:, 5:], tables, transport) for b in subset]
+            lights = PhotoLights(light.radiance())
+            return [b.samples(values[:, 5:], lights.tables(b.to_light), transport) for b in subset]
 
         mean_base = float(np.exp(np.log(values[dielectric, :3].max(1) + o.log_offset).mean()))
         found = search_light(samples_under, values[:, 3].copy(), tint, rough, mean_base)
@@ -305,13 +313,20 @@ class MaterialFit:
         new[:, :3] = np.clip(new[:, :3] * before[texel] / np.maximum(after[texel], 1e-6), o.min_base_color, o.base_color_range[1])
         self._reinitialise(texel, new)
 
+    @property
+    def moving_light(self) -> bool:
+        """Whether the light moves from photo to photo."""
+        return any(rotation is not None for rotation in self._rotations)
+
+    @property
+    def mostly_dielectric(self) -> bool:
+        """Whether so much is dielectric that its diffuse colours tell of the light."""
+        return bool(self._dielectric().mean() >= self._options.min_dielectric_share)
+
     @torch.no_grad()
     def move_shading_to_light(self, seed: int) -> None:
-        """Move the shading that is left in the base colours of dielectrics to the light; not where less than half is dielectric."""
-        dielectric = self._dielectric()
-        if dielectric.mean() < self._options.min_dielectric_share:
-            return
-        generator, texel = np.random.default_rng(seed), np.flatnonzero(dielectric)
+        """Move the shading that is left in the base colours of dielectrics to the light."""
+        generator, texel = np.random.default_rng(seed), np.flatnonzero(self._dielectric())
         unit = self._normal / np.maximum(np.linalg.norm(self._normal, axis=1, keepdims=True), 1e-12)
         coefficients = remaining_shading(self._values[texel, :3], unit[texel], np.asarray(self._surface.position)[texel], generator)
         matched = unit[generator.choice(texel, min(MATCHED_POINTS, len(texel)), replace=False)]
@@ -345,8 +360,8 @@ class MaterialFit:
 
     def _samples(self, batches: list[PhotoBatch], tilted: bool = False) -> list[PhotoSamples]:
         """All pixels under the present light, with `tilted` normals as well."""
-        tables = self._tables()
-        return [b.samples(self._values[:, 5:], tables, self._transport, tilted) for b in batches]
+        lights = self._lights()
+        return [b.samples(self._values[:, 5:], lights.tables(b.to_light), self._transport, tilted) for b in batches]
 
     def _search_metals(self, batches: list[PhotoBatch]) -> None:
         """Reinitialise texels that are detected as metal, and from a metallic start those that are dielectric."""
@@ -383,7 +398,7 @@ class MaterialFit:
     def samples_of(self, pixels: Pixels, chosen: NDArray[np.bool_]) -> tuple[NDArray[np.int64], PhotoSamples]:
         """Which (m,) of the `pixels` have a dominant texel that is `chosen` (n,), and their samples under the fitted light."""
         batch = PhotoBatch.of(pixels, self._normal)
-        samples = batch.select(chosen).samples(self._values[:, 5:], self._tables(), self._transport)
+        samples = batch.select(chosen).samples(self._values[:, 5:], self._lights().tables(batch.to_light), self._transport)
         return np.flatnonzero(chosen[batch.dominant_texel]), samples
 
     def psnr(self, photos: list[Pixels], values: Floats | None = None) -> float | None:
@@ -392,8 +407,11 @@ class MaterialFit:
         if not batches:
             return None
         materials = self._values if values is None else np.column_stack([values[:, :5], self._values[:, 5:]]).astype(np.float32)
-        tables, o = self._tables(), self._options
-        sums = np.sum([self._step_buffers(b, materials, tables, self._transport, 1.0, o.robust_scale, 0.0) for b in batches], axis=0)
+        lights, o = self._lights(), self._options
+        sums = np.sum(
+            [self._step_buffers(b, materials, lights.tables(b.to_light), self._transport, 1.0, o.robust_scale, 0.0) for b in batches],
+            axis=0,
+        )
         return decibels(float(sums[1] / sums[2]))
 
 

@@ -6,7 +6,7 @@ The fit works on two levels (`levels`): starts are compared and searches made on
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
@@ -19,19 +19,20 @@ from gsbake.config.schema import Bake
 from gsbake.geometry.cameras import Camera
 from gsbake.materials.adjacency import neighbours
 from gsbake.materials.fit_surface import FitSurface, Fitted
-from gsbake.materials.initialisation import ChosenFit
+from gsbake.materials.initialisation import DEFAULT_START, ChosenFit, Trials
 from gsbake.materials.levels import FitLevel, InterpolatedTransport, coarse_pixels, coarse_surface
 from gsbake.materials.map_selection import drop_unneeded_maps
 from gsbake.materials.metal_superresolution import superresolve_metals
 from gsbake.materials.options import Priors
 from gsbake.materials.pixels import PixelReader, Pixels
 from gsbake.materials.reflections import ReflectionTracer
-from gsbake.materials.two_level_fit import FitPlan, fit_two_levels
+from gsbake.materials.two_level_fit import FitPlan, compare_light_motions, fit_two_levels
 from gsbake.materials.view_dependence import SURFACE_POINTS, MeshBrightness
 from gsbake.materials.visibility import Visibility
 from gsbake.meshing.resolution import pixel_footprint
 from gsbake.monitor import Monitor, Rule, decide_skip, skips
 from gsbake.shading.environment import EnvironmentLight
+from gsbake.shading.light_motion import LightMotion, Motion, light_rotations
 from gsbake.surfels.training.views import held_out, test_photos, validation_photos
 from gsbake.texturing.normal_map import DenseSamples
 from gsbake.texturing.projection import ProjectedTexture
@@ -46,6 +47,10 @@ RAY_OFFSET = 0.002
 SMOOTHING_RADIUS = 3.0
 #: Largest number of pixels of each photo that materials are fitted to.
 MAX_PIXELS = 60_000
+#: Gain in dB on validation photos from which a light is taken to move.
+MIN_MOTION_GAIN = 0.5
+#: What a light does, in words.
+_MOTIONS = {"static": "stands", "turntable": "turns with the cameras (turntable)", "camera": "moves with the camera"}
 #: Least weight of a texel, in frontal views at a texel's size, for its normal to be refined and for it to count as observed.
 MIN_OBSERVATIONS = 0.3
 
@@ -66,12 +71,13 @@ class FitSettings:
 @dataclass(frozen=True)
 class FittedTextures:
     """`textures`: base colour, roughness, metallic (n, 5), with emission (n, 8) where there is any; `normal` of the texels; the `light` in
-    the unit frame; `figures` for the manifest."""
+    the unit frame, where it moves as the first photo saw it; `figures` for the manifest; how the light moves."""
 
     textures: ProjectedTexture
     normal: DenseSamples
     light: EnvironmentLight
     figures: dict[str, Any]
+    light_motion: LightMotion = LightMotion()
 
 
 def fit_materials(
@@ -95,7 +101,7 @@ def fit_materials(
 @dataclass(frozen=True)
 class _PhotoPixels:
     """Pixels of the photos to fit with their `cameras`, of those that decisions look at and of those that nothing looks at, whether the
-    surface is `diffuse`, and the `evidence`."""
+    surface is `diffuse`, the `evidence`, and the `indices` of the photos in the three roles."""
 
     fitted: list[Pixels]
     cameras: list[Camera]
@@ -103,6 +109,15 @@ class _PhotoPixels:
     test: list[Pixels]
     diffuse: bool
     evidence: str
+    indices: tuple[list[int], list[int], list[int]]
+
+    def under(self, rotations: NDArray[np.float64] | None) -> _PhotoPixels:
+        """The same under a light that is turned for each photo of the capture by `rotations` (photos, 3, 3); None: it stands."""
+        if rotations is None:
+            return self
+        roles = zip((self.fitted, self.validation, self.test), self.indices, strict=True)
+        fitted, validation, test = ([replace(p, to_light=rotations[i]) for p, i in zip(*role, strict=True)] for role in roles)
+        return replace(self, fitted=fitted, validation=validation, test=test)
 
 
 @dataclass
@@ -117,6 +132,8 @@ class _Fitting:
     settings: FitSettings
     seed: int
     monitor: Monitor
+    light_motion: LightMotion = LightMotion()
+    trials: Trials = field(default_factory=dict)
 
     def run(self) -> FittedTextures:
         """Choose the texture size, read the photos' pixels, trace visibility, fit, and resample to the full texture."""
@@ -126,6 +143,7 @@ class _Fitting:
         diffuse = skips(self.settings.specular, pixels.diffuse)
         if fine.transport is not None and self.settings.bake.visibility == "reflections" and not diffuse:
             pixels = self._trace_reflections(pixels, fine)
+        pixels = self._under_moving_light(coarse, pixels, diffuse)
         choice = self._fit(fine, coarse, pixels, diffuse)
         values = self._full_texture(choice, pixels)
         return self._result(choice, values, footprint, pixels)
@@ -165,8 +183,10 @@ class _Fitting:
             pixels.append(read.without_gain(self.projected.gains[index]))
             cameras.append(view.camera)
         fitted = sorted(set(range(count)) - validation - test)
-        photos, chosen, untouched = ([pixels[i] for i in sorted(role)] for role in (fitted, validation, test))
-        return _PhotoPixels(photos, [cameras[i] for i in fitted], chosen, untouched, *is_diffuse(*brightness.statistics()))
+        indices = (fitted, sorted(validation), sorted(test))
+        photos, chosen, untouched = ([pixels[i] for i in role] for role in indices)
+        self.cameras = cameras
+        return _PhotoPixels(photos, [cameras[i] for i in fitted], chosen, untouched, *is_diffuse(*brightness.statistics()), indices)
 
     def _trace_reflections(self, pixels: _PhotoPixels, texels: FitSurface) -> _PhotoPixels:
         """The pixels with the texels that their reflected rays hit."""
@@ -194,26 +214,49 @@ class _Fitting:
         )  # fmt: skip
         return replace(fine, transport=InterpolatedTransport(transport, self.half)), replace(coarse, transport=transport)
 
-    def _fit(self, fine_texels: FitSurface, coarse_texels: FitSurface, pixels: _PhotoPixels, diffuse: bool) -> ChosenFit:
-        """Compare starts on the coarse level, and fit the fine one from the best; `diffuse`: without specular reflection.
+    def _plan(self, diffuse: bool) -> FitPlan:
+        settings = self.settings.bake
+        return FitPlan(settings.fit_iterations, self.settings.light_size, Priors.of(settings), self.seed, diffuse)
 
-        Few photos are held out, so the coarse level adds some of those to fit to the validation photos; the fine level fits them.
-        """
-        settings, monitor, light_size = self.settings.bake, self.monitor, self.settings.light_size
+    def _each(self, name: str, done: int, total: int) -> None:
+        self.monitor.check_stop()
+        self.monitor.progress(done, total, name)
+
+    def _coarse_level(self, texels: FitSurface, pixels: _PhotoPixels) -> FitLevel:
+        """The coarse level. Few photos are held out, so it adds some of those to fit to the validation photos; the fine level fits them."""
         reduce = partial(coarse_pixels, texture=self.half)
         photos, validation = [*map(reduce, pixels.fitted)], [*map(reduce, pixels.validation)]
         added = set(held_out(len(photos), self.settings.holdout)) if validation else set()
         kept = [p for i, p in enumerate(photos) if i not in added]
-        coarse = FitLevel(coarse_texels, kept, validation + [photos[i] for i in sorted(added)])
-        fine = FitLevel(fine_texels, pixels.fitted, pixels.validation)
+        return FitLevel(texels, kept, validation + [photos[i] for i in sorted(added)])
 
-        def each(name: str, done: int, total: int) -> None:
-            monitor.check_stop()
-            monitor.progress(done, total, name)
+    def _under_moving_light(self, texels: FitSurface, pixels: _PhotoPixels, diffuse: bool) -> _PhotoPixels:
+        """The pixels under the light that moves as `bake.light_motion` says, or as explains the validation photos best."""
+        asked = self.settings.bake.light_motion
+        if asked == "auto" and (diffuse or not any(map(len, pixels.validation))):
+            return pixels
+        motions: tuple[Motion, ...] = ("turntable", "camera") if asked == "auto" else (asked,)
+        under = {motion: r for motion in motions if (r := light_rotations(self.cameras, motion)) is not None}
+        if asked != "auto":
+            self.light_motion = LightMotion(asked, under.get(asked))
+            self.monitor.decide("light", _MOTIONS[self.light_motion.motion], "bake.light_motion")
+            return pixels.under(self.light_motion.rotations)
+        if not under:
+            return pixels
+        levels: dict[Motion, FitLevel] = {"static": self._coarse_level(texels, pixels)}
+        levels |= {motion: self._coarse_level(texels, pixels.under(rotations)) for motion, rotations in under.items()}
+        trials = compare_light_motions(levels, self._plan(diffuse), self._each)
+        scores = {motion: fitted.held_out_psnr or 0.0 for motion, (_, fitted) in trials.items()}
+        best = max(scores, key=lambda motion: scores[motion] - (0 if motion == "static" else MIN_MOTION_GAIN))
+        self.light_motion, self.trials = LightMotion(best, under.get(best)), {DEFAULT_START: trials[best]}
+        self.monitor.decide("light", _MOTIONS[best], ", ".join(f"{score:.2f} dB where it {_MOTIONS[m]}" for m, score in scores.items()))
+        return pixels.under(self.light_motion.rotations)
 
+    def _fit(self, fine_texels: FitSurface, coarse_texels: FitSurface, pixels: _PhotoPixels, diffuse: bool) -> ChosenFit:
+        """Compare starts on the coarse level, and fit the fine one from the best; `diffuse`: without specular reflection."""
+        fine, plan = FitLevel(fine_texels, pixels.fitted, pixels.validation), self._plan(diffuse)
         started = time.perf_counter()
-        plan = FitPlan(settings.fit_iterations, light_size, Priors.of(settings), self.seed, diffuse)
-        choice = fit_two_levels(coarse, fine, self.half, plan, each)
+        choice = fit_two_levels(self._coarse_level(coarse_texels, pixels), fine, self.half, plan, self._each, self.trials)
         seconds = time.perf_counter() - started
         self._report(choice, pixels, 0.0 if diffuse else seconds)
         return choice
@@ -263,7 +306,7 @@ class _Fitting:
             "fit_emissive_regions": fitted.emissive_regions,
         }
         textures = replace(self.projected, values=values, views=np.where(observed, self.projected.views, 0))
-        return FittedTextures(textures, replace(self.detail, normal=normal), fitted.light, figures)
+        return FittedTextures(textures, replace(self.detail, normal=normal), fitted.light, figures, self.light_motion)
 
 
 def _metals(fitted: Fitted) -> NDArray[np.bool_]:

@@ -28,6 +28,8 @@ CANDIDATE_MARGIN = 1.0
 
 #: Initial metallic and roughness.
 Start = tuple[float, float]
+#: Trials by their start, with their results.
+Trials = dict[Start, tuple[MaterialFit, Fitted]]
 #: Builds a fit on the coarse level from a start.
 MakeFit = Callable[[float, float], MaterialFit]
 #: Called after every step with the number of steps done and their total.
@@ -47,21 +49,26 @@ class ChosenFit:
     evidence: str
 
 
-def trial_fits(make: MakeFit, level: FitLevel, steps: int, seed: int, diffuse: bool, each: Each) -> dict[Start, tuple[MaterialFit, Fitted]]:
+def trial_schedule(steps: int, seed: int, diffuse: bool) -> FitSchedule:
+    """What a trial of `steps` steps does."""
+    return FitSchedule(steps, seed, METAL_SEARCHES_AT, emission=False, intensity=False, sparsity=False, diffuse=diffuse)
+
+
+def trial_fits(make: MakeFit, level: FitLevel, steps: int, seed: int, diffuse: bool, each: Each, known: Trials | None = None) -> Trials:
     """Fits of `steps` steps on the coarse `level`: from all `STARTS`, or the default one for a `diffuse` object or without validation
-    photos."""
+    photos; those of the starts in `known` are taken from there."""
     starts: tuple[Start, ...] = STARTS
     if diffuse or not any(map(len, level.held_out)):
         starts = (DIFFUSE_START if diffuse else DEFAULT_START,)
-    plan = FitSchedule(steps, seed, METAL_SEARCHES_AT, emission=False, intensity=False, sparsity=False, diffuse=diffuse)
-    found: dict[Start, tuple[MaterialFit, Fitted]] = {}
+    plan, found = trial_schedule(steps, seed, diffuse), dict(known or {})
     for start in starts:
-        fit = make(*start)
-        found[start] = fit, fit.run(level.fitted, level.held_out, plan, each)
+        if start not in found:
+            fit = make(*start)
+            found[start] = fit, fit.run(level.fitted, level.held_out, plan, each)
     return found
 
 
-def best_fit(trials: dict[Start, tuple[MaterialFit, Fitted]], level: FitLevel, plan: FitSchedule, each: Each) -> ChosenFit:
+def best_fit(trials: Trials, level: FitLevel, plan: FitSchedule, each: Each) -> ChosenFit:
     """The fit with the best validation PSNR on `level` of those that continue the best of the `trials` by `plan`."""
     scores = {start: fitted.held_out_psnr or 0.0 for start, (_, fitted) in trials.items()}
     evidence = _scores(scores) if len(scores) > 1 else ("diffuse object" if plan.diffuse else "no validation photos")

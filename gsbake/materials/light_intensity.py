@@ -11,12 +11,13 @@ differentiation of pseudo-inverses and nonlinear least squares problems whose va
 
     L' = s · mean(L) · (L / mean(L))^γ / mean of the same
 
-of intensity s and contrast γ, and one shift of logit(roughness) for all dielectric texels, by coordinate descent as long as residuals fall;
-at the end the intensity of single colour channels. Roughness takes part because a wrong one biases the light: reflections that a too
-smooth material would show, and photos do not, favour a dim, uniform environment, from which coordinate descent in the light alone does not
-return. Base colours are solved robustly by reweighting, so that misplaced reflections do not decide. Residuals are of sRGB values, averaged
-over blocks of a twelfth of the object: a sharp reflection that is misplaced by a few pixels would otherwise favour a darker light, by
-regression dilution (Fuller, *Measurement Error Models*, 1987).
+of intensity s and contrast γ, and one shift of logit(roughness) for all dielectric texels, by coordinate descent as long as residuals
+fall; at the end the intensity between two steps, by a parabola through the logarithms of the costs, and that of single colour channels.
+Roughness takes part because a wrong one biases the light: reflections that a too smooth material would show, and photos do not, favour a
+dim, uniform environment, from which coordinate descent in the light alone does not return. Base colours are solved robustly by
+reweighting, so that misplaced reflections do not decide. Residuals are of sRGB values, averaged over blocks of a twelfth of the object: a
+sharp reflection that is misplaced by a few pixels would otherwise favour a darker light, by regression dilution (Fuller, *Measurement
+Error Models*, 1987).
 
 On rough materials reflections hardly tell the intensity, and the residual is flat over a factor of three. There a prior decides: the
 logarithms of mean base colours of objects follow Student's t with two degrees of freedom (some objects are black), and the residuals count
@@ -27,6 +28,7 @@ as `OBSERVATIONS` independent ones of a Laplace distribution, so with z = log(me
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -55,6 +57,8 @@ MIN_DECREASE, MIN_ROUGHER_DECREASE, MIN_SECOND_DECREASE = 0.002, 0.01, 0.03
 TYPICAL_BASE_COLOUR, SPREAD = 0.3, 0.66
 #: Number of independent residuals that evidence for the intensity counts as: errors of the model are shared by all pixels.
 OBSERVATIONS = 5.0
+#: Costs below this are noise.
+MIN_COST = 1e-9
 #: Rounds of reweighting, and the residual of an sRGB value (0..1) from which pixels weigh less.
 REWEIGHTING_ROUNDS, ROBUST_SCALE = 2, 0.02
 
@@ -138,11 +142,19 @@ def search_light(
                     best, tried, moved = tried, tried.step(*direction), True
         return best
 
+    def between_steps(best: _Candidate) -> _Candidate:
+        below, here, above = (math.log(max(cost(best.step(k, 0, 0)), MIN_COST)) for k in (-1, 0, 1))
+        if (curvature := below - 2 * here + above) <= 0:
+            return best
+        tried = best.step(float(np.clip((below - above) / (2 * curvature), -1, 1)), 0, 0)
+        return tried if cost(tried) < cost(best) else best
+
     start = _Candidate(0, 0, 0)
     best = descend(start)
     if rough:
         second = descend(start.step(*SECOND_START))
         best = second if cost(second) < (1 - MIN_SECOND_DECREASE) * cost(best) else best
+    best = between_steps(best)
     if tint:
         best = _tinted(best, residual)
     improvement = 1 - cost(best) / max(cost(start), 1e-12)
@@ -153,7 +165,7 @@ def search_light(
 class _Candidate:
     """A candidate, in steps of intensity, contrast and roughness, and of each colour channel's tint."""
 
-    intensity_steps: int
+    intensity_steps: float
     contrast_steps: int
     roughness_steps: int
     tint: tuple[int, ...] = (0, 0, 0)
@@ -173,7 +185,7 @@ class _Candidate:
         change = intensity, contrast, ROUGHNESS_STEP * abs(self.roughness_steps)
         return all(value <= limit for value, limit in zip(change, LIMITS, strict=True))
 
-    def step(self, intensity: int, contrast: int, roughness: int) -> _Candidate:
+    def step(self, intensity: float, contrast: int, roughness: int) -> _Candidate:
         return _Candidate(self.intensity_steps + intensity, self.contrast_steps + contrast, self.roughness_steps + roughness, self.tint)
 
 

@@ -99,6 +99,8 @@ class FitOptions:
     #: Pixels that such a search uses at most, and the least share of dielectric texels: reflections of metal do not tell the intensity.
     intensity_pixels: int = 100_000
     min_dielectric_share: float = 0.5
+    #: Photos that take part in it where the light moves: each has tables of its own.
+    moving_light_photos: int = 12
     #: Else this quantile of the strongest channel of metals' base colours is set to the following value, changed at most by the factor.
     metal_quantile: float = 0.5
     metal_base_color: float = 0.4

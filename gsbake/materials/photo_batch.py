@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from gsbake.imaging.srgb import decode
@@ -14,7 +15,8 @@ from gsbake.materials import fit_kernel
 from gsbake.materials.metallic import NORMAL_ERROR, PhotoSamples, Shader
 from gsbake.materials.pixels import Pixels
 from gsbake.shading import brdf
-from gsbake.shading.light_tables import LightTables
+from gsbake.shading.light_motion import rotated
+from gsbake.shading.light_tables import LightTables, prefilter_cube_map
 
 Floats = NDArray[np.float32]
 
@@ -46,6 +48,22 @@ class KernelTables:
         return self.table, self.knots, self.sizes, self.offsets, self.lut
 
 
+@dataclass
+class PhotoLights:
+    """The prefiltered light `radiance` (6, s, s, 3) as each photo sees it, without gradient; computed once per rotation."""
+
+    radiance: torch.Tensor
+    _known: dict[bytes, KernelTables] = field(default_factory=dict)
+
+    @torch.no_grad()
+    def tables(self, to_light: NDArray[np.float64] | None) -> KernelTables:
+        """The tables in the object's frame of a photo with the rotation `to_light` (3, 3); None: the light stands."""
+        key = b"" if to_light is None else to_light.tobytes()
+        if key not in self._known:
+            self._known[key] = KernelTables.of(prefilter_cube_map(rotated(self.radiance, to_light)))
+        return self._known[key]
+
+
 @dataclass(frozen=True)
 class PhotoBatch:
     """The n pixels of one photo, fields as in `Pixels`, with the mesh's `normal` (n, 3) there, of any length; `reflected` is empty where
@@ -59,6 +77,7 @@ class PhotoBatch:
     block: NDArray[np.int32]
     normal: Floats
     reflected: NDArray[np.int32]
+    to_light: NDArray[np.float64] | None = None
 
     @classmethod
     def of(cls, pixels: Pixels, normal: Floats) -> PhotoBatch:
@@ -67,7 +86,8 @@ class PhotoBatch:
         texel = np.ascontiguousarray(pixels.texel, np.int32)
         bilinear, view, colour = (np.ascontiguousarray(x, np.float32) for x in (pixels.bilinear, pixels.view, pixels.colour))
         weight = np.ascontiguousarray(pixels.weight, np.float32)
-        return cls(texel, bilinear, view, colour, weight, pixels.block, interpolate(normal, texel, bilinear), reflected.astype(np.int32))
+        normals = interpolate(normal, texel, bilinear)
+        return cls(texel, bilinear, view, colour, weight, pixels.block, normals, reflected.astype(np.int32), pixels.to_light)
 
     def __len__(self) -> int:
         return len(self.weight)
@@ -97,7 +117,7 @@ class PhotoBatch:
     def _rows(self, keep: Any) -> PhotoBatch:
         return PhotoBatch(
             self.texel[keep], self.bilinear[keep], self.view[keep], self.colour[keep], self.weight[keep], self.block[keep],
-            self.normal[keep], self.reflected[keep] if len(self.reflected) else self.reflected,
+            self.normal[keep], self.reflected[keep] if len(self.reflected) else self.reflected, self.to_light,
         )  # fmt: skip
 
     def samples(self, normal_offset: Floats, tables: KernelTables, transport: Floats, tilted: bool = False) -> PhotoSamples:

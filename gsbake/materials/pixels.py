@@ -40,7 +40,8 @@ class Pixels:
 
     `texel` (n, 4) int64 indices of texels and their weights `bilinear` (n, 4); `view` (n, 3) unit vectors from the surface to the camera;
     `colour` (n, 3) sRGB 0..1; `weight` (n,) 0..1; `block` (n,) index of the square block of the photo; `pixel` (n,) flat row-major index
-    in the photo; `reflected_texel` (n,) the texel that the reflected ray hits, -1: none, None: not traced.
+    in the photo; `reflected_texel` (n,) the texel that the reflected ray hits, -1: none, None: not traced; `to_light` (3, 3) rotates
+    directions to the frame of a light that moves (`light_motion`), None: it stands.
     """
 
     texel: NDArray[np.int64]
@@ -51,6 +52,7 @@ class Pixels:
     block: NDArray[np.int32]
     pixel: NDArray[np.int64]
     reflected_texel: NDArray[np.int64] | None = None
+    to_light: NDArray[np.float64] | None = None
 
     def __len__(self) -> int:
         return len(self.weight)
@@ -61,9 +63,9 @@ class Pixels:
 
     def every(self, step: int) -> Pixels:
         """Every `step`-th pixel."""
-        every = {field.name: getattr(self, field.name) for field in fields(self)}
+        every = {field.name: getattr(self, field.name) for field in fields(self) if field.name != "to_light"}
         chosen: Any = {name: None if part is None else part[::step] for name, part in every.items()}
-        return Pixels(**chosen)
+        return Pixels(**chosen, to_light=self.to_light)
 
     def without_gain(self, gain: NDArray[Any]) -> Pixels:
         """The pixels with the photo's exposure `gain` (3,) on linear colour divided out."""

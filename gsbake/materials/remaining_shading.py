@@ -20,9 +20,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
-from gsbake.materials.delighting import harmonics
+from gsbake.materials.delighting import harmonics, nearby_pairs
 from gsbake.shading.cubemap import directions
 
 Doubles = NDArray[np.float64]
@@ -71,11 +70,7 @@ def _pairs(position: Doubles, generator: np.random.Generator) -> tuple[NDArray[n
     """
     count = len(position)
     far = np.repeat(np.arange(count), PARTNERS), generator.integers(0, count, count * PARTNERS)
-    wanted, radius = min(NEIGHBOURS + 1, count), NEIGHBOUR_RADIUS * float(np.linalg.norm(np.ptp(position, axis=0)))
-    found = cKDTree(position).query(position, k=wanted, distance_upper_bound=radius)[1].astype(np.int64).ravel()
-    own = np.repeat(np.arange(count), wanted)
-    valid = (found < count) & (own < found)
-    near = own[valid], found[valid]
+    near = nearby_pairs(position, NEIGHBOURS, NEIGHBOUR_RADIUS)
     sizes = (len(far[0]), len(near[0]))
     share = np.repeat([1 / max(1, n) for n in sizes], sizes)
     scale = np.repeat([BRIGHTNESS_SCALE, NEARBY_BRIGHTNESS_SCALE], sizes)

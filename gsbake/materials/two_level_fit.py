@@ -6,20 +6,23 @@ step costs a quarter. The fine level continues from the result for a few steps: 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 
 from gsbake.materials.fit import MaterialFit
-from gsbake.materials.initialisation import ChosenFit, best_fit, trial_fits
+from gsbake.materials.fit_surface import Fitted
+from gsbake.materials.initialisation import DEFAULT_START, ChosenFit, Trials, best_fit, trial_fits, trial_schedule
 from gsbake.materials.levels import FitLevel
 from gsbake.materials.options import FitSchedule, Priors
+from gsbake.shading.light_motion import Motion
 from gsbake.texturing.resampling import CoarseTexture
 
 #: Steps of a trial, of the continued fit on the coarse level, and on the fine one, as shares of the iterations.
 TRIAL_SHARE, COARSE_SHARE, FINE_SHARE = 0.25, 0.5, 0.25
-#: How often shading left in base colours is moved to the light at the end of the coarse level, and the steps after each, as a share of
-#: the iterations, in which texels adapt to it, with their factor on the learning rates. Gradient steps would move the light back: that
-#: base colours have no shading is not part of their loss.
+#: How often shading left in base colours is moved to the light at the end of the coarse level, where most is dielectric and the light
+#: stands, and the steps after each, as a share of the iterations, in which texels adapt to it, with their factor on the learning rates.
+#: From there the light is given: gradient steps would move it back, as that base colours have no shading is not part of their loss.
 SHADING_ROUNDS, ADAPT_SHARE, ADAPT_RATE = 4, 0.05, 0.5
 #: When metals are searched for on the fine level, as a share of its steps.
 FINE_METAL_SEARCHES_AT = (0.3,)
@@ -39,12 +42,28 @@ class FitPlan:
     seed: int = 0
     diffuse: bool = False
 
+    def steps(self, share: float) -> int:
+        """Steps of a share of the iterations; at least one."""
+        return max(1, round(share * self.iterations))
 
-def fit_two_levels(coarse: FitLevel, fine: FitLevel, texture: CoarseTexture, plan: FitPlan, progress: Progress) -> ChosenFit:
-    """The fit on the `fine` level, whose texels `texture` reduces to those of `coarse`."""
 
-    def steps(share: float) -> int:
-        return max(1, round(share * plan.iterations))
+def compare_light_motions(levels: Mapping[Motion, FitLevel], plan: FitPlan, progress: Progress) -> dict[Motion, tuple[MaterialFit, Fitted]]:
+    """Trials from the default start on the coarse `levels`, whose photos differ in how the light moves."""
+    steps, (metallic, roughness) = plan.steps(TRIAL_SHARE), DEFAULT_START
+    schedule = trial_schedule(steps, plan.seed, plan.diffuse)
+    found: dict[Motion, tuple[MaterialFit, Fitted]] = {}
+    for motion, level in levels.items():
+        fit = MaterialFit(level.surface, plan.light_size, plan.priors, roughness, metallic)
+        each: Callable[[int, int], None] = partial(progress, "trial fits of moving lights")
+        found[motion] = fit, fit.run(level.fitted, level.held_out, schedule, each)
+    return found
+
+
+def fit_two_levels(
+    coarse: FitLevel, fine: FitLevel, texture: CoarseTexture, plan: FitPlan, progress: Progress, known: Trials | None = None
+) -> ChosenFit:
+    """The fit on the `fine` level, whose texels `texture` reduces to those of `coarse`; `known` are trials that are already there."""
+    steps = plan.steps
 
     def each(name: str) -> Callable[[int, int], None]:
         return lambda done, total: progress(name, done, total)
@@ -52,15 +71,16 @@ def fit_two_levels(coarse: FitLevel, fine: FitLevel, texture: CoarseTexture, pla
     def make(metallic: float, roughness: float) -> MaterialFit:
         return MaterialFit(coarse.surface, plan.light_size, plan.priors, roughness, metallic)
 
-    trials = trial_fits(make, coarse, steps(TRIAL_SHARE), plan.seed, plan.diffuse, each("trial fits"))
+    trials = trial_fits(make, coarse, steps(TRIAL_SHARE), plan.seed, plan.diffuse, each("trial fits"), known)
     schedule = FitSchedule(steps(COARSE_SHARE), plan.seed, diffuse=plan.diffuse)
     choice = best_fit(trials, coarse, schedule, each("material fit, coarse level"))
-    given = replace(schedule, emission=False, intensity=False, fixed_light=True)
-    adapt = replace(given, iterations=steps(ADAPT_SHARE), metal_searches_at=(), rate=ADAPT_RATE)
-    for turn in range(SHADING_ROUNDS):
-        choice.fit.move_shading_to_light(plan.seed + turn)
-        choice.fit.run(coarse.fitted, [], adapt, each("material fit, coarse level"))
-    choice.fit.move_shading_to_light(plan.seed + SHADING_ROUNDS)
+    refine = replace(schedule, emission=False, intensity=False, metal_searches_at=FINE_METAL_SEARCHES_AT, iterations=steps(FINE_SHARE))
+    if choice.fit.mostly_dielectric and not choice.fit.moving_light:
+        refine = replace(refine, fixed_light=True)
+        adapt = replace(refine, iterations=steps(ADAPT_SHARE), metal_searches_at=(), rate=ADAPT_RATE)
+        for turn in range(SHADING_ROUNDS):
+            choice.fit.move_shading_to_light(plan.seed + turn)
+            choice.fit.run(coarse.fitted, [], adapt, each("material fit, coarse level"))
+        choice.fit.move_shading_to_light(plan.seed + SHADING_ROUNDS)
     fit = choice.fit.continued_on(fine.surface, texture.up)
-    refine = replace(given, iterations=steps(FINE_SHARE), metal_searches_at=FINE_METAL_SEARCHES_AT)
     return replace(choice, fit=fit, fitted=fit.run(fine.fitted, fine.held_out, refine, each("material fit, fine level")))

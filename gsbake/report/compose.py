@@ -19,6 +19,7 @@ from gsbake.report.manifests import Manifests, peak, total_seconds
 from gsbake.report.quality import ImageMetrics, compare
 from gsbake.report.render import Asset, Renderer, Shader, unlit
 from gsbake.shading.environment import EnvironmentLight
+from gsbake.shading.light_motion import LightMotion
 from gsbake.text import duration, number, size
 
 Array = NDArray[np.float64]
@@ -52,9 +53,18 @@ def learnt_shader(light: Path, to_light: Array) -> LitShader:
     return LitShader(EnvironmentLight.load(light), to_light)
 
 
+def photo_shader(learnt: LitShader | None, motion: LightMotion) -> Callable[[int], Shader]:
+    """The shader of each photo by its index: unlit without a learnt light, that light, or where it moves the light turned for it."""
+    rotations = motion.rotations
+    if learnt is None or learnt.to_light is None or rotations is None:
+        return lambda index: learnt or unlit
+    light, to_light = learnt.light, learnt.to_light
+    return lambda index: LitShader(light, rotations[index] @ to_light)
+
+
 def score_views(
     renderer: Renderer,
-    shader: Shader,
+    shader: Callable[[int], Shader],
     posed: PosedPhotos,
     cameras: Sequence[Camera],
     indices: Sequence[int],
@@ -62,11 +72,12 @@ def score_views(
     longest: int,
     progress: Callable[[int, int], None],
 ) -> list[ViewScore]:
-    """Compare the photos `indices` with renders from their cameras (asset frame), at most `longest` pixels wide and high."""
+    """Compare the photos `indices` with renders from their cameras (asset frame), at most `longest` pixels wide and high; `shader` gives
+    that of a photo by its index."""
     out = []
     for done, index in enumerate(indices):
         view = posed.view(index, longest)
-        image = renderer.draw(cameras[index].scaled(view.camera.width, view.camera.height), shader)
+        image = renderer.draw(cameras[index].scaled(view.camera.width, view.camera.height), shader(index))
         out.append(ViewScore(view.camera.name, held_out, compare(view, image)))
         progress(done + 1, len(indices))
     return out

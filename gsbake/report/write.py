@@ -22,8 +22,9 @@ from gsbake.report.html import Light, Page, Panel, render_page
 from gsbake.report.masks import mask_panels
 from gsbake.report.page_model import page_model
 from gsbake.report.quality import select_views
-from gsbake.report.render import Asset, Renderer, Shader, unlit
+from gsbake.report.render import Asset, Renderer
 from gsbake.report.sheets import map_panels
+from gsbake.shading.light_motion import LightMotion
 from gsbake.surfels.training.views import test_photos
 from gsbake.text import number
 
@@ -115,7 +116,7 @@ class _ReportWriter:
             learnt = None
             if light.exists():
                 learnt = compose.learnt_shader(light, compose.light_rotation(cameras[0], posed.cameras.cameras[0]))
-        shader: Shader = learnt or unlit
+            shader = compose.photo_shader(learnt, LightMotion.load(self.folders["bake"] / "light_motion.json"))
         monitor.check_stop()
         with monitor.part("compare"):
             indices, held = select_views(len(posed), test_photos(len(posed), self.options.holdout), MAX_COMPARED)

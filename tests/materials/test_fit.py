@@ -26,6 +26,7 @@ from gsbake.materials.levels import FitLevel, InterpolatedTransport, coarse_pixe
 from gsbake.materials.options import FitSchedule, Priors
 from gsbake.materials.pixels import PixelReader, Pixels
 from gsbake.shading.environment import EnvironmentLight
+from gsbake.shading.light_motion import Motion, light_rotations
 from gsbake.shading.split_sum import shade
 from gsbake.texturing.resampling import CoarseTexture
 from gsbake.texturing.texels import Texels, rasterise
@@ -68,9 +69,17 @@ def room(directions: NDArray[np.float64]) -> NDArray[np.float64]:
 class Scene:
     """A sphere of two base colours, or of a uniform distribution between them (`even`), with constant `roughness`, in `count` photos.
 
-    With `reference` the images are made by `tests.support.monte_carlo`."""
+    With `reference` the images are made by `tests.support.monte_carlo`; `motion` is that of the light."""
 
-    def __init__(self, roughness: float, count: int = 12, even: bool = False, reference: bool = False, metallic: float = 0.0) -> None:
+    def __init__(
+        self,
+        roughness: float,
+        count: int = 12,
+        even: bool = False,
+        reference: bool = False,
+        metallic: float = 0.0,
+        motion: Motion = "static",
+    ) -> None:
         mesh, uv = sphere()
         caster = RayCaster(mesh.vertices, mesh.faces, 1)
         self.texels: Texels = rasterise(uv, mesh.faces, SIZE)
@@ -83,7 +92,10 @@ class Scene:
         tables = EnvironmentLight.from_function(room, 16).prefilter()
         reader = PixelReader(caster, uv, self.texels, 2.0)
         self.photos: list[Pixels] = []
-        for camera in cameras(count):
+        turned = light_rotations(cameras(count), motion)
+        for k, camera in enumerate(cameras(count)):
+            if turned is not None:
+                tables = EnvironmentLight.from_function(lambda d, turn=turned[k]: room(d @ turn.T), 16).prefilter()
             blank = reader.read(camera, np.zeros((camera.height, camera.width, 3), np.uint8), None)
             base_color, normal = (np.einsum("nk,nkc->nc", blank.bilinear, x[blank.texel]) for x in (self.base_color, self.normal))
             n = len(blank)

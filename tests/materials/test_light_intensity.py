@@ -124,11 +124,12 @@ def test_light_of_reference_photos_is_recovered(factor: float) -> None:
     assert 0.75 < found.contrast < 1.35
 
 
-@pytest.mark.parametrize("factor", [1.7, 0.6])
+@pytest.mark.parametrize("factor", [1.7, 0.6, INTENSITY_FACTOR**0.5])
 def test_wrong_intensity_is_corrected(factor: float) -> None:
+    """To a small part of a step, of which the true one need not be a multiple."""
     found = Plastic().search(adjust_radiance(TRUE, np.full(3, factor), 1.0, AREA))
-    assert found.intensity * factor == pytest.approx(np.ones(3), rel=INTENSITY_FACTOR - 1)
-    assert found.improvement > 0.3
+    assert found.intensity * factor == pytest.approx(np.ones(3), rel=0.04)
+    assert found.improvement > 0.3 or abs(np.log(factor)) < 0.2
     assert f"residual -{found.improvement:.1%}" in str(found)
 
 

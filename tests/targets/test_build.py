@@ -237,7 +237,7 @@ def test_the_same_input_gives_the_same_bytes(folders: dict[str, Path], built: tu
         assert (tmp_path / name).read_bytes() == (built[0] / name).read_bytes(), name
 
 
-def test_a_step_that_bends_normals_is_passed_over() -> None:
+def test_a_step_that_shortens_normals_is_passed_over() -> None:
     """Noisy normals: JPEG of low quality would fit into the bytes, and fails the audit; fewer texels at a better quality do not."""
     rng = np.random.default_rng(0)
 
