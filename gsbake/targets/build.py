@@ -34,6 +34,8 @@ from gsbake.targets.texel_density import pixels_per_texel, texture_edge
 
 #: Error of a level of detail on the screen, in pixels.
 PIXEL_ERROR = 0.5
+#: Largest share of a level's triangles that the next one has, as long as the former has more than so many: else it would save nothing.
+LEVEL_SHARE, MIN_TRIANGLES = 0.75, 1000
 #: Largest share of a target's bytes that the mesh takes.
 GEOMETRY_SHARE = 0.5
 #: Factor on that share up to which a mesh whose seams keep it above is taken; else it gets new charts, in at most so many tries.
@@ -152,7 +154,11 @@ class _Builder:
     def write(self, target: Target) -> dict[str, Any]:
         """Write the files of a target; returns {name: figures}."""
         megabytes, triangles, budget = self.budget(target)
-        levels = [self.level(target, k, int(megabytes * 1e6), triangles, budget) for k in range(self.options.targets.levels + 1)]
+        levels, most = [], triangles
+        for k in range(self.options.targets.levels + 1):
+            levels.append(self.level(target, k, int(megabytes * 1e6), most, budget))
+            if (count := len(levels[-1].mesh.faces)) > MIN_TRIANGLES:
+                most = min(triangles, int(LEVEL_SHARE * count))
         figures: dict[str, Any] = {}
         for k, level in enumerate(levels):
             if k == 0 and target.text == "default":

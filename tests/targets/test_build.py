@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 from pathlib import Path
 from typing import Any
@@ -96,6 +97,17 @@ def test_a_mesh_that_its_seams_keep_too_large_gets_new_charts(folders: dict[str,
     true = true_normals(unit_points(mesh, coded.shape[0])[1])
     assert degrees_between(shaded, true)[small.inside].mean() < 0.6 * degrees_between(n.astype(float), true)[small.inside].mean()
     assert gltf_issues(tmp_path / "asset_banner.glb") == []
+
+
+def test_each_level_has_clearly_fewer_triangles_than_the_one_before(
+    folders: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also where the seams of the bake would keep them near each other."""
+    monkeypatch.setattr("gsbake.targets.build.MIN_TRIANGLES", 100)
+    found = build_targets(folders, tmp_path, TargetOptions(Targets(files=("banner",), levels=3)))["targets"]
+    counts = [found[f"asset_banner{end}.glb"]["triangles"] for end in ("", "_lod1", "_lod2", "_lod3")]
+    assert all(after <= 0.75 * before for before, after in itertools.pairwise(counts)), counts
+    assert found["asset_banner_lod3.glb"]["bytes"] < 0.7 * found["asset_banner_lod1.glb"]["bytes"]
 
 
 def test_a_budget_that_cannot_be_met_is_refused(folders: dict[str, Path], tmp_path: Path) -> None:
