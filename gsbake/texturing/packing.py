@@ -82,34 +82,70 @@ def _bits(bitmap: NDArray[np.uint8]) -> NDArray[np.uint64]:
 
 
 @numba.njit(cache=True)
-def _overlaps(occupied: NDArray[np.uint64], row: NDArray[np.uint64], y: int, word: int, shift: np.uint64) -> bool:
-    """Whether one chart row shifted to (word, shift) overlaps row y of the occupied cells."""
+def _last_overlap(occupied: NDArray[np.uint64], row: NDArray[np.uint64], y: int, x: int) -> int:
+    """The rightmost cell of row y that is occupied and covered by a chart row at x; -1: none."""
+    word, shift = x >> 6, np.uint64(x & 63)
     back = np.uint64(64) - shift
-    carry = np.uint64(0)
-    for k in range(row.shape[0]):
-        value = row[k]
-        moved = (value << shift) | carry
-        if moved & occupied[y, word + k]:
-            return True
-        carry = value >> back if shift else np.uint64(0)
-    return bool(carry & occupied[y, word + row.shape[0]])
+    for k in range(row.shape[0], -1, -1):
+        moved = np.uint64(0)
+        if k < row.shape[0]:
+            moved = row[k] << shift
+        if k > 0 and shift:
+            moved |= row[k - 1] >> back
+        both = moved & occupied[y, word + k]
+        if both:
+            bit = 63
+            while not (both >> np.uint64(bit)) & np.uint64(1):
+                bit -= 1
+            return ((word + k) << 6) + bit
+    return -1
 
 
 @numba.njit(cache=True)
-def _place(occupied: NDArray[np.uint64], rows: NDArray[np.uint64], width: int, cells: int, limit: int) -> tuple[int, int]:
-    """Lowest (then leftmost) free position (x, y) with y < limit, or (-1, -1).
+def _longest_run(row: NDArray[np.uint64], cells: int, value: int) -> int:
+    """Length of the longest run of bits `value` (0 or 1) among the first `cells` of a row."""
+    longest = run = 0
+    for x in range(cells):
+        if int((row[x >> 6] >> np.uint64(x & 63)) & np.uint64(1)) == value:
+            run += 1
+            longest = max(longest, run)
+        else:
+            run = 0
+    return longest
 
-    `occupied` (cells, words + 1) has one extra word per row for the bits shifted past the end.
+
+@numba.njit(cache=True)
+def _place(
+    occupied: NDArray[np.uint64], longest_free: NDArray[np.int64], rows: NDArray[np.uint64], width: int, cells: int, first: int, limit: int
+) -> tuple[int, int]:
+    """Lowest (then leftmost) free position (x, y) with first ≤ y < limit, or (-1, -1).
+
+    `occupied` (cells, words + 1) has one extra word per row for the bits shifted past the end, `longest_free` (cells,) the longest run of
+    free cells of each row. Passed over is what cannot fit: heights at which a row has no free run as long as the chart's, and where a row
+    of the chart overlaps an occupied cell, all positions at which the same run of the row's cells would still cover that cell.
     """
     height = rows.shape[0]
-    for y in range(min(limit, cells - height + 1)):
-        for x in range(cells - width + 1):
-            word, shift = x >> 6, np.uint64(x & 63)
+    needed = np.empty(height, np.int64)
+    for r in range(height):
+        needed[r] = _longest_run(rows[r], width, 1)
+    for y in range(first, min(limit, cells - height + 1)):
+        possible = True
+        for r in range(height):
+            if needed[r] > longest_free[y + r]:
+                possible = False
+                break
+        x = 0 if possible else cells
+        while x <= cells - width:
             free = True
             # The middle row of a chart is usually the widest: test it first.
             for k in range(height):
                 r = (height // 2 + k) % height
-                if _overlaps(occupied, rows[r], y + r, word, shift):
+                last = _last_overlap(occupied, rows[r], y + r, x)
+                if last >= 0:
+                    start = last - x
+                    while start > 0 and (rows[r, (start - 1) >> 6] >> np.uint64((start - 1) & 63)) & np.uint64(1):
+                        start -= 1
+                    x = last - start + 1
                     free = False
                     break
             if free:
@@ -118,7 +154,7 @@ def _place(occupied: NDArray[np.uint64], rows: NDArray[np.uint64], width: int, c
 
 
 @numba.njit(cache=True)
-def _fill(occupied: NDArray[np.uint64], rows: NDArray[np.uint64], x: int, y: int) -> None:
+def _fill(occupied: NDArray[np.uint64], longest_free: NDArray[np.int64], rows: NDArray[np.uint64], x: int, y: int, cells: int) -> None:
     """Mark a chart placed at (x, y)."""
     word, shift = x >> 6, np.uint64(x & 63)
     for r in range(rows.shape[0]):
@@ -126,14 +162,16 @@ def _fill(occupied: NDArray[np.uint64], rows: NDArray[np.uint64], x: int, y: int
             occupied[y + r, word + k] |= rows[r, k] << shift
             if shift:
                 occupied[y + r, word + k + 1] |= rows[r, k] >> (np.uint64(64) - shift)
+        longest_free[y + r] = _longest_run(occupied[y + r], cells, 0)
 
 
 def _fit(charts: list[tuple[Floats, Ints]], order: Ints, scale: float, size: int, padding: float, cells: int) -> list[Floats] | None:
     """Texel coordinates of every chart at `scale`, or None when they do not all fit."""
     cell = size / cells
     reach = padding / 2
-    occupied = np.zeros((cells, cells // 64 + 3), np.uint64)
+    occupied, longest_free = np.zeros((cells, cells // 64 + 3), np.uint64), np.full(cells, cells)
     placed: list[Floats] = [np.zeros((0, 2))] * len(charts)
+    nothing_below: dict[tuple[int, bytes], int] = {}  # rows below which there is no place for a bitmap: cells are only ever occupied
     for c in order:
         uv, faces = charts[c]
         uv = uv * scale
@@ -147,13 +185,16 @@ def _fit(charts: list[tuple[Floats, Ints]], order: Ints, scale: float, size: int
         for turn in range(4):
             turned = np.ascontiguousarray(np.rot90(bitmap, turn))
             height, width = turned.shape
-            x, y = _place(occupied, _bits(turned), width, cells, max(0, best[0] - height))
+            limit, key = max(0, best[0] - height), (height, turned.tobytes())
+            first = nothing_below.get(key, 0)
+            x, y = _place(occupied, longest_free, _bits(turned), width, cells, first, limit)
+            nothing_below[key] = y if x >= 0 else max(first, limit)
             if x >= 0:
                 best = (y + height, x, y, turn)
         top, x, y, turn = best
         if top > cells:
             return None
-        _fill(occupied, _bits(np.ascontiguousarray(np.rot90(bitmap, turn))), x, y)
+        _fill(occupied, longest_free, _bits(np.ascontiguousarray(np.rot90(bitmap, turn))), x, y, cells)
         width_uv, height_uv = bitmap.shape[1] * cell, bitmap.shape[0] * cell
         u, v = uv[:, 0], uv[:, 1]
         # np.rot90 turns rows (here: v) and columns (u) as these maps do; all four are proper rotations.
