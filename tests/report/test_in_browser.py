@@ -36,15 +36,17 @@ def test_the_page_in_a_browser(make_run: Callable[..., Finished], tmp_path: Path
         {"evaluate": "document.getElementById('map').dataset.drawn"}, {"evaluate": "document.getElementById('map').focus()"},
         {"key": "ArrowLeft"}, {"evaluate": "document.getElementById('map').dataset.drawn"},
         {"evaluate": "document.documentElement.dataset.theme = 'dark'; getComputedStyle(document.body).backgroundColor"},
+        # The viewer draws only while it is in sight, and the focus has moved on.
+        {"evaluate": "document.querySelector('model-viewer').scrollIntoView()"},
         {"evaluate": "document.querySelector('[data-view=wire]').click()"}, {"evaluate": DRAWN},
         {"evaluate": "document.querySelector('[data-view=base-colour]').click()"}, {"evaluate": DRAWN},
         {"evaluate": "[...document.images].filter(image => !image.closest('dialog') && image.naturalWidth === 0).length"},
     ]  # fmt: skip
     found = visit(page.as_uri(), steps, tmp_path)
-    assert len(found["results"]) == 14, found["errors"]
+    assert len(found["results"]) == 15, found["errors"]
     assert [e for e in found["errors"] if not any(known in e for known in ITS_OWN)] == []
     assert found["requests"] == [page.as_uri()]
-    _, shaded, before, _, after, first, _, second, dark, _, wire, _, flat, missing = found["results"]
+    _, shaded, before, _, after, first, _, second, dark, _, _, wire, _, flat, missing = found["results"]
     images = {name: picture(uri) for name, uri in (("shaded", shaded), ("wire", wire), ("flat", flat))}
     covered = {name: float((image[..., 3] > 220).mean()) for name, image in images.items()}
     assert covered["shaded"] > 0.1 and covered["flat"] == pytest.approx(covered["shaded"], rel=0.1)  # the shadow below is paler
