@@ -10,6 +10,7 @@ tangent of their own and are left out. Exits 1 where more than one corner in a t
 from __future__ import annotations
 
 import argparse
+import os
 import shutil
 import subprocess
 import sys
@@ -24,7 +25,7 @@ from numpy.typing import NDArray
 from benchmarks.timeline import ROOT
 from gsbake.gltf.document import Document
 
-MODULES = ROOT / ".venv" / "node" / "node_modules"
+MODULES = Path(os.environ.get("GSBAKE_NODE_MODULES", ROOT / ".venv" / "node" / "node_modules"))
 #: Largest difference of unit vectors, and the share of corners that may exceed it.
 TOLERANCE, SHARE = 1e-4, 1e-3
 #: Least area of a triangle, as a share of the mean one.

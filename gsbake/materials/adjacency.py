@@ -63,3 +63,11 @@ def _seam_neighbours(texels: Texels, position: NDArray[np.float64], normal: NDAr
     far = np.maximum(np.abs(row[first] - row[second]), np.abs(column[first] - column[second])) >= MIN_TEXTURE_DISTANCE
     same_side = np.einsum("nd,nd->n", unit[first], unit[second]) > MIN_NORMAL_COSINE
     return np.unique(np.sort(np.stack([first, second], 1)[far & same_side], axis=1), axis=0)
+
+
+def neighbour_lists(pairs: NDArray[np.int64], count: int) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
+    """The neighbours of each of `count` texels in the `pairs` (m, 2): `start` (count + 1,) and the list they lie in."""
+    both = np.concatenate([pairs, pairs[:, ::-1]])
+    order = np.argsort(both[:, 0], kind="stable")
+    start = np.searchsorted(both[order, 0], np.arange(count + 1))
+    return start, both[order, 1].astype(np.int32)

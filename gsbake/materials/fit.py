@@ -33,13 +33,24 @@ from numpy.typing import NDArray
 
 from gsbake.imaging.metrics import decibels
 from gsbake.materials import fit_kernel
+from gsbake.materials.adjacency import neighbour_lists
 from gsbake.materials.bilateral import EdgeAwareFilter
 from gsbake.materials.emission import find_emission
 from gsbake.materials.fit_surface import FitSurface, Fitted
 from gsbake.materials.light_intensity import LightAdjustment, adjust_radiance, search_light
 from gsbake.materials.metallic import PhotoSamples, find_metals
 from gsbake.materials.options import FitOptions, FitSchedule, Priors
-from gsbake.materials.photo_batch import EMISSION, INDIRECT, OUTGOING, VISIBILITY, FitStep, KernelTables, PhotoBatch, PhotoLights
+from gsbake.materials.photo_batch import (
+    EMISSION,
+    INDIRECT,
+    OUTGOING,
+    VISIBILITY,
+    FitStep,
+    KernelTables,
+    PhotoBatch,
+    PhotoLights,
+    texel_weight,
+)
 from gsbake.materials.pixels import Pixels
 from gsbake.materials.remaining_shading import MATCHED_POINTS, remaining_shading, with_irradiance_factor
 from gsbake.materials.sparsity_prior import KERNEL_WIDTHS, common_materials
@@ -123,9 +134,9 @@ class MaterialFit:
         batches = self._batches(photos)
         order: list[int] = []
         self._common, self._residual = np.zeros((0, 4), np.float32), np.zeros(2)
-        weight = self._texel_weight(batches)
+        weight = texel_weight(batches, len(self._raw))
         self._rotations = [batch.to_light for batch in batches]
-        given = PhotoLights(self._light.radiance().detach()) if schedule.fixed_light else None
+        given = self._lights() if schedule.fixed_light else None
         for step in range(steps if batches else 0):
             update_common = step % o.sparsity_interval == 0
             if schedule.emission and step == int(o.emission_search_at * steps):
@@ -153,14 +164,6 @@ class MaterialFit:
 
     def _batches(self, photos: list[Pixels]) -> list[PhotoBatch]:
         return [PhotoBatch.of(p, self._normal) for p in photos if len(p)]
-
-    def _texel_weight(self, batches: list[PhotoBatch]) -> Floats:
-        """Total weight (n,) of the pixels that show each texel."""
-        weight = np.zeros(len(self._raw))
-        for batch in batches:
-            touched, start, pixel, share = batch.entries
-            weight[touched] += np.add.reduceat(share * batch.weight[pixel], start[:-1])
-        return weight.astype(np.float32)
 
     def _step(self, batch: PhotoBatch, decay: float, given: PhotoLights | None) -> None:
         """One Adam step on the pixels of one photo, with learning rates times `decay`; of the texels alone under a `given` light."""
@@ -211,12 +214,7 @@ class MaterialFit:
 
     @cached_property
     def _adjacency(self) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
-        """The neighbours of each texel: `start` (n + 1,) and the list they lie in."""
-        pairs = self._surface.pairs
-        both = np.concatenate([pairs, pairs[:, ::-1]])
-        order = np.argsort(both[:, 0], kind="stable")
-        start = np.searchsorted(both[order, 0], np.arange(len(self._raw) + 1))
-        return start, both[order, 1].astype(np.int32)
+        return neighbour_lists(self._surface.pairs, len(self._raw))
 
     def _update_transport(self) -> None:
         """Visibility, indirect light and outgoing radiance under the present light and materials."""

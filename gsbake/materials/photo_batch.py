@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -159,6 +160,15 @@ def _tilted(normal: Floats) -> tuple[Floats, Floats]:
     first /= np.maximum(np.linalg.norm(first, axis=1, keepdims=True), 1e-20)
     step = np.float32(NORMAL_ERROR)
     return unit + step * first, unit + step * np.cross(unit, first)
+
+
+def texel_weight(batches: Iterable[PhotoBatch], count: int) -> Floats:
+    """Total weight (count,) of the pixels that show each texel."""
+    weight = np.zeros(count)
+    for batch in batches:
+        touched, start, pixel, share = batch.entries
+        weight[touched] += np.add.reduceat(share * batch.weight[pixel], start[:-1])
+    return weight.astype(np.float32)
 
 
 def interpolate(values: NDArray[Any], texel: NDArray[Any], bilinear: Floats) -> Floats:
