@@ -238,7 +238,9 @@ class _Fitting:
         motions: tuple[Motion, ...] = ("turntable", "camera") if asked == "auto" else (asked,)
         under = {motion: r for motion in motions if (r := light_rotations(self.cameras, motion)) is not None}
         if asked != "auto":
-            self.light_motion = LightMotion(asked, under.get(asked))
+            if asked != "static" and not under:
+                self.monitor.warn(f"bake.light_motion is {asked}, but the cameras do not turn about one axis; the light is taken to stand.")
+            self.light_motion = LightMotion(asked if under else "static", under.get(asked))
             self.monitor.decide("light", _MOTIONS[self.light_motion.motion], "bake.light_motion")
             return pixels.under(self.light_motion.rotations)
         if not under:

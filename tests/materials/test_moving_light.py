@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from gsbake.config.schema import Bake
 from gsbake.imaging.srgb import encode
+from gsbake.materials.fitting import FitSettings, _Fitting
 from gsbake.materials.levels import FitLevel
 from gsbake.materials.options import FitSchedule
 from gsbake.materials.pixels import Pixels
 from gsbake.materials.two_level_fit import FitPlan, compare_light_motions
 from gsbake.shading.light_motion import Motion, light_rotations
 from tests.materials.test_fit import WEAK_PRIORS, Scene, cameras, room
+from tests.support.cameras import look_at
+from tests.support.recorder import Recorder
 
 COUNT = 12
 
@@ -56,6 +61,17 @@ def test_how_the_light_moves_is_found(moving: tuple[Motion, Scene]) -> None:
 
 def test_a_light_that_stands_is_found() -> None:
     assert best_motion(Scene(0.25, COUNT)) == "static"
+
+
+def test_a_turn_that_is_asked_for_and_not_there_is_said() -> None:
+    """Cameras rolled at random have no common axis: the light stands, and the report does not say otherwise."""
+    recorder = Recorder()
+    rolled = [look_at(np.random.default_rng(k).normal(size=3) * 3, roll=2.3 * k) for k in range(9)]
+    fitting = SimpleNamespace(settings=FitSettings(Bake(light_motion="turntable")), cameras=rolled, monitor=recorder)
+    pixels = SimpleNamespace(under=lambda rotations: rotations)
+    assert _Fitting._under_moving_light(fitting, None, pixels, False) is None  # type: ignore[arg-type]
+    assert fitting.light_motion.motion == "static"
+    assert any("do not turn about one axis" in text for text in recorder.warnings)
 
 
 def best_motion(scene: Scene) -> Motion:
