@@ -24,7 +24,8 @@ import scipy.sparse
 import scipy.sparse.csgraph
 from numpy.typing import NDArray
 
-from gsbake.materials.metallic import MIN_WEIGHT, PhotoSamples, observed_weight, perceptual_weights
+from gsbake.materials.linear_shading import PhotoSamples, observed_weight, perceptual_weights
+from gsbake.materials.metallic import MIN_WEIGHT
 
 Floats = NDArray[np.float64]
 

@@ -38,7 +38,8 @@ from gsbake.materials.bilateral import EdgeAwareFilter
 from gsbake.materials.emission import find_emission
 from gsbake.materials.fit_surface import FitSurface, Fitted
 from gsbake.materials.light_intensity import LightAdjustment, adjust_radiance, search_light
-from gsbake.materials.metallic import PhotoSamples, find_metals
+from gsbake.materials.linear_shading import PhotoSamples
+from gsbake.materials.metallic import find_metals
 from gsbake.materials.options import FitOptions, FitSchedule, Priors
 from gsbake.materials.photo_batch import (
     EMISSION,
@@ -141,7 +142,7 @@ class MaterialFit:
             update_common = step % o.sparsity_interval == 0
             if schedule.emission and step == int(o.emission_search_at * steps):
                 self.emissive_regions = self._search_emission(batches)
-            if schedule.intensity and step in {int(share * steps) for share in o.intensity_searches_at}:
+            if step in {int(share * steps) for share in schedule.light_searches_at}:
                 tint = not schedule.diffuse or len(self._adjustments) < o.diffuse_tint_searches
                 self._adjustments.append(self._search_light(batches, generator, tint, rough=not self._adjustments))
                 update_common = True

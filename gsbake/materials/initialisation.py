@@ -21,6 +21,8 @@ from gsbake.materials.options import FitSchedule
 STARTS = ((0.05, 0.2), (0.05, 0.45), (0.05, 0.8), (0.9, 0.2), (0.9, 0.45))
 #: When trials search for metals, as shares of their steps.
 METAL_SEARCHES_AT = (0.4, 0.8)
+#: When they search for the light's intensity.
+LIGHT_SEARCHES_AT = (0.6,)
 #: Start of a diffuse object, and without validation photos.
 DIFFUSE_START, DEFAULT_START = (0.05, 0.8), (0.05, 0.45)
 #: The best start of the other kind, dielectric or metal, is continued as well when it is within this many dB of the best.
@@ -51,7 +53,7 @@ class ChosenFit:
 
 def trial_schedule(steps: int, seed: int, diffuse: bool) -> FitSchedule:
     """What a trial of `steps` steps does."""
-    return FitSchedule(steps, seed, METAL_SEARCHES_AT, emission=False, intensity=False, sparsity=False, diffuse=diffuse)
+    return FitSchedule(steps, seed, METAL_SEARCHES_AT, emission=False, light_searches_at=LIGHT_SEARCHES_AT, sparsity=False, diffuse=diffuse)
 
 
 def trial_fits(make: MakeFit, level: FitLevel, steps: int, seed: int, diffuse: bool, each: Each, known: Trials | None = None) -> Trials:

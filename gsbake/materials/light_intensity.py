@@ -37,7 +37,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsbake.imaging.srgb import encode
-from gsbake.materials.metallic import PhotoSamples, perceptual_weights
+from gsbake.materials.linear_shading import LinearShading, PhotoSamples, best_base_colours
 
 Floats = NDArray[np.float64]
 
@@ -59,8 +59,6 @@ TYPICAL_BASE_COLOUR, SPREAD = 0.3, 0.66
 OBSERVATIONS = 5.0
 #: Costs below this are noise.
 MIN_COST = 1e-9
-#: Rounds of reweighting, and the residual of an sRGB value (0..1) from which pixels weigh less.
-REWEIGHTING_ROUNDS, ROBUST_SCALE = 2, 0.02
 
 
 @dataclass(frozen=True)
@@ -202,23 +200,11 @@ def _tinted(best: _Candidate, residual: Callable[[_Candidate], Floats]) -> _Cand
 
 def _residual(photos: Sequence[PhotoSamples], roughness: NDArray[np.float32]) -> Floats:
     """Block-averaged absolute residuals (3,) of sRGB values at the best base colours."""
-    offset = np.concatenate([photo.shade(0.0, roughness, 0.0) for photo in photos])
-    slope = np.concatenate([photo.shade(1.0, roughness, 0.0) for photo in photos]) - offset
-    colour, pixel_weight = (np.concatenate([getattr(photo, name) for photo in photos]) for name in ("colour", "weight"))
-    weight = np.concatenate([perceptual_weights(photo) for photo in photos])
-    texel = np.unique(np.concatenate([photo.texel for photo in photos]), return_inverse=True)[1]
-    first = np.cumsum([0] + [int(photo.block.max(initial=-1)) + 1 for photo in photos])
-    block = np.concatenate([photo.block + start for photo, start in zip(photos, first, strict=False)])
-    target, base = encode(colour), np.zeros((int(texel.max(initial=-1)) + 1, 3))
-
-    def error() -> NDArray[Any]:
-        return np.asarray(encode(base[texel] * slope + offset) - target)
-
-    for turn in range(REWEIGHTING_ROUNDS + 1):
-        robust = weight / np.maximum(np.abs(error()), ROBUST_SCALE) if turn else weight
-        for k in range(3):
-            slopes = np.bincount(texel, robust[:, k] * slope[:, k] ** 2)
-            mixed = np.bincount(texel, robust[:, k] * slope[:, k] * (colour - offset)[:, k])
-            base[:, k] = np.clip(mixed / np.maximum(slopes, 1e-12), 0, 1)
-    weighted = error() * pixel_weight[:, None]
-    return np.array([np.abs(np.bincount(block, weighted[:, k])).sum() for k in range(3)]) / max(float(pixel_weight.sum()), 1e-12)
+    shadings = [LinearShading.of(photo.shade, roughness, 0.0) for photo in photos]
+    base = best_base_colours(photos, shadings, len(roughness), robust=True)
+    total, pixels = np.zeros(3), 0.0
+    for photo, shading in zip(photos, shadings, strict=True):
+        error = (shading.srgb(base[photo.texel]) - encode(photo.colour)) * photo.weight[:, None]
+        total += [np.abs(np.bincount(photo.block, error[:, k])).sum() for k in range(3)]
+        pixels += float(photo.weight.sum())
+    return total / max(pixels, 1e-12)

@@ -37,7 +37,8 @@ from numpy.typing import NDArray
 from gsbake.geometry.cameras import Camera
 from gsbake.imaging.srgb import encode
 from gsbake.materials.fit import MaterialFit
-from gsbake.materials.metallic import MIN_METAL_ALBEDO, LinearShading, PhotoSamples, unclipped_weights
+from gsbake.materials.linear_shading import LinearShading, PhotoSamples, unclipped_weights
+from gsbake.materials.metallic import MIN_METAL_ALBEDO
 from gsbake.materials.pixels import PixelReader, Pixels
 from gsbake.texturing.resampling import CoarseTexture
 from gsbake.texturing.texels import Texels

@@ -28,7 +28,8 @@ class FitSchedule:
     """What a fit does in `iterations` steps of one photo each, whose order follows from `seed`.
 
     Metals are searched for at the shares `metal_searches_at` of all steps, but not on an object that is `diffuse`. Without `emission`
-    nothing is emissive, without `intensity` the light's intensity is left to gradient steps, without `sparsity` the sparsity prior is off.
+    nothing is emissive, without `sparsity` the sparsity prior is off. The light's intensity is searched for at `light_searches_at`; between
+    these and without any it is left to gradient steps.
     `rate` is a factor on all learning rates; with `fixed_light` the light is given.
     """
 
@@ -36,7 +37,7 @@ class FitSchedule:
     seed: int = 0
     metal_searches_at: tuple[float, ...] = (0.3, 0.55, 0.8)
     emission: bool = True
-    intensity: bool = True
+    light_searches_at: tuple[float, ...] = (0.5, 0.6, 0.7, 0.8)
     sparsity: bool = True
     diffuse: bool = False
     rate: float = 1.0
@@ -94,9 +95,7 @@ class FitOptions:
     #: The same of dielectric texels.
     detected_dielectric: float = 0.05
 
-    #: When the light's intensity is searched for.
-    intensity_searches_at: tuple[float, ...] = (0.5, 0.6, 0.7, 0.8)
-    #: Pixels that such a search uses at most, and the least share of dielectric texels: reflections of metal do not tell the intensity.
+    #: Pixels that a search for the light's intensity uses at most, and the least share of dielectric texels: reflections of metal do not tell the intensity.
     intensity_pixels: int = 100_000
     min_dielectric_share: float = 0.5
     #: Photos that take part in it where the light moves: each has tables of its own.

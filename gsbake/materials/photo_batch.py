@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from gsbake.imaging.srgb import decode
 from gsbake.materials import fit_kernel
-from gsbake.materials.metallic import NORMAL_ERROR, PhotoSamples, Shader
+from gsbake.materials.linear_shading import PhotoSamples, Shader
+from gsbake.materials.metallic import NORMAL_ERROR
 from gsbake.materials.pixels import Pixels
 from gsbake.shading import brdf
 from gsbake.shading.light_motion import rotated

@@ -74,7 +74,7 @@ def fit_two_levels(
     trials = trial_fits(make, coarse, steps(TRIAL_SHARE), plan.seed, plan.diffuse, each("trial fits"), known)
     schedule = FitSchedule(steps(COARSE_SHARE), plan.seed, diffuse=plan.diffuse)
     choice = best_fit(trials, coarse, schedule, each("material fit, coarse level"))
-    refine = replace(schedule, emission=False, intensity=False, metal_searches_at=FINE_METAL_SEARCHES_AT, iterations=steps(FINE_SHARE))
+    refine = replace(schedule, emission=False, light_searches_at=(), metal_searches_at=FINE_METAL_SEARCHES_AT, iterations=steps(FINE_SHARE))
     if choice.fit.mostly_dielectric and not choice.fit.moving_light:
         refine = replace(refine, fixed_light=True)
         adapt = replace(refine, iterations=steps(ADAPT_SHARE), metal_searches_at=(), rate=ADAPT_RATE)

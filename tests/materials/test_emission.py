@@ -8,7 +8,7 @@ import torch
 from numpy.typing import NDArray
 
 from gsbake.materials.emission import BOUNDARY_STEPS, Emission, find_emission
-from gsbake.materials.metallic import PhotoSamples
+from gsbake.materials.linear_shading import PhotoSamples
 from gsbake.shading.environment import EnvironmentLight
 from gsbake.shading.split_sum import shade
 

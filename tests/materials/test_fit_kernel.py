@@ -11,7 +11,7 @@ from numba import set_num_threads
 
 from gsbake.materials import fit_kernel
 from gsbake.materials.fit_reference import Batch, photo_loss, prior_loss
-from gsbake.materials.metallic import LinearShading
+from gsbake.materials.linear_shading import LinearShading
 from gsbake.materials.photo_batch import FitStep, KernelTables, PhotoBatch
 from gsbake.materials.pixels import Pixels
 from gsbake.shading.environment import EnvironmentLight

@@ -19,7 +19,7 @@ from gsbake.materials.light_intensity import (
     search_light,
     shift_roughness,
 )
-from gsbake.materials.metallic import PhotoSamples
+from gsbake.materials.linear_shading import PhotoSamples
 from gsbake.shading.cubemap import solid_angles
 from gsbake.shading.environment import EnvironmentLight
 from gsbake.shading.split_sum import shade
@@ -57,7 +57,7 @@ class Plastic:
         for _ in range(PHOTOS):
             side = rng.normal(size=3)
             self.sides.append(side / np.linalg.norm(side))
-        self.single = single
+        self.single, self.light = single, TRUE
 
     def colours(
         self, normal: Doubles, side: Doubles, base: NDArray[np.float32], light: NDArray[np.float32], roughness: NDArray[np.float32]
@@ -76,7 +76,7 @@ class Plastic:
                 view = np.tile(side, (len(visible), 1))
                 colour = render(self.normal[visible], view, self.base_color[visible], self.roughness[visible], np.zeros(len(visible)), room)
             else:
-                colour = self.colours(self.normal[visible], side, self.base_color[visible], TRUE, self.roughness[visible])
+                colour = self.colours(self.normal[visible], side, self.base_color[visible], self.light, self.roughness[visible])
             photos.append((side, visible, colour.astype(np.float32)))
 
         def under(intensity: Doubles, contrast: float) -> list[PhotoSamples]:
@@ -203,3 +203,16 @@ def test_misplaced_reflections_do_not_darken_the_light() -> None:
     together, alone = Plastic(normal_error=8), Plastic(normal_error=8, single=True)
     assert together.search(TRUE).intensity.mean() > 0.9
     assert alone.search(TRUE).intensity.mean() < 0.9
+
+
+def test_an_overexposed_light_is_unchanged() -> None:
+    """Most pixels of the photos are clipped at white under three times the light; the search keeps it."""
+
+    def search(light: NDArray[np.float32]) -> LightAdjustment:
+        bright = Plastic()
+        bright.base_color = np.random.default_rng(6).uniform(0.3, 0.8, (TEXELS, 3)).astype(np.float32)
+        bright.light = light
+        return bright.search(light)
+
+    found = search(3 * TRUE)
+    assert found.intensity == pytest.approx(np.ones(3), rel=0.1)

@@ -10,6 +10,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.optimize import lsq_linear
 
+from gsbake.materials.linear_shading import LinearShading, PhotoSamples, unclipped_weights
 from gsbake.materials.metal_superresolution import (
     HUE_RADIUS,
     MetalPixels,
@@ -22,7 +23,6 @@ from gsbake.materials.metal_superresolution import (
     metal_regions,
     superresolved,
 )
-from gsbake.materials.metallic import LinearShading, PhotoSamples, unclipped_weights
 from gsbake.texturing.texels import Texels
 
 SIZE = 32

@@ -9,7 +9,8 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from gsbake.materials.metallic import MIN_METAL_ALBEDO, MIN_PHOTOS, PhotoSamples, find_metals, majority_vote
+from gsbake.materials.linear_shading import PhotoSamples
+from gsbake.materials.metallic import MIN_METAL_ALBEDO, MIN_PHOTOS, find_metals, majority_vote
 from gsbake.shading.environment import EnvironmentLight
 from gsbake.shading.split_sum import shade
 from tests.support.monte_carlo import render
@@ -153,3 +154,17 @@ def test_clipped_pixels_do_not_hide_a_metal(wall: Wall) -> None:
     found = find_metals(photos, np.full(TEXELS, 0.2, np.float32))
     assert len(found.texel) == TEXELS
     np.testing.assert_allclose(found.base, gold, atol=1e-3)
+
+
+@pytest.mark.parametrize("exposure", [4.0, 30.0])
+def test_overexposed_white_is_not_metal(wall: Wall, exposure: float) -> None:
+    """Where all photos are clipped at white, they do not tell a base colour; that is no reason to take it for black metal."""
+    white = np.full((TEXELS, 3), 0.8, np.float32)
+
+    def exposed(e: PhotoSamples) -> PhotoSamples:
+        return replace(e, colour=np.minimum(exposure * e.colour, 1), shade=lambda base, rough, metal: exposure * e.shade(base, rough, metal))
+
+    photos = [exposed(e) for e in wall.photos(white, 0.2, 0.0)]
+    clipped = np.mean([e.colour >= 1 for e in photos])
+    assert clipped > (0.95 if exposure > 10 else 0.5)
+    assert len(find_metals(photos, np.full(TEXELS, 0.2, np.float32)).texel) == 0

@@ -1,0 +1,113 @@
+"""Photos as linear functions of base colour, and the base colours that explain them best under a given light.
+
+Light, roughness and normals given, a pixel is linear in the base colour b of its texel, dielectric or metal:
+
+    shade = b · slope + offset
+
+Searches over the light (`light_intensity`) and over metal and dielectric (`metallic`) solve b for each candidate, which leaves only its own
+unknowns (variable projection: Golub & Pereyra, *The differentiation of pseudo-inverses and nonlinear least squares problems whose
+variables separate*, 1973). Errors count as they are displayed: weights contain the squared slope of the sRGB curve. The solution is robust
+(iteratively reweighted towards the sum of absolute errors), because normals that are slightly off move the reflection of the sun by
+pixels: where it is predicted and not shown, the error is a hundred times that of all other pixels together. Pixels clipped at white
+only bound b from below: they take part where b leaves them too dark.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gsbake.imaging.srgb import encode
+
+Floats = NDArray[np.float64]
+
+#: Linear values above this are taken as clipped.
+CLIPPED = 0.95
+#: Lowest linear colour at which the slope of the sRGB curve is taken.
+MIN_SLOPE_COLOUR = 0.02
+#: Rounds of the solution, and the error of an sRGB value (0..1) from which pixels weigh less in the robust one.
+ROUNDS, ROBUST_SCALE = 3, 0.02
+
+#: Shades pixels of one photo: (base colour 0 or 1, roughness (texels,), metallic 0 or 1) to linear colours (n, 3).
+Shader = Callable[[float, NDArray[np.float32], float], NDArray[np.float32]]
+
+
+@dataclass(frozen=True)
+class PhotoSamples:
+    """n pixels of one photo: the `texel` (n,) each shows, its linear `colour` (n, 3), `weight` (n,), the `block` (n,) of the photo it lies
+    in, the function that shades them, and functions that shade them with normals `tilted` by `NORMAL_ERROR` along a tangent each."""
+
+    texel: NDArray[np.int64]
+    colour: NDArray[np.float32]
+    weight: NDArray[np.float32]
+    block: NDArray[np.int32]
+    shade: Shader
+    tilted: tuple[Shader, ...] = ()
+
+
+def perceptual_weights(samples: PhotoSamples) -> NDArray[np.float32]:
+    """Weights (n, 3) of squared errors of linear colours: pixel weight times squared slope of the sRGB curve (a power of 1/2.4)."""
+    return np.asarray(samples.weight[:, None] * np.maximum(samples.colour, MIN_SLOPE_COLOUR) ** (-7 / 6), np.float32)
+
+
+def unclipped_weights(samples: PhotoSamples) -> NDArray[np.float32]:
+    """`perceptual_weights`, 0 where the photo is clipped at white."""
+    return perceptual_weights(samples) * (samples.colour < CLIPPED)
+
+
+def observed_weight(photos: Sequence[PhotoSamples], texels: int) -> Floats:
+    """Total weight (texels,) of the pixels that show each texel."""
+    out = np.zeros(texels)
+    for photo in photos:
+        out += np.bincount(photo.texel, photo.weight, texels)
+    return out
+
+
+@dataclass(frozen=True)
+class LinearShading:
+    """Shading of a photo's pixels as a linear function of base colour: shade = b · `slope` + `offset`, both (n, 3)."""
+
+    slope: NDArray[np.float32]
+    offset: NDArray[np.float32]
+
+    @classmethod
+    def of(cls, shade: Shader, roughness: NDArray[np.float32], metallic: float) -> LinearShading:
+        """What `shade` gives at `roughness` (texels,) and `metallic` 0 or 1."""
+        offset = shade(0.0, roughness, metallic)
+        return cls(shade(1.0, roughness, metallic) - offset, offset)
+
+    def srgb(self, base: NDArray[Any]) -> NDArray[np.float32]:
+        """sRGB colours (n, 3), clipped at white, of base colours `base` (n, 3)."""
+        return np.asarray(encode(np.clip(base * self.slope + self.offset, 0, 1)), np.float32)
+
+
+def best_base_colours(
+    photos: Sequence[PhotoSamples], shadings: Sequence[LinearShading], texels: int, lowest: float = 0.0, robust: bool = False
+) -> Floats:
+    """Base colours (texels, 3) within [lowest, 1] that explain the photos under their `shadings` best; `lowest` where nothing tells.
+
+    They have the least squared error; with `robust` about the least absolute one.
+    """
+    texel = np.concatenate([samples.texel for samples in photos])
+    colour, weight = np.concatenate([samples.colour for samples in photos]), np.concatenate([*map(perceptual_weights, photos)])
+    slope, offset = (np.concatenate([getattr(shading, part) for shading in shadings]) for part in ("slope", "offset"))
+    # A reflection that is brighter than white by itself tells nothing of b.
+    weight = weight * (offset < CLIPPED)
+    clipped, curve = colour >= CLIPPED, np.maximum(colour, MIN_SLOPE_COLOUR) ** np.float32(-7 / 12)
+    used, base = weight * ~clipped, np.full((texels, 3), lowest)
+    for turn in range(ROUNDS if robust or clipped.any() else 1):
+        if turn:
+            shown = base[texel] * slope + offset
+            used = weight * (~clipped | (shown < CLIPPED))
+            if robust:
+                used /= np.maximum(np.abs(shown - colour) * curve, ROBUST_SCALE)
+        for k in range(3):
+            slopes = np.bincount(texel, used[:, k] * slope[:, k] ** 2, texels)
+            mixed = np.bincount(texel, used[:, k] * slope[:, k] * (colour - offset)[:, k], texels)
+            told = slopes > 0  # clipped pixels may all be explained by the last b
+            base[told, k] = np.clip(mixed[told] / slopes[told], lowest, 1)
+    return base
