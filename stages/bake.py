@@ -20,7 +20,7 @@ def run(ctx: Context) -> dict[str, Any]:
 
 STAGE = Stage(
     name="bake",
-    version=21,
+    version=22,
     title="Textures",
     run=run,
     summary="{charts} charts, {texels} texels, {fit_psnr:dB} on test photos",

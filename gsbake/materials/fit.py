@@ -146,6 +146,8 @@ class MaterialFit:
                 tint = not schedule.diffuse or len(self._adjustments) < o.diffuse_tint_searches
                 self._adjustments.append(self._search_light(batches, generator, tint, rough=not self._adjustments))
                 update_common = True
+            if step in {int(share * steps) for share in schedule.metal_anchors_at} and not self.mostly_dielectric:
+                self._anchor_metals()
             if not schedule.diffuse and step in {int(share * steps) for share in schedule.metal_searches_at}:
                 self._search_metals(batches)
                 update_common = True
@@ -159,9 +161,10 @@ class MaterialFit:
             if each is not None:
                 each(step + 1, steps)
         values, emission = self._values[:, :5].copy(), self._transport[:, EMISSION].copy()
-        psnr = self.psnr(held_out)
+        loss, squared = self._errors(held_out) or (None, None)
+        psnr = None if squared is None else decibels(squared)
         offset = self._values[:, 5:].copy()
-        return Fitted(values, offset, weight, emission, self._light, psnr, self.emissive_regions, tuple(self._adjustments))
+        return Fitted(values, offset, weight, emission, self._light, psnr, loss, self.emissive_regions, tuple(self._adjustments))
 
     def _batches(self, photos: list[Pixels]) -> list[PhotoBatch]:
         return [PhotoBatch.of(p, self._normal) for p in photos if len(p)]
@@ -337,6 +340,7 @@ class MaterialFit:
         light = with_irradiance_factor(self._radiance(), coefficients, matched, irradiance)
         self._change_light(EnvironmentLight.from_radiance(light), texel)
 
+    @torch.no_grad()
     def _anchor_metals(self) -> LightAdjustment:
         """Scale the light and base colours so that metals are as bright as metals usually are: their reflections leave the scale open."""
         o, metal = self._options, self._values[:, 4] > 0.5
@@ -402,16 +406,20 @@ class MaterialFit:
 
     def psnr(self, photos: list[Pixels], values: Floats | None = None) -> float | None:
         """PSNR in dB over all pixels of `photos` (None without any), with the fitted texels or with `values` (n, 5)."""
+        found = self._errors(photos, values)
+        return None if found is None else decibels(found[1])
+
+    def _errors(self, photos: list[Pixels], values: Floats | None = None) -> tuple[float, float] | None:
+        """Mean robust and mean squared error over all pixels of `photos`; None without any."""
         batches = [replace(batch, weight=np.ones_like(batch.weight)) for batch in self._batches(photos)]
         if not batches:
             return None
         materials = self._values if values is None else np.column_stack([values[:, :5], self._values[:, 5:]]).astype(np.float32)
-        lights, o = self._lights(), self._options
+        lights, scale = self._lights(), self._options.comparison_scale
         sums = np.sum(
-            [self._step_buffers(b, materials, lights.tables(b.to_light), self._transport, 1.0, o.robust_scale, 0.0) for b in batches],
-            axis=0,
+            [self._step_buffers(b, materials, lights.tables(b.to_light), self._transport, 1.0, scale, 0.0) for b in batches], axis=0
         )
-        return decibels(float(sums[1] / sums[2]))
+        return float(sums[0] / sums[2]), float(sums[1] / sums[2])
 
 
 def _logit(values: NDArray[Any]) -> Floats:

@@ -21,8 +21,8 @@ class Fitted:
 
     `values` (n, 5): linear base colour, roughness, metallic of each texel; `normal_offset` (n, 3) to be added to its unit normal; `weight`
     (n,) of all pixels that show it; `emission` (n, 3) its emitted radiance; the `light` in the mesh's frame; `held_out_psnr` in dB over the
-    pixels of held-out photos (None without any); the number of `emissive_regions`; `light_adjustments`, one per search for the light's
-    intensity.
+    pixels of held-out photos (None without any), `held_out_loss` their mean robust error; the number of `emissive_regions`;
+    `light_adjustments`, one per search for the light's intensity.
     """
 
     values: Floats
@@ -31,6 +31,7 @@ class Fitted:
     emission: Floats
     light: EnvironmentLight
     held_out_psnr: float | None
+    held_out_loss: float | None
     emissive_regions: int
     light_adjustments: tuple[LightAdjustment, ...]
 

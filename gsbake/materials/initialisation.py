@@ -3,8 +3,11 @@
 Gradient steps find the optimum near their start. A surface that starts too rough cannot localise light, and its reflections end up in base
 colour; one that starts dielectric explains a metal's reflections by a diffuse base colour under a light of their colour, and stays there.
 So short fits on the coarse level, from all-dielectric and all-metal starts of several roughnesses, are compared on photos that they were
-not fitted to. On the way `MaterialFit` decides texel by texel between metal and dielectric, so either start can end as any mixture. The
-best of them is continued with all searches, and so is the best of the other kind where it is close; all on the coarse level.
+not fitted to. On the way `MaterialFit` decides texel by texel between metal and dielectric, so either start can end as any mixture. Those
+close to the best are continued with all searches, on the coarse level, and compared again.
+
+They are compared by a robust error: a sharp reflection a few pixels off counts twice in the squared error, where it is and where it should
+be, so that the PSNR prefers materials that are too rough. Where both kinds explain the photos, the object is dielectric, as most are.
 """
 
 from __future__ import annotations
@@ -21,12 +24,14 @@ from gsbake.materials.options import FitSchedule
 STARTS = ((0.05, 0.2), (0.05, 0.45), (0.05, 0.8), (0.9, 0.2), (0.9, 0.45))
 #: When trials search for metals, as shares of their steps.
 METAL_SEARCHES_AT = (0.4, 0.8)
-#: When they search for the light's intensity.
-LIGHT_SEARCHES_AT = (0.6,)
+#: When the light of a mostly metallic object is scaled: metals are found with the light that they have.
+METAL_ANCHORS_AT = (0.6,)
 #: Start of a diffuse object, and without validation photos.
 DIFFUSE_START, DEFAULT_START = (0.05, 0.8), (0.05, 0.45)
-#: The best start of the other kind, dielectric or metal, is continued as well when it is within this many dB of the best.
-CANDIDATE_MARGIN = 1.0
+#: Starts whose error is within this factor of the best one are continued as well, at most so many in all.
+CANDIDATE_FACTOR, MAX_CANDIDATES = 1.3, 3
+#: A metallic start must have less error than the best dielectric one, by this share.
+METAL_MARGIN = 0.04
 
 #: Initial metallic and roughness.
 Start = tuple[float, float]
@@ -53,7 +58,16 @@ class ChosenFit:
 
 def trial_schedule(steps: int, seed: int, diffuse: bool) -> FitSchedule:
     """What a trial of `steps` steps does."""
-    return FitSchedule(steps, seed, METAL_SEARCHES_AT, emission=False, light_searches_at=LIGHT_SEARCHES_AT, sparsity=False, diffuse=diffuse)
+    return FitSchedule(
+        steps,
+        seed,
+        METAL_SEARCHES_AT,
+        emission=False,
+        light_searches_at=(),
+        metal_anchors_at=METAL_ANCHORS_AT,
+        sparsity=False,
+        diffuse=diffuse,
+    )
 
 
 def trial_fits(make: MakeFit, level: FitLevel, steps: int, seed: int, diffuse: bool, each: Each, known: Trials | None = None) -> Trials:
@@ -71,24 +85,27 @@ def trial_fits(make: MakeFit, level: FitLevel, steps: int, seed: int, diffuse: b
 
 
 def best_fit(trials: Trials, level: FitLevel, plan: FitSchedule, each: Each) -> ChosenFit:
-    """The fit with the best validation PSNR on `level` of those that continue the best of the `trials` by `plan`."""
-    scores = {start: fitted.held_out_psnr or 0.0 for start, (_, fitted) in trials.items()}
-    evidence = _scores(scores) if len(scores) > 1 else ("diffuse object" if plan.diffuse else "no validation photos")
-    found = {start: (trials[start][0], trials[start][0].run(level.fitted, level.held_out, plan, each)) for start in candidates(scores)}
-    continued = {start: fitted.held_out_psnr or 0.0 for start, (_, fitted) in found.items()}
-    best = max(continued, key=lambda start: continued[start])
+    """The fit with the least validation error on `level` of those that continue the best of the `trials` by `plan`."""
+    errors = {start: _error(fitted) for start, (_, fitted) in trials.items()}
+    evidence = _percent(errors) if len(errors) > 1 else ("diffuse object" if plan.diffuse else "no validation photos")
+    found = {start: (trials[start][0], trials[start][0].run(level.fitted, level.held_out, plan, each)) for start in candidates(errors)}
+    continued = {start: _error(fitted) for start, (_, fitted) in found.items()}
+    best = min(continued, key=lambda start: continued[start] * (1 - METAL_MARGIN if start[0] < 0.5 else 1))
     if len(continued) > 1:
-        evidence += f"; continued: {_scores(continued)}"
+        evidence += f"; continued: {_percent(continued)}"
     return ChosenFit(*found[best], *best, len(continued), evidence)
 
 
-def _scores(scores: dict[Start, float]) -> str:
-    return ", ".join(f"{score:.2f} dB from metallic {m:g} roughness {r:g}" for (m, r), score in scores.items())
+def _error(fitted: Fitted) -> float:
+    return fitted.held_out_loss or 0.0
 
 
-def candidates(trials: dict[Start, float]) -> list[Start]:
-    """The best start of `trials` (validation PSNR in dB), and the best of the other kind if it is within `CANDIDATE_MARGIN`."""
-    order = sorted(trials, key=lambda start: -trials[start])
-    best = order[0]
-    others = [start for start in order if (start[0] > 0.5) != (best[0] > 0.5) and trials[start] > trials[best] - CANDIDATE_MARGIN]
-    return [best, *others[:1]]
+def _percent(errors: dict[Start, float]) -> str:
+    """Errors in percent of white."""
+    return ", ".join(f"{error:.2%} error from metallic {m:g} roughness {r:g}" for (m, r), error in errors.items())
+
+
+def candidates(errors: dict[Start, float]) -> list[Start]:
+    """The best starts by the `errors` of their trials."""
+    order = sorted(errors, key=lambda start: errors[start])
+    return [start for start in order if errors[start] <= CANDIDATE_FACTOR * errors[order[0]]][:MAX_CANDIDATES]

@@ -56,7 +56,7 @@ MIN_DECREASE, MIN_ROUGHER_DECREASE, MIN_SECOND_DECREASE = 0.002, 0.01, 0.03
 #: Prior of the geometric mean of an object's base colours (strongest channel): median, and scale of the logarithm.
 TYPICAL_BASE_COLOUR, SPREAD = 0.3, 0.66
 #: Number of independent residuals that evidence for the intensity counts as: errors of the model are shared by all pixels.
-OBSERVATIONS = 5.0
+OBSERVATIONS = 10.0
 #: Costs below this are noise.
 MIN_COST = 1e-9
 

@@ -29,7 +29,7 @@ class FitSchedule:
 
     Metals are searched for at the shares `metal_searches_at` of all steps, but not on an object that is `diffuse`. Without `emission`
     nothing is emissive, without `sparsity` the sparsity prior is off. The light's intensity is searched for at `light_searches_at`; between
-    these and without any it is left to gradient steps.
+    these and without any it is left to gradient steps. At `metal_anchors_at` only a mostly metallic object has its light scaled.
     `rate` is a factor on all learning rates; with `fixed_light` the light is given.
     """
 
@@ -38,6 +38,7 @@ class FitSchedule:
     metal_searches_at: tuple[float, ...] = (0.3, 0.55, 0.8)
     emission: bool = True
     light_searches_at: tuple[float, ...] = (0.5, 0.6, 0.7, 0.8)
+    metal_anchors_at: tuple[float, ...] = ()
     sparsity: bool = True
     diffuse: bool = False
     rate: float = 1.0
@@ -68,6 +69,8 @@ class FitOptions:
     residual_weight: float = 1.5
     #: Pseudo-Huber scale in sRGB values (0..1): larger errors count linearly.
     robust_scale: float = 0.1
+    #: The same where fits are compared: small, as misplaced highlights would decide, which a blurred light avoids and a sharp one does not.
+    comparison_scale: float = 0.02
     #: Factors on the smoothness weight for base colour (3), roughness and metallic: prints change the base colour alone.
     smoothness_channels: tuple[float, ...] = (1.0, 1.0, 1.0, 6.0, 4.0)
     #: Weight of the squared normal offset: normals stay near those of the mesh.
@@ -91,11 +94,12 @@ class FitOptions:
     #: Pixels per texel, of all photos together, that such a search uses: neighbouring texels decide together.
     metal_pixels: int = 3
     #: Metallic of texels detected as metal, from where gradient steps go on.
-    detected_metallic: float = 0.8
+    detected_metallic: float = 0.9
     #: The same of dielectric texels.
     detected_dielectric: float = 0.05
 
-    #: Pixels that a search for the light's intensity uses at most, and the least share of dielectric texels: reflections of metal do not tell the intensity.
+    #: Pixels that a search for the light's intensity uses at most, and the least share of dielectric texels: reflections of metal do not
+    #: tell the intensity.
     intensity_pixels: int = 100_000
     min_dielectric_share: float = 0.5
     #: Photos that take part in it where the light moves: each has tables of its own.

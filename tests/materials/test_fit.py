@@ -203,10 +203,10 @@ def test_normal_offsets_reduce_normal_error(glossy: Scene) -> None:
     assert error[1] < 0.97 * error[0]  # low-resolution photos of a rather rough sphere are weak evidence
 
 
-def trial_scores(scene: Scene) -> dict[tuple[float, float], float]:
+def trial_errors(scene: Scene) -> dict[tuple[float, float], float]:
     level = FitLevel(scene.surface(), scene.photos[2:], scene.photos[:2])
     trials = trial_fits(lambda m, r: scene.fit(r, metallic=m), level, 100, 0, False, skip)
-    return {start: fitted.held_out_psnr or 0.0 for start, (_, fitted) in trials.items()}
+    return {start: fitted.held_out_loss or 0.0 for start, (_, fitted) in trials.items()}
 
 
 def skip(done: int, total: int) -> None:
@@ -214,17 +214,17 @@ def skip(done: int, total: int) -> None:
 
 
 def test_trials_find_the_roughness(glossy: Scene) -> None:
-    smooth, rough = trial_scores(glossy), trial_scores(Scene(0.85))
+    smooth, rough = trial_errors(glossy), trial_errors(Scene(0.85))
     dielectric = [(0.05, r) for r in (0.2, 0.45, 0.8)]
-    assert max(dielectric, key=lambda k: smooth[k]) == (0.05, 0.2)
-    assert max(dielectric, key=lambda k: rough[k]) == (0.05, 0.8)
+    assert min(dielectric, key=lambda k: smooth[k]) == (0.05, 0.2)
+    assert min(dielectric, key=lambda k: rough[k]) == (0.05, 0.8)
 
 
 def test_metal_is_found_from_the_best_start() -> None:
     """A sphere of two metals, in reference images: from the start that the trials choose, nearly all texels end as metal."""
     scene = Scene(0.25, reference=True, metallic=1.0)
-    scores = trial_scores(scene)
-    metallic, roughness = max(scores, key=lambda start: scores[start])
+    errors = trial_errors(scene)
+    metallic, roughness = min(errors, key=lambda start: errors[start])
     fitted = scene.fit(roughness, metallic=metallic).run(scene.photos[2:], scene.photos[:2], FitSchedule(200))
     known = fitted.weight > 0.3
     assert (fitted.values[known, 4] > 0.5).mean() > 0.9
@@ -245,10 +245,11 @@ def test_the_fine_level_continues_from_the_coarse_one(glossy: Scene) -> None:
     distance = np.linalg.norm(coarse.position[parent[known]] - fine.position[known], axis=1)
     assert known.mean() > 0.9 and distance.max() < 0.2  # texels are about 0.1 wide
     fit = MaterialFit(coarse, 16, WEAK_PRIORS, 0.2)
-    fitted = fit.run(photos[2:], photos[:2], FitSchedule(150, metal_searches_at=(), emission=False, intensity=False))
-    continued = fit.continued_on(fine, texture.up).run(glossy.photos[2:], glossy.photos[:2], FitSchedule(1, rate=1e-6, intensity=False))
+    fitted = fit.run(photos[2:], photos[:2], FitSchedule(150, metal_searches_at=(), emission=False, light_searches_at=()))
+    briefly = FitSchedule(1, rate=1e-6, light_searches_at=())
+    continued = fit.continued_on(fine, texture.up).run(glossy.photos[2:], glossy.photos[:2], briefly)
     np.testing.assert_allclose(np.median(continued.values, 0), np.median(fitted.values, 0), atol=0.03)
-    scratch = glossy.fit(0.2).run(glossy.photos[2:], glossy.photos[:2], FitSchedule(1, rate=1e-6, intensity=False))
+    scratch = glossy.fit(0.2).run(glossy.photos[2:], glossy.photos[:2], briefly)
     assert continued.held_out_psnr is not None and scratch.held_out_psnr is not None
     assert continued.held_out_psnr > scratch.held_out_psnr + 3
 

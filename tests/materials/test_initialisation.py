@@ -1,4 +1,4 @@
-"""Choice of the fit's start on fits with known validation PSNR."""
+"""Choice of the fit's start on fits with known validation error."""
 
 from __future__ import annotations
 
@@ -8,9 +8,11 @@ from typing import Any
 import pytest
 
 from gsbake.materials.initialisation import (
-    CANDIDATE_MARGIN,
+    CANDIDATE_FACTOR,
     DEFAULT_START,
     DIFFUSE_START,
+    MAX_CANDIDATES,
+    METAL_MARGIN,
     STARTS,
     ChosenFit,
     Start,
@@ -22,14 +24,14 @@ from gsbake.materials.options import FitSchedule
 
 
 class Fit:
-    """A fit with the validation PSNR `psnr` that records its schedules."""
+    """A fit with the validation error `error` that records its schedules."""
 
-    def __init__(self, psnr: float, runs: list[FitSchedule]) -> None:
-        self._psnr, self._runs = psnr, runs
+    def __init__(self, error: float, runs: list[FitSchedule]) -> None:
+        self._error, self._runs = error, runs
 
     def run(self, photos: Any, held_out: Any, schedule: FitSchedule, each: Any) -> Any:
         self._runs.append(schedule)
-        return SimpleNamespace(held_out_psnr=self._psnr if held_out else None)
+        return SimpleNamespace(held_out_loss=self._error if held_out else None)
 
 
 def level(held_out: bool = True) -> Any:
@@ -40,10 +42,10 @@ def nothing(done: int, total: int) -> None:
     pass
 
 
-def chosen(trial_scores: dict[Start, float], full_scores: dict[Start, float]) -> tuple[ChosenFit, list[FitSchedule]]:
+def chosen(trial_errors: dict[Start, float], full_errors: dict[Start, float]) -> tuple[ChosenFit, list[FitSchedule]]:
     runs: list[FitSchedule] = []
     trials: Any = {
-        start: (Fit(full_scores.get(start, 0.0), runs), SimpleNamespace(held_out_psnr=score)) for start, score in trial_scores.items()
+        start: (Fit(full_errors.get(start, 1.0), runs), SimpleNamespace(held_out_loss=error)) for start, error in trial_errors.items()
     }
     return best_fit(trials, level(), FitSchedule(10), nothing), runs
 
@@ -52,7 +54,7 @@ def test_all_starts_are_tried_without_searches_for_the_light() -> None:
     runs: list[FitSchedule] = []
     trials = trial_fits(lambda m, r: Fit(10 * m + r, runs), level(), 7, 1, False, nothing)  # type: ignore[arg-type,return-value]
     assert tuple(trials) == STARTS and len(runs) == len(STARTS)
-    assert all(run.iterations == 7 and run.metal_searches_at and not run.intensity and not run.emission for run in runs)
+    assert all(run.iterations == 7 and run.metal_searches_at and not run.light_searches_at and not run.emission for run in runs)
     assert {m > 0.5 for m, _ in STARTS} == {True, False}
 
 
@@ -63,17 +65,23 @@ def test_one_start_where_nothing_is_compared(diffuse: bool, held_out: bool, star
 
 
 def test_close_starts_are_continued_and_compared() -> None:
-    near = 21.0 - 0.5 * CANDIDATE_MARGIN
-    choice, runs = chosen({STARTS[0]: 21.0, STARTS[3]: near, STARTS[1]: 15.0}, {STARTS[0]: 22.0, STARTS[3]: 23.0})
+    near = 0.02 * (1 + CANDIDATE_FACTOR) / 2
+    choice, runs = chosen({STARTS[0]: 0.02, STARTS[3]: near, STARTS[1]: 0.05}, {STARTS[0]: 0.018, STARTS[3]: 0.01})
     assert (choice.metallic, choice.roughness) == STARTS[3] and choice.fits == len(runs) == 2
-    assert "continued: 22.00 dB" in choice.evidence and "21.00 dB from metallic 0.05 roughness 0.2" in choice.evidence
+    assert "continued: 1.80% error" in choice.evidence and "2.00% error from metallic 0.05 roughness 0.2" in choice.evidence
 
 
 def test_only_a_clear_winner_is_continued() -> None:
-    choice, runs = chosen({STARTS[0]: 21.0, STARTS[1]: 20.9, STARTS[3]: 21.1 + CANDIDATE_MARGIN}, {STARTS[3]: 20.0})
+    choice, runs = chosen({STARTS[0]: 0.021, STARTS[1]: 0.022, STARTS[3]: 0.02 / CANDIDATE_FACTOR}, {STARTS[3]: 0.3})
     assert (choice.metallic, choice.roughness) == STARTS[3] and len(runs) == 1
 
 
-def test_one_candidate_of_either_kind() -> None:
-    first, second = candidates({start: 20.0 for start in STARTS})
-    assert first[0] < 0.5 < second[0]
+def test_a_metal_must_be_clearly_better() -> None:
+    trials = {STARTS[0]: 0.02, STARTS[3]: 0.02}
+    assert chosen(trials, {STARTS[0]: 0.02, STARTS[3]: 0.02 * (1 - METAL_MARGIN / 2)})[0].metallic < 0.5
+    assert chosen(trials, {STARTS[0]: 0.02, STARTS[3]: 0.02 * (1 - METAL_MARGIN * 2)})[0].metallic > 0.5
+
+
+def test_the_number_of_candidates_is_bounded() -> None:
+    errors = {start: 0.02 + 1e-4 * k for k, start in enumerate(STARTS)}
+    assert candidates(errors) == list(STARTS[:MAX_CANDIDATES])

@@ -162,7 +162,8 @@ def test_overexposed_white_is_not_metal(wall: Wall, exposure: float) -> None:
     white = np.full((TEXELS, 3), 0.8, np.float32)
 
     def exposed(e: PhotoSamples) -> PhotoSamples:
-        return replace(e, colour=np.minimum(exposure * e.colour, 1), shade=lambda base, rough, metal: exposure * e.shade(base, rough, metal))
+        colour = np.minimum(exposure * e.colour, 1)
+        return replace(e, colour=colour, shade=lambda base, rough, metal: exposure * e.shade(base, rough, metal))
 
     photos = [exposed(e) for e in wall.photos(white, 0.2, 0.0)]
     clipped = np.mean([e.colour >= 1 for e in photos])
