@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 
+from benchmarks.true_mesh import bake_on_true_mesh
 from benchmarks.truth import measure_stage
 from tests.support.node import gltf_issues
 from tests.support.truth import Figures, measure
@@ -69,6 +70,12 @@ def test_looks_right_in_another_light(figures: Figures) -> None:
 
 def test_the_asset_is_valid(baked: tuple[Path, Path]) -> None:
     assert gltf_issues(baked[1] / "asset.glb") == []
+
+
+def test_a_bake_on_the_true_mesh_has_its_shape(baked: tuple[Path, Path], tmp_path: Path) -> None:
+    bake_on_true_mesh(baked[1], baked[0], tmp_path, overrides=("bake.materials=none", "bake.size=256", "bake.occlusion_rays=8"))
+    shape = measure(tmp_path / "asset.glb", baked[0])
+    assert shape.chamfer < CHAMFER / 10 and shape.normals < NORMALS / 4, shape
 
 
 @pytest.mark.slow
