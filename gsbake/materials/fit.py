@@ -325,6 +325,17 @@ class MaterialFit:
         """Whether so much is dielectric that its diffuse colours tell of the light."""
         return bool(self._dielectric().mean() >= self._options.min_dielectric_share)
 
+    def purify_metals(self) -> None:
+        """Scale metallic, where it is above .5, so that its median there is 1: metals are pure.
+
+        Gradient steps leave it lower, as a share of diffuse reflection makes up for reflections that are misplaced.
+        """
+        texel = np.flatnonzero(self._values[:, 4] > 0.5)
+        if len(texel):
+            new = self._values[texel, :5]
+            new[:, 4] = np.minimum(new[:, 4] / np.median(new[:, 4]), self._options.purest_metallic)
+            self._reinitialise(texel, new)
+
     @torch.no_grad()
     def move_shading_to_light(self, seed: int) -> None:
         """Move the shading that is left in the base colours of dielectrics to the light."""

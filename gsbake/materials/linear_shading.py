@@ -108,6 +108,6 @@ def best_base_colours(
         for k in range(3):
             slopes = np.bincount(texel, used[:, k] * slope[:, k] ** 2, texels)
             mixed = np.bincount(texel, used[:, k] * slope[:, k] * (colour - offset)[:, k], texels)
-            told = slopes > 0  # clipped pixels may all be explained by the last b
-            base[told, k] = np.clip(mixed[told] / slopes[told], lowest, 1)
+            known = slopes > 0  # clipped pixels may all be explained by the last b
+            base[known, k] = np.clip(mixed[known] / slopes[known], lowest, 1)
     return base

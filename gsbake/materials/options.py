@@ -97,6 +97,8 @@ class FitOptions:
     detected_metallic: float = 0.9
     #: The same of dielectric texels.
     detected_dielectric: float = 0.05
+    #: Highest metallic of purified metals: logits stay finite.
+    purest_metallic: float = 0.99
 
     #: Pixels that a search for the light's intensity uses at most, and the least share of dielectric texels: reflections of metal do not
     #: tell the intensity.
