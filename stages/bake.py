@@ -11,9 +11,7 @@ def run(ctx: Context) -> dict[str, Any]:
     """See `gsbake.materials.bake.bake_textures`."""
     from gsbake.materials.bake import BakeOptions, bake_textures
 
-    s = ctx.settings
-    rules = s.skip.exposure_equalisation, s.skip.specular, s.skip.normal_map, s.skip.metallic_map, s.skip.roughness_map
-    options = BakeOptions(s.bake, s.train.max_size, s.train.holdout, s.light.size, *rules)
+    options = BakeOptions.of(ctx.settings)
     poses, surfels, mesh = ctx.inputs["poses"], ctx.inputs["refine"], ctx.inputs["mesh"]
     return bake_textures(poses, surfels, mesh, ctx.out, options, seed=ctx.seed, threads=ctx.threads, monitor=ctx)
 

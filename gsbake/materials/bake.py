@@ -54,6 +54,13 @@ class BakeOptions:
     metallic_map: Rule = "auto"
     roughness_map: Rule = "auto"
 
+    @classmethod
+    def of(cls, settings: Any) -> BakeOptions:
+        """Those in the `settings` of a profile, or in the part of them that the stage declares."""
+        skip = settings.skip
+        rules = skip.exposure_equalisation, skip.specular, skip.normal_map, skip.metallic_map, skip.roughness_map
+        return cls(settings.bake, settings.train.max_size, settings.train.holdout, settings.light.size, *rules)
+
 
 def bake_textures(
     poses: Path,

@@ -37,7 +37,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsbake.imaging.srgb import encode
-from gsbake.materials.linear_shading import LinearShading, PhotoSamples, best_base_colours
+from gsbake.materials.linear_shading import BaseColourSolver, LinearShading, PhotoSamples
 
 Floats = NDArray[np.float64]
 
@@ -201,7 +201,7 @@ def _tinted(best: _Candidate, residual: Callable[[_Candidate], Floats]) -> _Cand
 def _residual(photos: Sequence[PhotoSamples], roughness: NDArray[np.float32]) -> Floats:
     """Block-averaged absolute residuals (3,) of sRGB values at the best base colours."""
     shadings = [LinearShading.of(photo.shade, roughness, 0.0) for photo in photos]
-    base = best_base_colours(photos, shadings, len(roughness), robust=True)
+    base = BaseColourSolver(photos, len(roughness)).solve(shadings, robust=True)
     total, pixels = np.zeros(3), 0.0
     for photo, shading in zip(photos, shadings, strict=True):
         error = (shading.srgb(base[photo.texel]) - encode(photo.colour)) * photo.weight[:, None]

@@ -85,29 +85,34 @@ class LinearShading:
         return np.asarray(encode(np.clip(base * self.slope + self.offset, 0, 1)), np.float32)
 
 
-def best_base_colours(
-    photos: Sequence[PhotoSamples], shadings: Sequence[LinearShading], texels: int, lowest: float = 0.0, robust: bool = False
-) -> Floats:
-    """Base colours (texels, 3) within [lowest, 1] that explain the photos under their `shadings` best; `lowest` where nothing tells.
+class BaseColourSolver:
+    """Finds the base colours of `texels` texels in `photos` for any number of shadings."""
 
-    They have the least squared error; with `robust` about the least absolute one.
-    """
-    texel = np.concatenate([samples.texel for samples in photos])
-    colour, weight = np.concatenate([samples.colour for samples in photos]), np.concatenate([*map(perceptual_weights, photos)])
-    slope, offset = (np.concatenate([getattr(shading, part) for shading in shadings]) for part in ("slope", "offset"))
-    # A reflection that is brighter than white by itself tells nothing of b.
-    weight = weight * (offset < CLIPPED)
-    clipped, curve = colour >= CLIPPED, np.maximum(colour, MIN_SLOPE_COLOUR) ** np.float32(-7 / 12)
-    used, base = weight * ~clipped, np.full((texels, 3), lowest)
-    for turn in range(ROUNDS if robust or clipped.any() else 1):
-        if turn:
-            shown = base[texel] * slope + offset
-            used = weight * (~clipped | (shown < CLIPPED))
-            if robust:
-                used /= np.maximum(np.abs(shown - colour) * curve, ROBUST_SCALE)
-        for k in range(3):
-            slopes = np.bincount(texel, used[:, k] * slope[:, k] ** 2, texels)
-            mixed = np.bincount(texel, used[:, k] * slope[:, k] * (colour - offset)[:, k], texels)
-            known = slopes > 0  # clipped pixels may all be explained by the last b
-            base[known, k] = np.clip(mixed[known] / slopes[known], lowest, 1)
-    return base
+    def __init__(self, photos: Sequence[PhotoSamples], texels: int) -> None:
+        self._texels, self._texel = texels, np.concatenate([samples.texel for samples in photos])
+        self._colour = np.concatenate([samples.colour for samples in photos])
+        self._weight = np.concatenate([*map(perceptual_weights, photos)])
+        self._clipped = self._colour >= CLIPPED
+        self._curve = np.maximum(self._colour, MIN_SLOPE_COLOUR) ** np.float32(-7 / 12)
+
+    def solve(self, shadings: Sequence[LinearShading], lowest: float = 0.0, robust: bool = False) -> Floats:
+        """Base colours (texels, 3) within [lowest, 1] that explain the photos under their `shadings` best; `lowest` where nothing tells.
+
+        They have the least squared error; with `robust` about the least absolute one.
+        """
+        slope, offset = (np.concatenate([getattr(shading, part) for shading in shadings]) for part in ("slope", "offset"))
+        # A reflection that is brighter than white by itself tells nothing of b.
+        weight = self._weight * (offset < CLIPPED)
+        used, base = weight * ~self._clipped, np.full((self._texels, 3), lowest)
+        for turn in range(ROUNDS if robust or self._clipped.any() else 1):
+            if turn:
+                shown = base[self._texel] * slope + offset
+                used = weight * (~self._clipped | (shown < CLIPPED))
+                if robust:
+                    used /= np.maximum(np.abs(shown - self._colour) * self._curve, ROBUST_SCALE)
+            for k in range(3):
+                slopes = np.bincount(self._texel, used[:, k] * slope[:, k] ** 2, self._texels)
+                mixed = np.bincount(self._texel, used[:, k] * slope[:, k] * (self._colour - offset)[:, k], self._texels)
+                known = slopes > 0  # clipped pixels may all be explained by the last b
+                base[known, k] = np.clip(mixed[known] / slopes[known], lowest, 1)
+        return base

@@ -28,7 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsbake.imaging.srgb import encode
-from gsbake.materials.linear_shading import CLIPPED, LinearShading, PhotoSamples, best_base_colours, observed_weight
+from gsbake.materials.linear_shading import CLIPPED, BaseColourSolver, LinearShading, PhotoSamples, observed_weight
 
 Floats = NDArray[np.float64]
 
@@ -124,13 +124,14 @@ class _BestModel:
 def _compare_models(photos: Sequence[PhotoSamples], own: NDArray[np.float32]) -> tuple[_BestModel, _BestModel]:
     """The best dielectric and the best metal of each texel over all roughnesses tried."""
     texels = len(own)
+    solver = BaseColourSolver(photos, texels)
     dielectric, metal = _BestModel(texels), _BestModel(texels)
     for tried in (own, *(np.full(texels, r, np.float32) for r in TRIED_ROUGHNESS)):
         for metallic, lowest in ((0.0, 0.0), (1.0, MIN_METAL_ALBEDO)):
             if metallic and tried is own:
                 tried = np.minimum(own, np.float32(MAX_METAL_ROUGHNESS))
             models = [ShadingModel.of(samples, tried, metallic) for samples in photos]
-            b = best_base_colours(photos, [model.shading for model in models], texels, lowest)
+            b = solver.solve([model.shading for model in models], lowest)
             cost = sum((m.negative_log_likelihood(s, b) for s, m in zip(photos, models, strict=True)), np.zeros(texels))
             (metal if metallic else dielectric).offer(cost, b, tried)
     return dielectric, metal

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from gsbake.materials.linear_shading import CLIPPED, LinearShading, PhotoSamples, best_base_colours
+from gsbake.materials.linear_shading import CLIPPED, BaseColourSolver, LinearShading, PhotoSamples
 
 TRUE = np.array([0.8, 0.5, 0.2])
 
@@ -26,7 +26,7 @@ def photo(slope: list[float], offset: list[float], texel: list[int] | None = Non
 
 
 def solve(*photos: tuple[PhotoSamples, LinearShading], texels: int = 1, lowest: float = 0.0, robust: bool = False) -> NDArray[np.float64]:
-    return best_base_colours([p for p, _ in photos], [s for _, s in photos], texels, lowest, robust)
+    return BaseColourSolver([p for p, _ in photos], texels).solve([s for _, s in photos], lowest, robust)
 
 
 @pytest.mark.parametrize("robust", [False, True])
