@@ -270,7 +270,7 @@ def gather_gradient(touched: Any, start: Any, pixel: Any, share: Any, gradient: 
 
 @njit(inline="always", **_FLAGS)
 def _sign(x: Any) -> Any:
-    return _1 if x > _0 else (-_1 if x < _0 else _0)
+    return np.float32(x > _0) - np.float32(x < _0)
 
 
 @njit(parallel=True, **_FLAGS)
@@ -287,34 +287,39 @@ def adam_step(
     diffuse part), `offset_weight` the squared normal offset; `common` (texels or 0, 4) with
     `common_weight` (4,) draws sRGB base colour and roughness. `rate` (PARAMETERS,) learning rates; `first`, `second` moments.
     """
-    regular = common.shape[0] > 0
-    for t in prange(raw.shape[0]):
-        for c in range(PARAMETERS):
-            value = values[t, c]
-            g = data[t, c] + mean_weight[c] * (_1 - values[t, 4] if c < 3 else _1)  # of base colour only the diffuse part
-            data[t, c] = _0
-            pull = _0
-            if c < 5:
-                for e in range(start[t], start[t + 1]):
-                    pull += _sign(value - values[neighbour[e], c])
-                g += smoothness[c] * pull
-                if regular and c < 3:
-                    encoded, slope = srgb_and_slope(value)
-                    g += common_weight[c] * (encoded - common[t, c]) * slope
-                elif regular and c == 3:
-                    g += common_weight[3] * (value - common[t, 3])
-                g *= value * (_1 - value)
-            else:
-                for e in range(start[t], start[t + 1]):
-                    pull += value - values[neighbour[e], c]
-                g += _2 * (smoothness[c] * pull + offset_weight * value)
-            m = beta1 * first[t, c] + (_1 - beta1) * g
-            s = beta2 * second[t, c] + (_1 - beta2) * g * g
-            first[t, c] = m
-            second[t, c] = s
-            r = raw[t, c] - rate[c] * m * correction1 / (math.sqrt(s * correction2) + epsilon)
-            raw[t, c] = r
-            new_values[t, c] = r if c >= 5 else _1 / (_1 + math.exp(-r))
+    regular, texels = common.shape[0] > 0, raw.shape[0]
+    size = -(-texels // CHUNKS)
+    for chunk in prange(CHUNKS):
+        pull = np.empty(PARAMETERS, np.float32)
+        for t in range(chunk * size, min(texels, (chunk + 1) * size)):
+            pull[:] = _0
+            for e in range(start[t], start[t + 1]):
+                other = np.uint64(neighbour[e])
+                for c in range(5):
+                    pull[c] += _sign(values[t, c] - values[other, c])
+                for c in range(5, PARAMETERS):
+                    pull[c] += values[t, c] - values[other, c]
+            for c in range(PARAMETERS):
+                value = values[t, c]
+                g = data[t, c] + mean_weight[c] * (_1 - values[t, 4] if c < 3 else _1)  # of base colour only the diffuse part
+                data[t, c] = _0
+                if c < 5:
+                    g += smoothness[c] * pull[c]
+                    if regular and c < 3:
+                        encoded, slope = srgb_and_slope(value)
+                        g += common_weight[c] * (encoded - common[t, c]) * slope
+                    elif regular and c == 3:
+                        g += common_weight[3] * (value - common[t, 3])
+                    g *= value * (_1 - value)
+                else:
+                    g += _2 * (smoothness[c] * pull[c] + offset_weight * value)
+                m = beta1 * first[t, c] + (_1 - beta1) * g
+                s = beta2 * second[t, c] + (_1 - beta2) * g * g
+                first[t, c] = m
+                second[t, c] = s
+                r = raw[t, c] - rate[c] * m * correction1 / (math.sqrt(s * correction2) + epsilon)
+                raw[t, c] = r
+                new_values[t, c] = r if c >= 5 else _1 / (_1 + math.exp(-r))
 
 
 @njit(parallel=True, **_FLAGS)

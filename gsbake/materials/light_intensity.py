@@ -36,7 +36,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gsbake.imaging.srgb import encode
 from gsbake.materials.linear_shading import BaseColourSolver, LinearShading, PhotoSamples
 
 Floats = NDArray[np.float64]
@@ -204,7 +203,7 @@ def _residual(photos: Sequence[PhotoSamples], roughness: NDArray[np.float32]) ->
     base = BaseColourSolver(photos, len(roughness)).solve(shadings, robust=True)
     total, pixels = np.zeros(3), 0.0
     for photo, shading in zip(photos, shadings, strict=True):
-        error = (shading.srgb(base[photo.texel]) - encode(photo.colour)) * photo.weight[:, None]
+        error = (shading.srgb(base[photo.texel]) - photo.encoded) * photo.weight[:, None]
         total += [np.abs(np.bincount(photo.block, error[:, k])).sum() for k in range(3)]
         pixels += float(photo.weight.sum())
     return total / max(pixels, 1e-12)

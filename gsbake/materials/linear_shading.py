@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -47,6 +48,11 @@ class PhotoSamples:
     block: NDArray[np.int32]
     shade: Shader
     tilted: tuple[Shader, ...] = ()
+
+    @cached_property
+    def encoded(self) -> NDArray[np.float32]:
+        """The colour (n, 3) in sRGB."""
+        return encode(self.colour)
 
 
 def perceptual_weights(samples: PhotoSamples) -> NDArray[np.float32]:

@@ -27,7 +27,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from gsbake.imaging.srgb import encode
 from gsbake.materials.linear_shading import CLIPPED, BaseColourSolver, LinearShading, PhotoSamples, observed_weight
 
 Floats = NDArray[np.float64]
@@ -79,7 +78,7 @@ class ShadingModel:
         variance = np.full(shown.shape, NOISE**2, np.float32)
         for tilted in self.tilted:
             variance += np.square(tilted.srgb(b) - shown)
-        error = np.square(shown - encode(samples.colour)) / variance
+        error = np.square(shown - samples.encoded) / variance
         nll = 0.5 * (DEGREES_OF_FREEDOM + 1) * np.log1p(error / DEGREES_OF_FREEDOM) + 0.5 * np.log(variance)
         return np.asarray(np.bincount(samples.texel, samples.weight * nll.sum(1), len(base)), np.float64)
 

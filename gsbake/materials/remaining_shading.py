@@ -15,10 +15,12 @@ prior on reflectance*, NIPS 2011). Gauss-Newton with iteratively reweighted leas
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from numba import njit, prange
 from numpy.typing import NDArray
 
 from gsbake.materials.delighting import harmonics, nearby_pairs
@@ -34,6 +36,8 @@ CHROMATICITY_SCALE, BRIGHTNESS_SCALE, NEARBY_BRIGHTNESS_SCALE = 0.06, 0.1, 0.2
 LOG_OFFSET, NOISE_FLOOR = 0.004, 0.03
 #: Ridge weight of the coefficients, rounds of reweighting, and damping of a step.
 RIDGE, ROUNDS, DAMPING = 1e-3, 25, 0.7
+#: Partial sums of the pairs: a fixed number, so that results do not depend on threads.
+CHUNKS = 16
 #: Points at which the irradiance of a changed light is matched, Gauss-Newton steps, their ridge weight and largest exponent.
 MATCHED_POINTS, MATCHING_STEPS, MATCHING_RIDGE, MAX_EXPONENT = 4000, 4, 1e-3, 1.0
 
@@ -48,19 +52,55 @@ def remaining_shading(base_color: NDArray[Any], normal: NDArray[Any], position: 
     logs = np.log(np.maximum(np.asarray(base_color[chosen], np.float64), 0) + LOG_OFFSET)
     basis = harmonics(normal[chosen])
     first, second, share, scale = _pairs(np.asarray(position[chosen], np.float64), generator)
-    slope, difference = basis[first] - basis[second], logs[first] - logs[second]
+    matrices, rights, weights = (np.zeros((CHUNKS, 3, *shape)) for shape in ((8, 8), (8,), ()))
     for _ in range(ROUNDS):
-        rest = difference - slope @ found
-        brightness = rest.mean(1)
-        chromaticity = np.linalg.norm(rest - brightness[:, None], axis=1)
-        similar = share * np.exp(-((chromaticity / CHROMATICITY_SCALE) ** 2)) / (1 + (brightness / scale) ** 2)
+        normal_equations(first, second, basis, logs, share, scale, found, matrices, rights, weights)
         for channel in range(3):
-            weight = similar / np.maximum(np.abs(rest[:, channel]), NOISE_FLOOR)
-            ridge = RIDGE * max(float(weight.sum()), 1e-12)
-            normal_matrix = (slope * weight[:, None]).T @ slope + ridge * np.eye(8)
-            step = slope.T @ (weight * rest[:, channel]) - ridge * found[:, channel]
-            found[:, channel] += DAMPING * np.linalg.solve(normal_matrix, step)
+            ridge = RIDGE * max(float(weights[:, channel].sum()), 1e-12)
+            step = rights[:, channel].sum(0) - ridge * found[:, channel]
+            found[:, channel] += DAMPING * np.linalg.solve(matrices[:, channel].sum(0) + ridge * np.eye(8), step)
     return found
+
+
+@njit(parallel=True, cache=True, error_model="numpy", fastmath={"contract", "nsz"})
+def normal_equations(
+    first: Any, second: Any, basis: Any, logs: Any, share: Any, scale: Any, found: Any, matrices: Any, rights: Any, weights: Any
+) -> None:
+    """Matrix, right side and sum of weights of one round's least squares for each channel, in a fixed number of partial sums.
+
+    The pairs (`first`, `second`) (m,) of points with harmonics `basis` (n, 8) and log base colours `logs` (n, 3) count as `share` (m,),
+    less where brightness differs by `scale` (m,) after the shading of the coefficients `found` (8, 3). `matrices` (CHUNKS, 3, 8, 8),
+    `rights` (CHUNKS, 3, 8) and `weights` (CHUNKS, 3) are overwritten.
+    """
+    chunks = matrices.shape[0]
+    size = -(-len(first) // chunks)
+    for chunk in prange(chunks):
+        matrix, right, total = np.zeros((3, 8, 8)), np.zeros((3, 8)), np.zeros(3)
+        slope, rest = np.empty(8), np.empty(3)
+        for pair in range(chunk * size, min(len(first), (chunk + 1) * size)):
+            i, j = first[pair], second[pair]
+            for k in range(8):
+                slope[k] = basis[i, k] - basis[j, k]
+            for c in range(3):
+                rest[c] = logs[i, c] - logs[j, c]
+                for k in range(8):
+                    rest[c] -= slope[k] * found[k, c]
+            brightness = (rest[0] + rest[1] + rest[2]) / 3
+            chromaticity = (rest[0] - brightness) ** 2 + (rest[1] - brightness) ** 2 + (rest[2] - brightness) ** 2
+            similar = share[pair] * math.exp(-chromaticity / CHROMATICITY_SCALE**2) / (1 + (brightness / scale[pair]) ** 2)
+            for c in range(3):
+                weight = similar / max(abs(rest[c]), NOISE_FLOOR)
+                total[c] += weight
+                for k in range(8):
+                    weighted = weight * slope[k]
+                    right[c, k] += weighted * rest[c]
+                    for m in range(k + 1):
+                        matrix[c, k, m] += weighted * slope[m]
+        for c in range(3):
+            for k in range(8):
+                for m in range(k):
+                    matrix[c, m, k] = matrix[c, k, m]
+        matrices[chunk], rights[chunk], weights[chunk] = matrix, right, total
 
 
 def _pairs(position: Doubles, generator: np.random.Generator) -> tuple[NDArray[np.int64], NDArray[np.int64], Doubles, Doubles]:

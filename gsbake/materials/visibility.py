@@ -23,6 +23,7 @@ from typing import Any
 
 import numpy as np
 import scipy.sparse
+from numba import njit, prange
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
@@ -64,6 +65,20 @@ def _cells(count: int, size: int) -> scipy.sparse.csr_matrix:
     rows = np.concatenate([rotation * count + cKDTree(copy).query(centre)[1] for rotation, copy in enumerate(directions(count))])
     weight = np.tile(angle * (count / (4 * np.pi)), ROTATIONS)
     return scipy.sparse.csr_matrix((weight.astype(np.float32), (rows, np.tile(column, ROTATIONS))), shape=(ROTATIONS * count, len(centre)))
+
+
+@njit(parallel=True, cache=True, error_model="numpy")
+def unoccluded_irradiance(normal: Any, rotation: Any, copies: Any, cells: Any, out: Any) -> None:
+    """`out` (n,): irradiance / π of surfaces with unit `normal` (n, 3) under `cells` (ROTATIONS, count), each summed over the directions
+    `copies` (ROTATIONS, count, 3) of its own `rotation` (n,)."""
+    count = cells.shape[1]
+    for i in prange(normal.shape[0]):
+        r = rotation[i]
+        x, y, z = normal[i, 0], normal[i, 1], normal[i, 2]
+        total = np.float32(0)
+        for k in range(count):
+            total += max(x * copies[r, k, 0] + y * copies[r, k, 1] + z * copies[r, k, 2], np.float32(0)) * cells[r, k]
+        out[i] = total * np.float32(4 / count)
 
 
 @dataclass(frozen=True)
@@ -148,11 +163,9 @@ class Visibility:
 
     def _unoccluded_irradiance(self, cells: Floats) -> Floats:
         """Irradiance / π (n,) of unoccluded texels under `cells` (ROTATIONS·count,), by the same quadrature as the blocked part."""
-        out = np.zeros(len(self.normal), np.float32)
-        for rotation, copy in enumerate(directions(self.count)):
-            mine = self.rotation == rotation
-            out[mine] = np.maximum(self.normal[mine] @ copy.T, 0) @ cells[rotation * self.count : (rotation + 1) * self.count]
-        return out * np.float32(4 / self.count)
+        out = np.empty(len(self.normal), np.float32)
+        unoccluded_irradiance(self.normal, self.rotation, directions(self.count), cells.reshape(ROTATIONS, self.count), out)
+        return out
 
     def _filter(self, value: Floats) -> Floats:
         """`value` (n,) averaged over neighbouring texels of the surface."""

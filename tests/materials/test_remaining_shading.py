@@ -8,7 +8,14 @@ import torch
 from numpy.typing import NDArray
 
 from gsbake.materials.delighting import harmonics
-from gsbake.materials.remaining_shading import remaining_shading, with_irradiance_factor
+from gsbake.materials.remaining_shading import (
+    CHROMATICITY_SCALE,
+    CHUNKS,
+    NOISE_FLOOR,
+    normal_equations,
+    remaining_shading,
+    with_irradiance_factor,
+)
 from gsbake.shading.environment import EnvironmentLight
 from gsbake.shading.light_tables import prefilter_cube_map
 
@@ -62,3 +69,23 @@ def test_the_light_gets_the_irradiance() -> None:
     got = irradiance(with_irradiance_factor(radiance, TRUE, normal, irradiance))
     assert np.abs(got / wanted - 1).mean() < 0.02
     assert np.abs(irradiance(radiance) / wanted - 1).mean() > 0.1
+
+
+def test_normal_equations_equal_sums_of_arrays() -> None:
+    rng, points, pairs = np.random.default_rng(2), 50, 333
+    first, second = rng.integers(points, size=(2, pairs))
+    basis, logs = rng.normal(size=(points, 8)), rng.normal(scale=0.1, size=(points, 3))
+    share, scale, found = rng.uniform(size=pairs), rng.uniform(0.1, 0.2, pairs), rng.normal(scale=0.01, size=(8, 3))
+    matrices, rights, weights = (np.ones((CHUNKS, 3, *shape)) for shape in ((8, 8), (8,), ()))
+    normal_equations(first, second, basis, logs, share, scale, found, matrices, rights, weights)
+
+    slope = basis[first] - basis[second]
+    rest = logs[first] - logs[second] - slope @ found
+    brightness = rest.mean(1)
+    chromaticity = np.linalg.norm(rest - brightness[:, None], axis=1)
+    similar = share * np.exp(-((chromaticity / CHROMATICITY_SCALE) ** 2)) / (1 + (brightness / scale) ** 2)
+    for channel in range(3):
+        weight = similar / np.maximum(np.abs(rest[:, channel]), NOISE_FLOOR)
+        assert np.allclose(matrices[:, channel].sum(0), (slope * weight[:, None]).T @ slope)
+        assert np.allclose(rights[:, channel].sum(0), slope.T @ (weight * rest[:, channel]))
+        assert np.isclose(weights[:, channel].sum(), weight.sum())

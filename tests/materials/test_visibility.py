@@ -18,7 +18,7 @@ from gsbake.materials.fit import MaterialFit
 from gsbake.materials.fit_surface import FitSurface
 from gsbake.materials.options import FitSchedule, Priors
 from gsbake.materials.pixels import PixelReader, Pixels
-from gsbake.materials.visibility import Visibility, directions
+from gsbake.materials.visibility import ROTATIONS, Visibility, directions, unoccluded_irradiance
 from gsbake.shading import cubemap
 from gsbake.shading.environment import EnvironmentLight
 from gsbake.shading.split_sum import shade
@@ -230,3 +230,14 @@ def test_shadows_and_indirect_light_stay_out_of_base_colour() -> None:
     assert direct < 0.9 * none
     assert indirect < 0.95 * direct
     assert tray.error(visibility, True, Priors.of(Bake()).sparsity) < 0.9 * indirect
+
+
+def test_unoccluded_irradiance_is_the_sum_over_directions() -> None:
+    rng, n, count = np.random.default_rng(3), 70, 12
+    normal = rng.normal(size=(n, 3)).astype(np.float32)
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    rotation, cells = rng.integers(ROTATIONS, size=n), rng.uniform(size=(ROTATIONS, count)).astype(np.float32)
+    found = np.empty(n, np.float32)
+    unoccluded_irradiance(normal, rotation, directions(count), cells, found)
+    cosine = np.maximum(np.einsum("nc,nkc->nk", normal.astype(float), directions(count)[rotation].astype(float)), 0)
+    assert np.allclose(found, (cosine * cells[rotation]).sum(1) * 4 / count, atol=1e-5)
