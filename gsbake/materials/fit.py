@@ -33,7 +33,6 @@ from numpy.typing import NDArray
 
 from gsbake.imaging.metrics import decibels
 from gsbake.materials import fit_kernel
-from gsbake.materials.adjacency import neighbour_lists
 from gsbake.materials.bilateral import EdgeAwareFilter
 from gsbake.materials.emission import find_emission
 from gsbake.materials.fit_surface import FitSurface, Fitted
@@ -54,7 +53,8 @@ from gsbake.materials.photo_batch import (
 )
 from gsbake.materials.pixels import Pixels
 from gsbake.materials.remaining_shading import MATCHED_POINTS, remaining_shading, with_irradiance_factor
-from gsbake.materials.sparsity_prior import KERNEL_WIDTHS, common_materials
+from gsbake.materials.sparsity_prior import common_materials
+from gsbake.materials.texel_optimiser import TexelOptimiser
 from gsbake.shading.cubemap import solid_angles
 from gsbake.shading.environment import EnvironmentLight
 from gsbake.shading.light_motion import mean_radiance, rotated
@@ -83,11 +83,9 @@ class MaterialFit:
         values = np.zeros((n, fit_kernel.PARAMETERS), np.float32)
         values[:, :3] = np.clip(surface.base_color, *o.base_color_range)
         values[:, 3], values[:, 4] = roughness, metallic
-        self._set(values)
+        self._texels = TexelOptimiser(surface, priors, o, values)
         self._metal_start, self.emissive_regions = metallic > o.max_dielectric_metallic, 0
         self._adjustments: list[LightAdjustment] = []
-        self._moments = np.zeros_like(values), np.zeros_like(values)
-        self._steps = 0
         self._step_buffers = FitStep(n)
         self._normal = np.ascontiguousarray(surface.normal, np.float32)
         self._transport = np.zeros((n, fit_kernel.TRANSPORT), np.float32)
@@ -98,11 +96,10 @@ class MaterialFit:
         self._residual = np.zeros(2)  # sums of weighted squared errors and of weights
         self._adam_light = torch.optim.Adam([self._light.raw], lr=o.light_rate, betas=o.betas)
 
-    def _set(self, values: Floats) -> None:
-        """Start from texel `values` (n, PARAMETERS)."""
-        self._values, self._spare = values, np.empty_like(values)
-        self._raw = values.copy()
-        self._raw[:, :5] = _logit(values[:, :5])
+    @property
+    def _values(self) -> Floats:
+        """The present values (n, PARAMETERS) of the texels."""
+        return self._texels.values
 
     def continued_on(self, surface: FitSurface, up: Callable[[NDArray[Any]], Floats]) -> MaterialFit:
         """A fit on the finer texels of `surface` that starts from this one; `up` interpolates values (n, c) at the finer texels.
@@ -115,7 +112,7 @@ class MaterialFit:
         detail = (surface.base_color + DETAIL_OFFSET) / (up(self._surface.base_color) + DETAIL_OFFSET)
         values[:, :3] = np.clip(values[:, :3] * np.clip(detail, 1 / MAX_DETAIL_RATIO, MAX_DETAIL_RATIO), *o.base_color_range)
         values[:, 3:5] = np.clip(values[:, 3:5], o.min_base_color, 1 - o.min_base_color)
-        fit._set(np.ascontiguousarray(values, np.float32))
+        fit._texels = TexelOptimiser(surface, self._priors, o, np.ascontiguousarray(values, np.float32))
         with torch.no_grad():
             fit._light.raw.copy_(self._light.raw)
         if self.emissive_regions:
@@ -135,7 +132,7 @@ class MaterialFit:
         batches = self._batches(photos)
         order: list[int] = []
         self._common, self._residual = np.zeros((0, 4), np.float32), np.zeros(2)
-        weight = texel_weight(batches, len(self._raw))
+        weight = texel_weight(batches, len(self._values))
         self._rotations = [batch.to_light for batch in batches]
         given = self._lights() if schedule.fixed_light else None
         for step in range(steps if batches else 0):
@@ -146,8 +143,8 @@ class MaterialFit:
                 tint = not schedule.diffuse or len(self._adjustments) < o.diffuse_tint_searches
                 self._adjustments.append(self._search_light(batches, generator, tint, rough=not self._adjustments))
                 update_common = True
-            if step in {int(share * steps) for share in schedule.metal_anchors_at} and not self.mostly_dielectric:
-                self._anchor_metals()
+            if step in {int(share * steps) for share in schedule.light_scaled_at} and not self.mostly_dielectric:
+                self._scale_light_to_metals()
             if not schedule.diffuse and step in {int(share * steps) for share in schedule.metal_searches_at}:
                 self._search_metals(batches)
                 update_common = True
@@ -183,7 +180,7 @@ class MaterialFit:
         self._adam_light.param_groups[0]["lr"] = o.light_rate * decay
         loss = (tables.table * torch.from_numpy(self._step_buffers.table.sum(0))).sum()
         if self._priors.neutral_light:
-            loss = loss + len(self._raw) * self._priors.neutral_light * neutral_light_loss(radiance)
+            loss = loss + len(self._values) * self._priors.neutral_light * neutral_light_loss(radiance)
         loss.backward()
         self._adam_light.step()
         self._update_texels(decay)
@@ -191,34 +188,13 @@ class MaterialFit:
     def _shade(self, batch: PhotoBatch, tables: KernelTables) -> None:
         """Shade the pixels of a photo, leave the gradients in the buffers and add to the sums of the residual."""
         o = self._options
-        factor = len(self._raw) / len(batch)
+        factor = len(self._values) / len(batch)
         self._residual += self._step_buffers(batch, self._values, tables, self._transport, o.residual_weight, o.robust_scale, factor)[1:]
 
     def _update_texels(self, decay: float) -> None:
-        """One Adam step on all texels, from the gradient of the photo and those of the priors."""
-        o, priors, f = self._options, self._priors, np.float32
-        self._steps += 1
-        start, neighbour = self._adjacency
-        pair_weight = len(self._raw) / max(1, len(self._surface.pairs))
-        normal_smoothness = o.normal_smoothness * (self._surface.texels.size / 512) ** 2  # the change per texel grows with their size
-        smoothness = np.array([*(priors.smoothness * np.array(o.smoothness_channels)), *[normal_smoothness] * 3], f) * f(pair_weight)
-        mean_weight = np.array([*[priors.base_color_l1 / 3] * 3, 0, priors.metallic_l1, 0, 0, 0], f)
-        common_weight = np.zeros(4, f)
-        if len(self._common):
-            residual = self._residual[0] / max(self._residual[1], 1e-6) / o.robust_scale**2
-            common_weight = (priors.sparsity * residual / np.square(KERNEL_WIDTHS)).astype(f)
-        rate = np.array([o.texel_rate] * 5 + [o.normal_rate] * 3, f) * f(decay)
-        beta1, beta2 = o.betas
-        fit_kernel.adam_step(
-            self._raw, self._values, self._spare, self._step_buffers.gradient, *self._moments, start, neighbour, smoothness, mean_weight,
-            f(o.normal_offset_weight), self._common, common_weight, rate, f(beta1), f(beta2), f(1 / (1 - beta1**self._steps)),
-            f(1 / (1 - beta2**self._steps)), f(o.epsilon),
-        )  # fmt: skip
-        self._values, self._spare = self._spare, self._values
-
-    @cached_property
-    def _adjacency(self) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
-        return neighbour_lists(self._surface.pairs, len(self._raw))
+        """One step on all texels, from the gradient of the photo and those of the priors."""
+        residual = float(self._residual[0] / max(self._residual[1], 1e-6) / self._options.robust_scale**2)
+        self._texels.step(self._step_buffers.gradient, residual, self._common, decay)
 
     def _update_transport(self) -> None:
         """Visibility, indirect light and outgoing radiance under the present light and materials."""
@@ -270,7 +246,7 @@ class MaterialFit:
         """Search for the light's intensity and contrast and for a roughness shift, apply them, and adapt base colours."""
         o, values = self._options, self._values
         if not self.mostly_dielectric:
-            return self._anchor_metals()
+            return self._scale_light_to_metals()
         dielectric = self._dielectric()
         share = min(1.0, o.intensity_pixels / max(1, sum(map(len, batches))))
         chosen = dielectric & (generator.random(len(dielectric)) < share)
@@ -313,7 +289,7 @@ class MaterialFit:
         after = self._irradiance() * self._transport[:, :1] + self._transport[:, INDIRECT]
         new = self._values[texel, :5]
         new[:, :3] = np.clip(new[:, :3] * before[texel] / np.maximum(after[texel], 1e-6), o.min_base_color, o.base_color_range[1])
-        self._reinitialise(texel, new)
+        self._texels.reinitialise(texel, new)
 
     @property
     def moving_light(self) -> bool:
@@ -325,7 +301,7 @@ class MaterialFit:
         """Whether so much is dielectric that its diffuse colours tell of the light."""
         return bool(self._dielectric().mean() >= self._options.min_dielectric_share)
 
-    def purify_metals(self) -> None:
+    def rescale_metallic(self) -> None:
         """Scale metallic, where it is above .5, so that its median there is 1: metals are pure.
 
         Gradient steps leave it lower, as a share of diffuse reflection makes up for reflections that are misplaced.
@@ -333,8 +309,8 @@ class MaterialFit:
         texel = np.flatnonzero(self._values[:, 4] > 0.5)
         if len(texel):
             new = self._values[texel, :5]
-            new[:, 4] = np.minimum(new[:, 4] / np.median(new[:, 4]), self._options.purest_metallic)
-            self._reinitialise(texel, new)
+            new[:, 4] = np.minimum(new[:, 4] / np.median(new[:, 4]), self._options.max_metallic)
+            self._texels.reinitialise(texel, new)
 
     @torch.no_grad()
     def move_shading_to_light(self, seed: int) -> None:
@@ -352,7 +328,7 @@ class MaterialFit:
         self._change_light(EnvironmentLight.from_radiance(light), texel)
 
     @torch.no_grad()
-    def _anchor_metals(self) -> LightAdjustment:
+    def _scale_light_to_metals(self) -> LightAdjustment:
         """Scale the light and base colours so that metals are as bright as metals usually are: their reflections leave the scale open."""
         o, metal = self._options, self._values[:, 4] > 0.5
         if not metal.any():
@@ -363,7 +339,7 @@ class MaterialFit:
         self._adam_light.state.clear()
         new = self._values[:, :5].copy()
         new[:, :3] = np.clip(new[:, :3] * np.float32(factor), o.min_base_color, o.base_color_range[1])
-        self._reinitialise(np.arange(len(new)), np.clip(new, 1e-6, 1 - 1e-6))
+        self._texels.reinitialise(np.arange(len(new)), np.clip(new, 1e-6, 1 - 1e-6))
         self._update_transport()
         return LightAdjustment(np.full(3, 1 / factor), 1.0, 0.0, 0.0)
 
@@ -380,7 +356,7 @@ class MaterialFit:
     def _search_metals(self, batches: list[PhotoBatch]) -> None:
         """Reinitialise texels that are detected as metal, and from a metallic start those that are dielectric."""
         o = self._options
-        step = max(1, sum(map(len, batches)) // (o.metal_pixels * len(self._raw)))
+        step = max(1, sum(map(len, batches)) // (o.metal_pixels * len(self._values)))
         samples = self._samples([batch.every(step) for batch in batches], tilted=True)
         found = find_metals(samples, self._values[:, 3].copy(), self._colour_filter)
         kinds = [(found.texel, found.base, found.roughness, o.detected_metallic)]
@@ -390,7 +366,7 @@ class MaterialFit:
             # A texel that already is of its kind keeps its values.
             other = (self._values[texel, 4] > 0.5) != (metallic > 0.5) if self._metal_start else np.ones(len(texel), bool)
             values = np.column_stack([np.clip(base, *o.base_color_range), roughness, np.full(len(texel), metallic)])
-            self._reinitialise(texel[other], values[other])
+            self._texels.reinitialise(texel[other], values[other])
 
     def _search_emission(self, batches: list[PhotoBatch]) -> int:
         """Set the radiance of emissive regions and reinitialise their base colour to black; the number of regions."""
@@ -399,15 +375,8 @@ class MaterialFit:
         self._transport[found.texel, EMISSION] = found.radiance
         black = self._values[found.texel, :5]
         black[:, :3], black[:, 4] = o.base_color_range[0], o.detected_dielectric
-        self._reinitialise(found.texel, black)
+        self._texels.reinitialise(found.texel, black)
         return found.regions
-
-    def _reinitialise(self, texel: NDArray[np.int64], values: NDArray[Any]) -> None:
-        """Set texels (m,) to `values` (m, 5) and reset the optimiser's moments there."""
-        self._values[texel, :5] = values
-        self._raw[texel, :5] = _logit(self._values[texel, :5])
-        for moment in self._moments:
-            moment[texel, :5] = 0
 
     def samples_of(self, pixels: Pixels, chosen: NDArray[np.bool_]) -> tuple[NDArray[np.int64], PhotoSamples]:
         """Which (m,) of the `pixels` have a dominant texel that is `chosen` (n,), and their samples under the fitted light."""
@@ -431,9 +400,3 @@ class MaterialFit:
             [self._step_buffers(b, materials, lights.tables(b.to_light), self._transport, 1.0, scale, 0.0) for b in batches], axis=0
         )
         return float(sums[0] / sums[2]), float(sums[1] / sums[2])
-
-
-def _logit(values: NDArray[Any]) -> Floats:
-    """log(v / (1 − v)) of values in (0, 1)."""
-    v = np.asarray(values, np.float64)
-    return np.asarray(np.log(v / (1 - v)), np.float32)

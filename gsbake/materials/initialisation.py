@@ -25,7 +25,7 @@ STARTS = ((0.05, 0.2), (0.05, 0.45), (0.05, 0.8), (0.9, 0.2), (0.9, 0.45))
 #: When trials search for metals, as shares of their steps.
 METAL_SEARCHES_AT = (0.4, 0.8)
 #: When the light of a mostly metallic object is scaled: metals are found with the light that they have.
-METAL_ANCHORS_AT = (0.6,)
+LIGHT_SCALED_AT = (0.6,)
 #: Start of a diffuse object, and without validation photos.
 DIFFUSE_START, DEFAULT_START = (0.05, 0.8), (0.05, 0.45)
 #: Starts whose error is within this factor of the best one are continued as well, at most so many in all.
@@ -64,7 +64,7 @@ def trial_schedule(steps: int, seed: int, diffuse: bool) -> FitSchedule:
         METAL_SEARCHES_AT,
         emission=False,
         light_searches_at=(),
-        metal_anchors_at=METAL_ANCHORS_AT,
+        light_scaled_at=LIGHT_SCALED_AT,
         sparsity=False,
         diffuse=diffuse,
     )

@@ -29,7 +29,7 @@ class FitSchedule:
 
     Metals are searched for at the shares `metal_searches_at` of all steps, but not on an object that is `diffuse`. Without `emission`
     nothing is emissive, without `sparsity` the sparsity prior is off. The light's intensity is searched for at `light_searches_at`; between
-    these and without any it is left to gradient steps. At `metal_anchors_at` only a mostly metallic object has its light scaled.
+    these and without any it is left to gradient steps. At `light_scaled_at` only a mostly metallic object has its light scaled.
     `rate` is a factor on all learning rates; with `fixed_light` the light is given.
     """
 
@@ -38,7 +38,7 @@ class FitSchedule:
     metal_searches_at: tuple[float, ...] = (0.3, 0.55, 0.8)
     emission: bool = True
     light_searches_at: tuple[float, ...] = (0.5, 0.6, 0.7, 0.8)
-    metal_anchors_at: tuple[float, ...] = ()
+    light_scaled_at: tuple[float, ...] = ()
     sparsity: bool = True
     diffuse: bool = False
     rate: float = 1.0
@@ -97,8 +97,8 @@ class FitOptions:
     detected_metallic: float = 0.9
     #: The same of dielectric texels.
     detected_dielectric: float = 0.05
-    #: Highest metallic of purified metals: logits stay finite.
-    purest_metallic: float = 0.99
+    #: Highest metallic of rescaled metals: logits stay finite.
+    max_metallic: float = 0.99
 
     #: Pixels that a search for the light's intensity uses at most, and the least share of dielectric texels: reflections of metal do not
     #: tell the intensity.

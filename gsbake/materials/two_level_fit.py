@@ -83,6 +83,6 @@ def fit_two_levels(
             choice.fit.run(coarse.fitted, [], adapt, each("material fit, coarse level"))
         choice.fit.move_shading_to_light(plan.seed + SHADING_ROUNDS)
     if not choice.fit.mostly_dielectric:
-        choice.fit.purify_metals()
+        choice.fit.rescale_metallic()
     fit = choice.fit.continued_on(fine.surface, texture.up)
     return replace(choice, fit=fit, fitted=fit.run(fine.fitted, fine.held_out, refine, each("material fit, fine level")))

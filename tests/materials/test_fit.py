@@ -236,12 +236,12 @@ def test_metal_is_found_from_the_best_start() -> None:
 def test_purified_metals_have_a_median_of_one(glossy: Scene) -> None:
     fit = glossy.fit(0.3, metallic=0.7)
     before = fit.run(glossy.photos[2:], [], FitSchedule(0)).values
-    fit.purify_metals()
+    fit.rescale_metallic()
     after = fit.run(glossy.photos[2:], [], FitSchedule(0)).values
     assert np.median(before[:, 4]) == pytest.approx(0.7, abs=1e-3) and np.median(after[:, 4]) == pytest.approx(0.99, abs=1e-3)
     np.testing.assert_allclose(after[:, :4], before[:, :4], atol=1e-6)
     dielectric = glossy.fit(0.3, metallic=0.05)
-    dielectric.purify_metals()
+    dielectric.rescale_metallic()
     assert dielectric.run(glossy.photos[2:], [], FitSchedule(0)).values[:, 4].max() < 0.1
 
 
