@@ -29,7 +29,9 @@ FIRST_WIDTH, LAST_WIDTH = 1.5, 0.25
 #: Cells along each side of the lattice on which the zero level set is looked for, and Newton steps onto it.
 SEARCH_CELLS, NEWTON_STEPS = 64, 3
 #: Points of the fit to the known distance, those of one step, and its rate as a multiple of that of training.
-FIT_POINTS, FIT_BATCH, FIT_RATE = 60_000, 8192, 3.0
+FIT_POINTS, FIT_BATCH, FIT_RATE = 60_000, 4096, 3.0
+#: Weight of the gradient's error in that fit.
+GRADIENT_WEIGHT = 1.0
 
 
 class ContinuousField(Field):
@@ -171,7 +173,9 @@ class ContinuousField(Field):
         return combined_losses(self, step, view, self.loss, self.coupling)
 
     def fit(self, known: Known, seed: int, steps: int) -> None:
-        """Fit the parameters to the known distance (L1) at points near the surface and all over the box."""
+        """Fit the parameters to the known distance (L1, in spacings) and its gradient (L1) at points near the surface and all over the box.
+
+        Without the gradient a field with many parameters meets the distances by a rough function, whose slope has no meaning."""
         if not steps:
             return
         rng = np.random.default_rng(seed)
@@ -181,7 +185,8 @@ class ContinuousField(Field):
             near = known.points[rng.integers(len(known.points), size=FIT_POINTS - len(points))]
             spread = np.repeat([1.0, 4.0], [len(near) // 2, len(near) - len(near) // 2])[:, None] * known.spacing
             points = np.concatenate([points, near + spread * rng.normal(size=near.shape)])
-        x, target = torch.from_numpy(points.astype(np.float32)), torch.from_numpy(known(points))
+        x = torch.from_numpy(points.astype(np.float32))
+        target, slope = (torch.from_numpy(known_at) for known_at in known.with_gradient(points))
         adam, generator = Adam(), torch.Generator().manual_seed(seed)
         parameters, rates = self.own_parameters(), self.own_rates()
         for done in range(steps):
@@ -189,7 +194,8 @@ class ContinuousField(Field):
             for p in parameters.values():
                 p.requires_grad_()
                 p.grad = None
-            ((self.evaluate(x[batch])[0] - target[batch]).abs()).mean().backward()
+            f, g = self.evaluate(x[batch])
+            ((f - target[batch]).abs().mean() / known.spacing + GRADIENT_WEIGHT * (g - slope[batch]).abs().sum(1).mean()).backward()
             for name, p in parameters.items():
                 if p.grad is not None:
                     adam.step(name, p.data, p.grad, FIT_RATE * rates[name] * 0.1 ** (done / steps))

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import label
 from scipy.spatial import cKDTree
 
+from gsbake.geometry.vectors import unit
 from gsbake.meshing.resolution import surfel_spacing
 
 Floats = NDArray[np.float64]
@@ -62,6 +63,11 @@ class KnownDistance:
 
     def __call__(self, query: NDArray[np.floating]) -> NDArray[np.float32]:
         """Signed distances (n,) at `query` (n, 3)."""
+        return self.with_gradient(query)[0]
+
+    def with_gradient(self, query: NDArray[np.floating]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Signed distances (n,) at `query` (n, 3), and unit gradients (n, 3): blended normals near the points, else the direction away from
+        the nearest one."""
         x = np.nan_to_num(np.asarray(query, float), nan=0.0, posinf=1e6, neginf=-1e6)
         k = min(NEIGHBOURS, len(self.points))
         distance, index = self.tree.query(x, k=range(1, k + 1), workers=-1)
@@ -74,7 +80,10 @@ class KnownDistance:
         outside |= ((x < self._lower) | (x > self._lower + self._cell * (np.array(self._outside.shape) - 1))).any(1)
         sign = np.where(outside, 1.0, np.where(inside, -1.0, np.where(blended < 0, -1.0, 1.0)))
         near = nearest < NEAR_SPACINGS * self.spacing
-        return np.where(near, np.clip(blended, -nearest, nearest), sign * nearest).astype(np.float32)
+        value = np.where(near, np.clip(blended, -nearest, nearest), sign * nearest)
+        normal = np.einsum("nk,nkc->nc", weight, self.normals[index])
+        slope = np.where(near[:, None], normal, sign[:, None] * (x - self.points[index[:, 0]]))
+        return value.astype(np.float32), unit(slope).astype(np.float32)
 
 
 class SphereDistance:
@@ -93,7 +102,12 @@ class SphereDistance:
 
     def __call__(self, query: NDArray[np.floating]) -> NDArray[np.float32]:
         """Signed distances (n,) at `query` (n, 3)."""
-        return (np.linalg.norm(np.asarray(query, float), axis=1) - self.radius).astype(np.float32)
+        return self.with_gradient(query)[0]
+
+    def with_gradient(self, query: NDArray[np.floating]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Signed distances (n,) at `query` (n, 3), and unit gradients (n, 3)."""
+        x = np.asarray(query, float)
+        return (np.linalg.norm(x, axis=1) - self.radius).astype(np.float32), unit(x).astype(np.float32)
 
 
 Known = KnownDistance | SphereDistance

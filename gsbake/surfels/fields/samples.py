@@ -51,6 +51,13 @@ class SamplesField(Field):
         """The SDF samples (n,) themselves."""
         return surfels.sdf
 
+    def opacity(self, surfels: Surfels) -> Tensor:
+        """Opacity (n,). With the sharpness in spacings the median loss alone moves it: photos would sharpen a band of surfels until it is
+        transparent, since fewer opaque layers always explain them better."""
+        if self.train is None or self.train.sharpness == "unit":
+            return surfels.opacity()
+        return surfels.transfer.opacity(surfels.sdf, surfels.gamma.detach())
+
     def project_surfels(self, surfels: Surfels) -> Tensor:
         """μ − s n (n, 3)."""
         return surfels.position - surfels.sdf[:, None] * surfels.normal()

@@ -112,6 +112,20 @@ def test_gradients_reach_the_surfels(photos: list[TrainView]) -> None:
         assert gradient is not None and torch.isfinite(gradient).all() and bool(gradient.any()), name
 
 
+def test_a_field_supervises_surfels_in_the_second_half_only(photos: list[TrainView]) -> None:
+    field = field_of("grid", 0.97 * RADIUS)
+    for name, leaf in (("depth", "position"), ("normals", "quaternion")):
+        for share, expected in ((0.49, False), (0.5, True)):
+            surfels = ball()
+            for x in [*surfels.tensors().values(), *field.parameters().values()]:
+                x.requires_grad_()
+                x.grad = None
+            COUPLINGS[name](inputs(field, surfels, photos, share=share)).backward()
+            gradient = getattr(surfels, leaf).grad
+            assert (gradient is not None and bool(gradient.any())) is expected, (name, share)
+            assert any(x.grad is not None and bool(x.grad.any()) for x in field.parameters().values()), name
+
+
 def test_the_sum_is_weighted_and_nothing_is_none(photos: list[TrainView]) -> None:
     field, surfels = field_of("grid", 0.97 * RADIUS), ball()
     out = rasterise(surfels, photos[0])

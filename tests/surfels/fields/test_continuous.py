@@ -55,6 +55,8 @@ def test_starts_from_what_is_known(kind: str) -> None:
         outside = torch.tensor([[2.0, 0.0, 0.0], [0.0, -3.0, 0.0]])
         assert torch.allclose(field.value(outside), outside.norm(dim=1) - RADIUS, atol=0.1)
         assert float(field.value(torch.zeros(1, 3))) < -0.4
+        slope = torch.nn.functional.normalize(field.gradient(x), dim=1)
+        assert float((slope * x).sum(1).div(x.norm(dim=1)).median()) > 0.98  # 11°
 
 
 @pytest.mark.parametrize("kind", FIELDS)
@@ -162,6 +164,8 @@ def test_known_distance_of_a_ball_and_of_a_thin_plate() -> None:
     x = np.random.default_rng(0).uniform(-1.2, 1.2, (2000, 3))
     truth = np.linalg.norm(x, axis=1) - RADIUS
     assert np.abs(known(x) - truth).max() < 0.02
+    slope = known.with_gradient(x)[1]
+    assert np.einsum("nc,nc->n", slope, x / np.linalg.norm(x, axis=1)[:, None])[np.abs(truth) > 0.03].min() > 0.95
     # two sides of a plate, 2.5 spacings apart: the sign is that of the nearer side
     u, v = np.meshgrid(np.linspace(-0.5, 0.5, 41), np.linspace(-0.5, 0.5, 41))
     side = np.stack([u.ravel(), v.ravel(), np.full(u.size, 0.03)], 1)
@@ -169,7 +173,10 @@ def test_known_distance_of_a_ball_and_of_a_thin_plate() -> None:
     z = np.linspace(-0.3, 0.3, 61)
     line = np.stack([np.full(61, 0.111), np.full(61, 0.2), z], 1)
     assert np.abs(plate(line) - (np.abs(z) - 0.03)).max() < 0.012
+    off = np.abs(z) > 0.02
+    assert np.allclose(plate.with_gradient(line[off])[1][:, 2], np.sign(z[off]), atol=0.4)
     assert np.allclose(SphereDistance(0.5)(np.eye(3)), 0.5)
+    assert np.allclose(SphereDistance(0.5).with_gradient(2 * np.eye(3))[1], np.eye(3))
 
 
 def test_nothing_known_is_a_field_too() -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from gsbake.config.schema import Loss
+from gsbake.config.schema import Loss, Train
 from gsbake.meshing.sparse_lattice import BlockLattice
 from gsbake.surfels.fields.samples import SamplesField
 from gsbake.surfels.initialisation import fibonacci_sphere, spacing
@@ -34,6 +34,18 @@ def test_value_is_the_distance_and_projection_reaches_the_surface() -> None:
     assert float((field.value(x) - (x.norm(dim=1) - RADIUS)).abs().max()) < 2e-3
     assert float((field.project(x).norm(dim=1) - RADIUS).abs().max()) < 2e-3
     assert float((field.project_surfels(field.surfels).norm(dim=1) - RADIUS).abs().max()) < 1e-6
+
+
+def test_photos_move_the_sharpness_only_in_the_unit_frame() -> None:
+    for sharpness in ("unit", "spacing"):
+        s = ball(50)
+        s.gamma.requires_grad_()
+        s.sdf.requires_grad_()
+        opacity = SamplesField(s, Loss(), Train(sharpness=sharpness)).opacity(s)
+        assert torch.equal(opacity, s.opacity())
+        opacity.sum().backward()
+        assert s.sdf.grad is not None and bool(s.sdf.grad.any())
+        assert (s.gamma.grad is not None) is (sharpness == "unit")
 
 
 def test_value_equals_the_sum_over_all_samples() -> None:
