@@ -135,7 +135,7 @@ def correlation(surfels: Surfels, posed: PosedPhotos, surface: Surface) -> float
     true = true_distances(world.apply(surfels.position.numpy().astype(np.float64)), surface) / world.scale
     near = np.abs(true) < MAX_SPACINGS * typical_spacing(surfels)
     own = surfels.sdf.numpy()[near]
-    return float(np.corrcoef(own, true[near])[0, 1]) if len(own) > 2 and own.std() > 0 else 0.0
+    return float(np.corrcoef(own, true[near])[0, 1]) if len(own) > 2 and np.ptp(own) > 0 else 0.0
 
 
 def measure(capture: str, system: str, seed: int, settings: Sequence[str], out: Path, threads: int) -> list[Row]:
