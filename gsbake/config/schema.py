@@ -265,6 +265,7 @@ class Scale(Section):
 class Export(Section):
     """GLB and the files beside it."""
 
+    up: Literal["cameras", "markers", "ground"] = Field("cameras", description="What is level. cameras: as they were held, or as given poses say; markers: the plane of the printed markers in the photos; ground: the plane on which the object stands (photos without masks).")
     max_megabytes: float = Field(5.0, gt=0, le=4096, description="Maximum file size in MB: normal and material maps are reduced to meet it; the audit warns above it.")
     max_triangles: int = Field(100_000, ge=100, le=10_000_000, description="Maximum triangle count; the audit fails above it.")
     copyright: str = Field("", description="Copyright line of the asset.")

@@ -27,6 +27,7 @@ from gsbake.imaging.exr import write_hdr
 from gsbake.imaging.png import encode_png
 from gsbake.monitor import SILENT, Monitor
 from gsbake.scale.measure import MetricScale, measure_scale
+from gsbake.scale.upright import measure_rotation
 
 #: Height of the exported environment map in pixels.
 LIGHT_HEIGHT = 256
@@ -63,7 +64,8 @@ def export_asset(
     """
     options = options or ExportOptions()
     settings = options.export
-    cameras = PosedPhotos.open(poses, surfels).cameras
+    posed = PosedPhotos.open(poses, surfels)
+    cameras = posed.cameras
     arrays = load_mesh_arrays(baked / "mesh.safetensors")
     with monitor.part("scale"):
         surface = RayCaster(arrays["position"], arrays["faces"])
@@ -71,6 +73,9 @@ def export_asset(
     if scale is not None:
         to_world = cameras.to_world.then(Similarity(scale.metres))
         cameras = replace(cameras, to_world=to_world, metric=True)
+    with monitor.part("up axis"):
+        rotation = measure_rotation(ingest, posed, surfels, settings.up, options.scale, monitor=monitor)
+    cameras = replace(cameras, to_world=cameras.to_world.then(Similarity(1.0, rotation)))
     frame = asset_frame(cameras, arrays["position"])
     mesh = mesh_in_frame(arrays, frame)
     if not np.isfinite(mesh.position).all():

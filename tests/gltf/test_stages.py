@@ -135,6 +135,19 @@ def test_a_known_distance_makes_metres(run: Path, asset: GltfAsset, tmp_path: Pa
     assert json.loads((tmp_path / "out/cameras.json").read_text())["scale"] == "metres"
 
 
+def test_the_up_axis_turns_asset_cameras_and_light(run: Path, asset: GltfAsset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    quarter = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # world: about x, so glTF too
+    monkeypatch.setattr("gsbake.gltf.export.measure_rotation", lambda *_, **__: quarter)
+    export(run, tmp_path / "turned", up="ground")
+    turned = read_glb(tmp_path / "turned/asset.glb")
+    assert np.allclose(turned.attributes["POSITION"], asset.attributes["POSITION"] @ quarter.T, atol=1e-5)
+    before, after = (
+        np.array([f["transform_matrix"] for f in json.loads((folder / "cameras.json").read_text())["frames"]])
+        for folder in (run / "export", tmp_path / "turned")
+    )
+    assert np.allclose(after[:, :3, :3], quarter @ before[:, :3, :3], atol=1e-6)
+
+
 def test_files(run: Path) -> None:
     assert {p.name for p in (run / "bake").iterdir()} == {"mesh.safetensors", "base_color.exr", "orm.exr", "normal.exr", "coverage.exr"}
     names = {str(p.relative_to(run / "export")) for p in (run / "export").rglob("*") if p.is_file()}
