@@ -49,6 +49,7 @@ from gsbake.materials.photo_batch import (
     KernelTables,
     PhotoBatch,
     PhotoLights,
+    TexelInputs,
     texel_weight,
 )
 from gsbake.materials.pixels import Pixels
@@ -267,8 +268,8 @@ class MaterialFit:
                 if contrast not in visible:
                     visible[contrast] = self._surface.transport.visible_share(mean_radiance(light.radiance().numpy(), self._rotations))
                 transport[:, VISIBILITY] = visible[contrast]
-            lights = PhotoLights(light.radiance())
-            return [b.samples(values[:, 5:], lights.tables(b.to_light), transport) for b in subset]
+            lights, texels = PhotoLights(light.radiance()), TexelInputs.of(values, transport)
+            return [b.samples(texels, lights.tables(b.to_light)) for b in subset]
 
         mean_base = float(np.exp(np.log(values[dielectric, :3].max(1) + o.log_offset).mean()))
         found = search_light(samples_under, values[:, 3].copy(), tint, rough, mean_base)
@@ -350,8 +351,8 @@ class MaterialFit:
 
     def _samples(self, batches: list[PhotoBatch], tilted: bool = False) -> list[PhotoSamples]:
         """All pixels under the present light, with `tilted` normals as well."""
-        lights = self._lights()
-        return [b.samples(self._values[:, 5:], lights.tables(b.to_light), self._transport, tilted) for b in batches]
+        lights, texels = self._lights(), TexelInputs.of(self._values, self._transport)
+        return [b.samples(texels, lights.tables(b.to_light), tilted) for b in batches]
 
     def _search_metals(self, batches: list[PhotoBatch]) -> None:
         """Reinitialise texels that are detected as metal, and from a metallic start those that are dielectric."""
@@ -381,7 +382,8 @@ class MaterialFit:
     def samples_of(self, pixels: Pixels, chosen: NDArray[np.bool_]) -> tuple[NDArray[np.int64], PhotoSamples]:
         """Which (m,) of the `pixels` have a dominant texel that is `chosen` (n,), and their samples under the fitted light."""
         batch = PhotoBatch.of(pixels, self._normal)
-        samples = batch.select(chosen).samples(self._values[:, 5:], self._lights().tables(batch.to_light), self._transport)
+        texels = TexelInputs.of(self._values, self._transport)
+        samples = batch.select(chosen).samples(texels, self._lights().tables(batch.to_light))
         return np.flatnonzero(chosen[batch.dominant_texel]), samples
 
     def psnr(self, photos: list[Pixels], values: Floats | None = None) -> float | None:

@@ -20,6 +20,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+from numba import njit, prange
 from numpy.typing import NDArray
 
 from gsbake.imaging.srgb import encode
@@ -98,7 +99,7 @@ class BaseColourSolver:
         self._texels, self._texel = texels, np.concatenate([samples.texel for samples in photos])
         self._colour = np.concatenate([samples.colour for samples in photos])
         self._weight = np.concatenate([*map(perceptual_weights, photos)])
-        self._clipped = self._colour >= CLIPPED
+        self._any_clipped = bool((self._colour >= CLIPPED).any())
         self._curve = np.maximum(self._colour, MIN_SLOPE_COLOUR) ** np.float32(-7 / 12)
 
     def solve(self, shadings: Sequence[LinearShading], lowest: float = 0.0, robust: bool = False) -> Floats:
@@ -107,18 +108,40 @@ class BaseColourSolver:
         They have the least squared error; with `robust` about the least absolute one.
         """
         slope, offset = (np.concatenate([getattr(shading, part) for shading in shadings]) for part in ("slope", "offset"))
-        # A reflection that is brighter than white by itself tells nothing of b.
-        weight = self._weight * (offset < CLIPPED)
-        used, base = weight * ~self._clipped, np.full((self._texels, 3), lowest)
-        for turn in range(ROUNDS if robust or self._clipped.any() else 1):
-            if turn:
-                shown = base[self._texel] * slope + offset
-                used = weight * (~self._clipped | (shown < CLIPPED))
-                if robust:
-                    used /= np.maximum(np.abs(shown - self._colour) * self._curve, ROBUST_SCALE)
-            for k in range(3):
-                slopes = np.bincount(self._texel, used[:, k] * slope[:, k] ** 2, self._texels)
-                mixed = np.bincount(self._texel, used[:, k] * slope[:, k] * (self._colour - offset)[:, k], self._texels)
-                known = slopes > 0  # clipped pixels may all be explained by the last b
-                base[known, k] = np.clip(mixed[known] / slopes[known], lowest, 1)
+        base = np.full((self._texels, 3), lowest)
+        rounds = ROUNDS if robust or self._any_clipped else 1
+        solve_base_colours(self._texel, slope, offset, self._colour, self._weight, self._curve, lowest, rounds, robust, base)
         return base
+
+
+@njit(parallel=True, cache=True, error_model="numpy")
+def solve_base_colours(
+    texel: Any, slope: Any, offset: Any, colour: Any, weight: Any, curve: Any, lowest: Any, rounds: Any, robust: Any, base: Any
+) -> None:
+    """Iteratively reweighted least squares for `base` (texels, 3), which starts at `lowest`, channel by channel.
+
+    n pixels show `texel` (n,) as base · `slope` + `offset` where the photo has `colour`, with `weight` and, for the robust solution, errors
+    scaled by the slope of the sRGB `curve`; (n, 3) each.
+    """
+    for k in prange(3):
+        squares, products = np.zeros(len(base)), np.zeros(len(base))
+        for turn in range(rounds):
+            squares[:] = 0
+            products[:] = 0
+            for i in range(len(texel)):
+                s, o, c, w, t = slope[i, k], offset[i, k], colour[i, k], weight[i, k], texel[i]
+                if not o < CLIPPED:  # a reflection that is brighter than white by itself tells nothing of b
+                    continue
+                if turn:
+                    shown = base[t, k] * s + o
+                    if c >= CLIPPED and not shown < CLIPPED:
+                        continue
+                    if robust:
+                        w /= max(abs(shown - c) * curve[i, k], ROBUST_SCALE)
+                elif c >= CLIPPED:
+                    continue
+                squares[t] += w * s * s
+                products[t] += w * s * (c - o)
+            for t in range(len(base)):
+                if squares[t] > 0:  # clipped pixels may all be explained by the last b
+                    base[t, k] = min(max(products[t] / squares[t], lowest), 1.0)

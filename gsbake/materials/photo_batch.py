@@ -67,6 +67,21 @@ class PhotoLights:
 
 
 @dataclass(frozen=True)
+class TexelInputs:
+    """What searches read of the texels, each in one block of memory: normal offsets (n, 3), the light transport (n, 8) at a pixel, and the
+    outgoing radiance (n, 3) that reflections show."""
+
+    normal_offset: Floats
+    local: Floats
+    outgoing: Floats
+
+    @classmethod
+    def of(cls, values: Floats, transport: Floats) -> TexelInputs:
+        """Of texel `values` (n, PARAMETERS) and their `transport` (n, TRANSPORT)."""
+        return cls(*(np.ascontiguousarray(x) for x in (values[:, 5:], transport[:, : OUTGOING.start], transport[:, OUTGOING])))
+
+
+@dataclass(frozen=True)
 class PhotoBatch:
     """The n pixels of one photo, fields as in `Pixels`, with the mesh's `normal` (n, 3) there, of any length; `reflected` is empty where
     reflections were not traced."""
@@ -122,11 +137,10 @@ class PhotoBatch:
             self.normal[keep], self.reflected[keep] if len(self.reflected) else self.reflected, self.to_light,
         )  # fmt: skip
 
-    def samples(self, normal_offset: Floats, tables: KernelTables, transport: Floats, tilted: bool = False) -> PhotoSamples:
+    def samples(self, texels: TexelInputs, tables: KernelTables, tilted: bool = False) -> PhotoSamples:
         """The pixels for searches over all photos, with `tilted` normals as well; each counts for its dominant texel."""
-        normal = self.normal + interpolate(normal_offset, self.texel, self.bilinear)
-        local = interpolate(transport[:, : OUTGOING.start], self.texel, self.bilinear)
-        light = tables, local, np.ascontiguousarray(transport[:, OUTGOING])
+        normal = self.normal + interpolate(texels.normal_offset, self.texel, self.bilinear)
+        light = tables, interpolate(texels.local, self.texel, self.bilinear), texels.outgoing
         others = tuple(self._shader(n, *light) for n in _tilted(normal)) if tilted else ()
         return PhotoSamples(self.dominant_texel, decode(self.colour), self.weight, self.block, self._shader(normal, *light), others)
 

@@ -12,7 +12,7 @@ from numba import set_num_threads
 from gsbake.materials import fit_kernel
 from gsbake.materials.fit_reference import Batch, photo_loss, prior_loss
 from gsbake.materials.linear_shading import LinearShading
-from gsbake.materials.photo_batch import FitStep, KernelTables, PhotoBatch
+from gsbake.materials.photo_batch import FitStep, KernelTables, PhotoBatch, TexelInputs
 from gsbake.materials.pixels import Pixels
 from gsbake.shading.environment import EnvironmentLight
 from gsbake.shading.light_tables import LightTables
@@ -89,7 +89,7 @@ def test_linear_shading_is_the_shading_at_both_ends() -> None:
     case = Case(3, True)
     batch = PhotoBatch.of(replace(case.pixels, bilinear=np.tile(np.array([1, 0, 0, 0], np.float32), (PIXELS, 1))), case.normal)
     tables = KernelTables.of(case.tables)
-    samples = batch.samples(case.values[:, 5:], tables, case.transport)
+    samples = batch.samples(TexelInputs.of(case.values, case.transport), tables)
     torch_batch = Batch.of(replace(case.pixels, bilinear=batch.bilinear), torch.as_tensor(case.normal))
     rough = np.ascontiguousarray(case.values[:, 3])
     for metallic in (0.0, 1.0):

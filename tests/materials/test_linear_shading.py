@@ -6,7 +6,15 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from gsbake.materials.linear_shading import CLIPPED, BaseColourSolver, LinearShading, PhotoSamples
+from gsbake.materials.linear_shading import (
+    CLIPPED,
+    ROBUST_SCALE,
+    ROUNDS,
+    BaseColourSolver,
+    LinearShading,
+    PhotoSamples,
+    solve_base_colours,
+)
 
 TRUE = np.array([0.8, 0.5, 0.2])
 
@@ -71,3 +79,28 @@ def test_the_robust_solution_ignores_one_wrong_pixel() -> None:
 def test_texels_are_separate_and_unseen_ones_get_the_lowest() -> None:
     found = solve(photo([0.5, 0.5], [0.0, 0.0], [0, 2]), texels=3, lowest=0.1)
     assert found[[0, 2]] == pytest.approx(np.tile(TRUE, (2, 1)), abs=1e-5) and found[1] == pytest.approx(0.1)
+
+
+@pytest.mark.parametrize("robust", [False, True])
+def test_the_solution_equals_that_by_sums_over_arrays(robust: bool) -> None:
+    rng, texels, pixels = np.random.default_rng(4), 9, 400
+    texel = rng.integers(texels, size=pixels)
+    slope, offset, colour = (rng.uniform(0, 1.1, (pixels, 3)).astype(np.float32) for _ in range(3))
+    offset *= 0.95
+    colour = np.minimum(colour, 1)
+    weight = rng.uniform(0.1, 2, (pixels, 3)).astype(np.float32)
+    curve = rng.uniform(0.5, 3, (pixels, 3)).astype(np.float32)
+    found = np.full((texels, 3), 0.02)
+    solve_base_colours(texel, slope, offset, colour, weight, curve, 0.02, ROUNDS, robust, found)
+
+    base, clipped = np.full((texels, 3), 0.02), colour >= CLIPPED
+    for turn in range(ROUNDS):
+        shown = base[texel] * slope + offset
+        used = weight.astype(float) * (offset < CLIPPED) * (~clipped | ((shown < CLIPPED) & (turn > 0)))
+        if robust and turn:
+            used /= np.maximum(np.abs(shown - colour) * curve, ROBUST_SCALE)
+        for k in range(3):
+            squares = np.bincount(texel, used[:, k] * slope[:, k].astype(float) ** 2, texels)
+            products = np.bincount(texel, used[:, k] * slope[:, k] * (colour - offset)[:, k].astype(float), texels)
+            base[:, k] = np.clip(products / squares, 0.02, 1)
+    assert clipped.any() and np.allclose(found, base, rtol=1e-5)
