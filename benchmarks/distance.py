@@ -18,12 +18,11 @@ Rows carry commit, host and seed, and replace older ones of the same capture, sy
 from __future__ import annotations
 
 import argparse
-import csv
 import platform
 import shutil
 import sys
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +30,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from benchmarks.fields import SYSTEMS, commit, find, sizes
+from benchmarks.fields import KEY, SYSTEMS, commit, find, sizes, write
 from benchmarks.timeline import ROOT, names
 from benchmarks.truth import Surface, fit_robustly, nearest, nearest_on_faces, read_centres, read_truth
 from gsbake.api import RunOptions, open_session
@@ -77,11 +76,6 @@ class Row:
     counts: str
     commit: str = ""
     host: str = ""
-
-    @property
-    def key(self) -> tuple[str, ...]:
-        """What is measured."""
-        return self.capture, self.system, self.settings, str(self.seed), str(self.share)
 
 
 class StopAt(SilentMonitor):
@@ -194,20 +188,6 @@ def matched_centres(found: Any, true: Any) -> tuple[NDArray[np.float64], NDArray
     return np.array([found[n] for n in both]), np.array([true[n] for n in both])
 
 
-def write(path: Path, rows: Sequence[Row]) -> None:
-    """Add rows, in the place of those with the same keys."""
-    keys = {row.key for row in rows}
-    old: list[dict[str, str]] = []
-    if path.is_file():
-        with path.open(newline="", encoding="utf-8") as file:
-            old = [r for r in csv.DictReader(file) if (r["capture"], r["system"], r["settings"], r["seed"], r["share"]) not in keys]
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, [f.name for f in fields(Row)], lineterminator="\n")
-        writer.writeheader()
-        writer.writerows([*old, *({k: round(v, 5) if isinstance(v, float) else v for k, v in asdict(row).items()} for row in rows)])
-
-
 def main(arguments: Sequence[str] | None = None) -> None:
     """Measure, print and write."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -233,7 +213,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
                     figures = f"shift {row.shift:.4f} voxels  correlation {row.correlation:+.3f}  opacity {row.opacity:.4f}"
                     sys.stdout.write(f"{head}  {figures}  {row.surfels} surfels  {row.counts}\n")
                 sys.stdout.flush()
-                write(args.csv, rows)
+                write(args.csv, rows, (*KEY, "share"))
 
 
 if __name__ == "__main__":

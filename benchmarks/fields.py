@@ -26,6 +26,7 @@ import tomllib
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -48,6 +49,8 @@ SYSTEMS = (
     "neus", "volsdf",
 )  # fmt: skip
 DEFAULT_CAPTURES = ("boombox", "avocado", "brass_vase", "mixer", "stool", "boombox:8")
+#: Columns that say what a row measures.
+KEY = ("capture", "system", "settings", "seed")
 #: Sections of the profile `preview` whose values every system takes.
 SIZES = ("ingest", "stereo", "surfels", "train", "refine", "mesh")
 
@@ -71,11 +74,6 @@ class Row:
     failed: str = ""
     commit: str = ""
     host: str = ""
-
-    @property
-    def key(self) -> tuple[str, str, str, str]:
-        """What is measured."""
-        return self.capture, self.system, self.settings, str(self.seed)
 
 
 def commit() -> str:
@@ -175,18 +173,19 @@ def measure(capture: str, system: str, seed: int, settings: Sequence[str], out: 
     )
 
 
-def write(path: Path, row: Row) -> None:
-    """Add a row, in the place of one with the same key."""
-    old: list[dict[str, str]] = []
+def write(path: Path, rows: Sequence[Any], key: Sequence[str]) -> None:
+    """Add rows, dataclasses of one kind, in the place of those with the same values in the columns `key`."""
+    new = [{k: "" if v is None else round(v, 4) if isinstance(v, float) else v for k, v in asdict(row).items()} for row in rows]
+    known = {tuple(str(line[k]) for k in key) for line in new}
+    old: list[dict[str, Any]] = []
     if path.is_file():
         with path.open(newline="", encoding="utf-8") as file:
-            old = [line for line in csv.DictReader(file) if (line["capture"], line["system"], line["settings"], line["seed"]) != row.key]
+            old = [line for line in csv.DictReader(file) if tuple(line[k] for k in key) not in known]
     path.parent.mkdir(parents=True, exist_ok=True)
-    table = [*old, {k: "" if v is None else round(v, 4) if isinstance(v, float) else v for k, v in asdict(row).items()}]
     with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, [f.name for f in fields(Row)], lineterminator="\n")
+        writer = csv.DictWriter(file, [f.name for f in fields(rows[0])], lineterminator="\n")
         writer.writeheader()
-        writer.writerows(table)
+        writer.writerows([*old, *new])
 
 
 def show(row: Row) -> None:
@@ -224,7 +223,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
                     sys.stdout.write(f"{capture}: left out: {error}\n")
                     break
                 show(row)
-                write(args.csv, row)
+                write(args.csv, [row], KEY)
 
 
 if __name__ == "__main__":

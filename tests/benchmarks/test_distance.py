@@ -13,7 +13,8 @@ import pytest
 import torch
 import trimesh
 
-from benchmarks.distance import Row, StopAt, correlation, depth_shift, true_distances, write
+from benchmarks.distance import Row, StopAt, correlation, depth_shift, true_distances
+from benchmarks.fields import KEY, write
 from benchmarks.truth import Surface
 from gsbake.errors import InterruptedRun
 from gsbake.geometry.cameras import Similarity
@@ -78,8 +79,9 @@ def test_a_run_stops_at_its_share() -> None:
 
 def test_rows_replace_those_of_the_same_stop(tmp_path: Path) -> None:
     row = Row("built-in", "dsdf", "", 0, 0.5, 1.0, 0.8, 0.7, 1.5, 100, "densified: 3")
-    write(tmp_path / "rows.csv", [row, replace(row, share=1.0)])
-    write(tmp_path / "rows.csv", [replace(row, shift=2.0)])
+    key = (*KEY, "share")
+    write(tmp_path / "rows.csv", [row, replace(row, share=1.0)], key)
+    write(tmp_path / "rows.csv", [replace(row, shift=2.0)], key)
     with (tmp_path / "rows.csv").open(newline="") as file:
         found = {line["share"]: line["shift"] for line in csv.DictReader(file)}
     assert found == {"0.5": "2.0", "1.0": "1.0"}
