@@ -17,7 +17,6 @@ Rows carry commit, host and seed, and replace older ones of the same capture, sy
 
 from __future__ import annotations
 
-import argparse
 import platform
 import shutil
 import sys
@@ -30,10 +29,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from benchmarks.fields import KEY, SYSTEMS, commit, find, sizes, write
-from benchmarks.timeline import ROOT, names
+from benchmarks.fields import KEY, commit, parse, run_options, write
+from benchmarks.timeline import ROOT
 from benchmarks.truth import Surface, fit_robustly, nearest, nearest_on_faces, read_centres, read_truth
-from gsbake.api import RunOptions, open_session
+from gsbake.api import open_session
 from gsbake.capture.posed_photos import PosedPhotos
 from gsbake.checkpoint import load_checkpoint
 from gsbake.config.schema import Profile
@@ -134,12 +133,7 @@ def correlation(surfels: Surfels, posed: PosedPhotos, surface: Surface) -> float
 
 def measure(capture: str, system: str, seed: int, settings: Sequence[str], out: Path, threads: int) -> list[Row]:
     """Train one system on one capture, stopping at every share. Raises UsageError for photos without given poses."""
-    photos, truth_folder = find(capture, out)
-    profile = "relight" if system == "default" else system
-    folder = out / "runs" / capture.replace(":", "-")
-    options = RunOptions(
-        photos=photos, out=folder, profile=profile, overrides=[*sizes(), *settings], device="cpu", threads=threads, seed=seed
-    )
+    options, truth_folder = run_options(capture, system, seed, settings, out, threads)
     session = open_session(options)
     at = {s.name: s.artifact.folder for s in session.engine.run("stereo") if s.artifact is not None}
     p, posed, truth = session.profile.profile, PosedPhotos.open(at["poses"]), read_truth(truth_folder)
@@ -190,24 +184,14 @@ def matched_centres(found: Any, true: Any) -> tuple[NDArray[np.float64], NDArray
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Measure, print and write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--captures", type=names, default=["built-in"])
-    parser.add_argument("--systems", type=names, default=list(DEFAULT_SYSTEMS))
-    parser.add_argument("--seeds", type=lambda text: [int(v) for v in text.split(",")], default=[0])
-    parser.add_argument("--set", action="append", default=[], dest="settings", metavar="KEY=VALUE", help="a setting of all systems")
-    parser.add_argument("--threads", type=int, default=2)
-    parser.add_argument("--out", type=Path, default=ROOT / "out" / "bench" / "fields", help="folder of the runs; finished stages are kept")
-    parser.add_argument("--csv", type=Path, default=RESULTS)
-    args = parser.parse_args(arguments)
-    if unknown := set(args.systems) - set(SYSTEMS):
-        parser.error(f"there is no system {', '.join(sorted(unknown))}; there are {', '.join(SYSTEMS)}")
+    args = parse(arguments, __doc__, ("built-in",), DEFAULT_SYSTEMS, RESULTS)
     for capture in args.captures:
         for system in args.systems:
             for seed in args.seeds:
                 try:
                     rows = measure(capture, system, seed, args.settings, args.out.resolve(), args.threads)
                 except UsageError as error:
-                    parser.error(str(error))
+                    sys.exit(f"{capture}: {error}")
                 for row in rows:
                     head = f"{row.capture:10} {row.system:8} {row.settings} seed {row.seed} {row.share:4.0%}"
                     figures = f"shift {row.shift:.4f} voxels  correlation {row.correlation:+.3f}  opacity {row.opacity:.4f}"

@@ -141,16 +141,20 @@ def measured_psnr(poses: Path, refined: Path, holdout: int, size: int) -> float 
     return float(np.mean(figures)) if figures else None
 
 
+def run_options(capture: str, system: str, seed: int, settings: Sequence[str], out: Path, threads: int) -> tuple[RunOptions, Path]:
+    """The run of one system on one capture, and the folder of the truth. Raises UsageError as `find`."""
+    photos, truth = find(capture, out)
+    profile, folder = "relight" if system == "default" else system, out / "runs" / capture.replace(":", "-")
+    return RunOptions(
+        photos=photos, out=folder, profile=profile, overrides=[*sizes(), *settings], device="cpu", threads=threads, seed=seed
+    ), truth  # fmt: skip
+
+
 def measure(capture: str, system: str, seed: int, settings: Sequence[str], out: Path, threads: int) -> Row:
     """Run one system on one capture up to the mesh (or use cached stages), and measure it."""
     row = Row(capture, system, " ".join(settings), seed, commit=commit(), host=platform.node())
-    photos, truth = find(capture, out)
-    folder = out / "runs" / capture.replace(":", "-")
-    profile = "relight" if system == "default" else system
-    options = RunOptions(
-        photos=photos, out=folder, profile=profile, overrides=[*sizes(), *settings], device="cpu", threads=threads, seed=seed
-    )
-    clock = CpuClock(folder / "cpu.json")
+    options, truth = run_options(capture, system, seed, settings, out, threads)
+    clock = CpuClock(options.out / "cpu.json")
     try:
         session = open_session(options, clock)
         states = session.engine.run("mesh")
@@ -201,19 +205,27 @@ def show(row: Row) -> None:
     sys.stdout.flush()
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Run, print every row, and write the CSV after each."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--captures", type=names, default=list(DEFAULT_CAPTURES))
-    parser.add_argument("--systems", type=names, default=list(SYSTEMS))
+def parse(
+    arguments: Sequence[str] | None, description: str | None, captures: Sequence[str], systems: Sequence[str], results: Path
+) -> argparse.Namespace:
+    """The arguments of a benchmark of field systems, with its defaults."""
+    parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--captures", type=names, default=list(captures))
+    parser.add_argument("--systems", type=names, default=list(systems))
     parser.add_argument("--seeds", type=lambda text: [int(v) for v in text.split(",")], default=[0])
     parser.add_argument("--set", action="append", default=[], dest="settings", metavar="KEY=VALUE", help="a setting of all systems")
     parser.add_argument("--threads", type=int, default=0, help="0: the physical cores")
     parser.add_argument("--out", type=Path, default=ROOT / "out" / "bench" / "fields", help="folder of the runs; finished stages are kept")
-    parser.add_argument("--csv", type=Path, default=RESULTS)
+    parser.add_argument("--csv", type=Path, default=results)
     args = parser.parse_args(arguments)
     if unknown := set(args.systems) - set(SYSTEMS):
         parser.error(f"there is no system {', '.join(sorted(unknown))}; there are {', '.join(SYSTEMS)}")
+    return args
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run, print every row, and write the CSV after each."""
+    args = parse(arguments, __doc__, DEFAULT_CAPTURES, SYSTEMS, RESULTS)
     for capture in args.captures:
         for system in args.systems:
             for seed in args.seeds:
