@@ -4,7 +4,7 @@ python -m benchmarks.distance [--captures built-in,boombox] [--systems dsdf,defa
     [--csv FILE]
 
 A training run (sizes of the profile `preview`) is stopped at shares of its iterations, as Ctrl-C stops one, its checkpoint is read, and it
-goes on from there. At each stop, over training photos evenly chosen:
+goes on from there. At each stop, over the cameras of photos evenly chosen:
 
 * shift: median |D − D₀| in voxels of the mesh, D the rendered depth and D₀ that with every distance set to 0 (all surfels opaque, none
   moved), where both render a surface;
@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 
 from benchmarks.fields import KEY, commit, parse, run_options, write
 from benchmarks.timeline import ROOT
-from benchmarks.truth import Surface, fit_robustly, nearest, nearest_on_faces, read_centres, read_truth
+from benchmarks.truth import Surface, camera_frame, nearest, nearest_on_faces, read_centres, read_truth
 from gsbake.api import open_session
 from gsbake.capture.posed_photos import PosedPhotos
 from gsbake.checkpoint import load_checkpoint
@@ -132,14 +132,14 @@ def correlation(surfels: Surfels, posed: PosedPhotos, surface: Surface) -> float
 
 
 def measure(capture: str, system: str, seed: int, settings: Sequence[str], out: Path, threads: int) -> list[Row]:
-    """Train one system on one capture, stopping at every share. Raises UsageError for photos without given poses."""
+    """Train one system on one capture, stopping at every share. Raises UsageError without the truth or its cameras."""
     options, truth_folder = run_options(capture, system, seed, settings, out, threads)
     session = open_session(options)
     at = {s.name: s.artifact.folder for s in session.engine.run("stereo") if s.artifact is not None}
     p, posed, truth = session.profile.profile, PosedPhotos.open(at["poses"]), read_truth(truth_folder)
     surface = truth.surface
     if posed.cameras.poses != "given":
-        frame = fit_robustly(*matched_centres(read_centres(at["poses"] / "cameras.json"), truth.centres))
+        frame = camera_frame(read_centres(at["poses"] / "cameras.json"), truth)
         surface = Surface(frame.inverse().apply(surface.vertices), surface.faces)
     scratch = out / "distance"
     shutil.rmtree(scratch, ignore_errors=True)
@@ -174,12 +174,6 @@ def measure(capture: str, system: str, seed: int, settings: Sequence[str], out: 
             )
         )  # fmt: skip
     return rows
-
-
-def matched_centres(found: Any, true: Any) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Camera centres (n, 3) of both by the names that both have."""
-    both = sorted(found.keys() & true.keys())
-    return np.array([found[n] for n in both]), np.array([true[n] for n in both])
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

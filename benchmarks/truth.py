@@ -179,15 +179,21 @@ def fit_robustly(source: Array, target: Array) -> Similarity:
     return frame
 
 
+def camera_frame(centres: Mapping[str, Array], truth: Truth) -> Similarity:
+    """Similarity from a reconstruction to the ground truth by its camera `centres` (3,). Raises UsageError when fewer than three match by
+    name."""
+    names = sorted(centres.keys() & truth.centres.keys())
+    if len(names) < 3:
+        raise UsageError(f"{len(names)} of the {len(truth.centres)} true cameras were found by name; the alignment takes 3.")
+    return fit_robustly(np.array([centres[n] for n in names]), np.array([truth.centres[n] for n in names]))
+
+
 def align(surface: Surface, centres: Mapping[str, Array], truth: Truth) -> Similarity:
     """Similarity from a reconstruction to the ground truth: from camera `centres`, then ICP with a shrinking distance threshold.
 
     Raises UsageError when fewer than three cameras match by name.
     """
-    names = sorted(centres.keys() & truth.centres.keys())
-    if len(names) < 3:
-        raise UsageError(f"{len(names)} of the {len(truth.centres)} true cameras were found by name; the alignment takes 3.")
-    frame = fit_robustly(np.array([centres[n] for n in names]), np.array([truth.centres[n] for n in names]))
+    frame = camera_frame(centres, truth)
     reach = 0.05 * truth.surface.diagonal
     points = surface.sample(ALIGNMENT_POINTS[0], 5)[0]
     anchors = truth.surface.sample(ALIGNMENT_POINTS[1], 6)[0]
