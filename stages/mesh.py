@@ -23,7 +23,7 @@ def run(ctx: Context) -> dict[str, Any]:
 
 STAGE = Stage(
     name="mesh",
-    version=7,
+    version=8,
     title="Mesh",
     run=run,
     summary="{faces} triangles, {dense_faces} before decimation",

@@ -228,6 +228,7 @@ class Mesh(Section):
     smoothing_iterations: int = Field(2, ge=0, le=1000, description="Taubin smoothing iterations on the dense mesh.")
     normal_wavelength: float = Field(8.0, ge=0, le=1000, description="Wavelength in voxels below which detail comes from rendered normals instead of depth; 0 is off.")
     silhouette_iterations: int = Field(3, ge=0, le=100, description="Mesh refinement iterations against the masks; 0 is off.")
+    denoising_iterations: int = Field(20, ge=0, le=1000, description="Iterations of bilateral normal filtering on the dense mesh; 0 is off.")
     photometric_iterations: int = Field(2, ge=0, le=100, description="Mesh refinement iterations by photometric consistency on textured surfaces; 0 is off.")
     min_component: Fraction = Field(0.02, description="Minimum area of a connected component as a share of the largest one's; smaller ones are removed.")
 

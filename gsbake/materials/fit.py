@@ -155,7 +155,7 @@ class MaterialFit:
             if schedule.sparsity and self._priors.sparsity and update_common and step >= o.sparsity_from * steps:
                 self._common = self._find_common_materials()
             order = order or generator.permutation(len(batches)).tolist()
-            self._step(batches[order.pop()], schedule.rate * o.final_rate ** (step / steps), given)
+            self._step(batches[order.pop()], schedule.rate * o.final_rate ** (step / steps), given, schedule.normals)
             if each is not None:
                 each(step + 1, steps)
         values, emission = self._values[:, :5].copy(), self._transport[:, EMISSION].copy()
@@ -167,12 +167,12 @@ class MaterialFit:
     def _batches(self, photos: list[Pixels]) -> list[PhotoBatch]:
         return [PhotoBatch.of(p, self._normal) for p in photos if len(p)]
 
-    def _step(self, batch: PhotoBatch, decay: float, given: PhotoLights | None) -> None:
+    def _step(self, batch: PhotoBatch, decay: float, given: PhotoLights | None, normals: bool) -> None:
         """One Adam step on the pixels of one photo, with learning rates times `decay`; of the texels alone under a `given` light."""
         o = self._options
         if given is not None:
             self._shade(batch, given.tables(batch.to_light))
-            self._update_texels(decay)
+            self._update_texels(decay, normals)
             return
         radiance = self._light.radiance()
         tables = prefilter_cube_map(rotated(radiance, batch.to_light))
@@ -184,7 +184,7 @@ class MaterialFit:
             loss = loss + len(self._values) * self._priors.neutral_light * neutral_light_loss(radiance)
         loss.backward()
         self._adam_light.step()
-        self._update_texels(decay)
+        self._update_texels(decay, normals)
 
     def _shade(self, batch: PhotoBatch, tables: KernelTables) -> None:
         """Shade the pixels of a photo, leave the gradients in the buffers and add to the sums of the residual."""
@@ -192,10 +192,10 @@ class MaterialFit:
         factor = len(self._values) / len(batch)
         self._residual += self._step_buffers(batch, self._values, tables, self._transport, o.residual_weight, o.robust_scale, factor)[1:]
 
-    def _update_texels(self, decay: float) -> None:
+    def _update_texels(self, decay: float, normals: bool) -> None:
         """One step on all texels, from the gradient of the photo and those of the priors."""
         residual = float(self._residual[0] / max(self._residual[1], 1e-6) / self._options.robust_scale**2)
-        self._texels.step(self._step_buffers.gradient, residual, self._common, decay)
+        self._texels.step(self._step_buffers.gradient, residual, self._common, decay, normals)
 
     def _update_transport(self) -> None:
         """Visibility, indirect light and outgoing radiance under the present light and materials."""

@@ -67,6 +67,7 @@ def trial_schedule(steps: int, seed: int, diffuse: bool) -> FitSchedule:
         light_scaled_at=LIGHT_SCALED_AT,
         sparsity=False,
         diffuse=diffuse,
+        normals=False,
     )
 
 

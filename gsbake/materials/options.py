@@ -30,7 +30,7 @@ class FitSchedule:
     Metals are searched for at the shares `metal_searches_at` of all steps, but not on an object that is `diffuse`. Without `emission`
     nothing is emissive, without `sparsity` the sparsity prior is off. The light's intensity is searched for at `light_searches_at`; between
     these and without any it is left to gradient steps. At `light_scaled_at` only a mostly metallic object has its light scaled.
-    `rate` is a factor on all learning rates; with `fixed_light` the light is given.
+    `rate` is a factor on all learning rates; with `fixed_light` the light is given. Without `normals` those of the mesh stay.
     """
 
     iterations: int
@@ -43,6 +43,7 @@ class FitSchedule:
     diffuse: bool = False
     rate: float = 1.0
     fixed_light: bool = False
+    normals: bool = True
 
 
 @dataclass(frozen=True)

@@ -33,7 +33,7 @@ class TexelOptimiser:
         self._moments = np.zeros_like(values), np.zeros_like(values)
         self._steps = 0
 
-    def step(self, gradient: Floats, residual: float, common: Floats, decay: float) -> None:
+    def step(self, gradient: Floats, residual: float, common: Floats, decay: float, normals: bool = True) -> None:
         """One step on all texels, with learning rates times `decay`, from the `gradient` (n, PARAMETERS) of a photo, which is set to zero.
 
         `residual` is the mean squared error so far, in units of the robust scale's square, and `common` (n or 0, 4) the common materials
@@ -49,7 +49,7 @@ class TexelOptimiser:
         common_weight = np.zeros(4, f)
         if len(common):
             common_weight = (priors.sparsity * residual / np.square(KERNEL_WIDTHS)).astype(f)
-        rate = np.array([o.texel_rate] * 5 + [o.normal_rate] * 3, f) * f(decay)
+        rate = np.array([o.texel_rate] * 5 + [o.normal_rate if normals else 0.0] * 3, f) * f(decay)
         beta1, beta2 = o.betas
         fit_kernel.adam_step(
             self._raw, self.values, self._spare, gradient, *self._moments, start, neighbour, smoothness, mean_weight,

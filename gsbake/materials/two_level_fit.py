@@ -72,9 +72,9 @@ def fit_two_levels(
         return MaterialFit(coarse.surface, plan.light_size, plan.priors, roughness, metallic)
 
     trials = trial_fits(make, coarse, steps(TRIAL_SHARE), plan.seed, plan.diffuse, each("trial fits"), known)
-    schedule = FitSchedule(steps(COARSE_SHARE), plan.seed, diffuse=plan.diffuse)
+    schedule = FitSchedule(steps(COARSE_SHARE), plan.seed, diffuse=plan.diffuse, normals=False)
     choice = best_fit(trials, coarse, schedule, each("material fit, coarse level"))
-    refine = replace(schedule, emission=False, light_searches_at=(), metal_searches_at=FINE_METAL_SEARCHES_AT, iterations=steps(FINE_SHARE))
+    refine = FitSchedule(steps(FINE_SHARE), plan.seed, FINE_METAL_SEARCHES_AT, emission=False, light_searches_at=(), diffuse=plan.diffuse)
     if choice.fit.mostly_dielectric and not choice.fit.moving_light:
         refine = replace(refine, fixed_light=True)
         adapt = replace(refine, iterations=steps(ADAPT_SHARE), metal_searches_at=(), rate=ADAPT_RATE)

@@ -24,6 +24,7 @@ from gsbake.meshing.decimator_choice import resolve_decimator
 from gsbake.meshing.depth_cache import DepthViewCache
 from gsbake.meshing.depth_views import DepthView, depth_noise
 from gsbake.meshing.oriented_points import BALL_RADIUS, OrientedPoints, oriented_points
+from gsbake.meshing.refinement.normal_filter import denoise
 from gsbake.meshing.refinement.normals import NormalAccumulator, integrate_normals
 from gsbake.meshing.refinement.silhouette import refine_silhouettes
 from gsbake.meshing.repair import close_holes, repair
@@ -143,6 +144,8 @@ class _Extraction:
             vertices, faces, dropped = self._clean(vertices, faces, cache, resolution.cell, support)
         with self.monitor.part("silhouettes"):
             vertices = self._refine_silhouettes(vertices, faces)
+        with self.monitor.part("denoising"):
+            vertices = denoise(vertices, faces, self.options.mesh.denoising_iterations)
         with self.monitor.part("photos"):
             vertices, photometric = self._refine_photometric(vertices, faces, resolution.cell)
         write_mesh(self.out / "dense.ply", vertices, faces)
