@@ -391,6 +391,7 @@ def synth_command(
     seed: Annotated[int, typer.Option(min=0, max=2**31 - 1, help="Seed of the noise.")] = 0,
     poses: Annotated[bool, typer.Option("--poses/--no-poses", help="Write transforms.json.")] = True,
     background: Annotated[bool, typer.Option("--background", help="Opaque photos with a ground plane, not transparent ones.")] = False,
+    marker: Annotated[bool, typer.Option("--marker", help="A printed ArUco marker of 0.2 units on a ground plane.")] = False,
     dry_run: DryRunOption = False,
     quiet: QuietOption = False,
     as_json: JsonOption = False,
@@ -398,7 +399,8 @@ def synth_command(
     """Write the built-in synthetic capture: renders of an analytic object, with ground truth."""
     from gsbake.cli.synth import synth
 
-    synth(folder, views=views, size=size, seed=seed, poses=poses, background=background, dry_run=dry_run, quiet=quiet, as_json=as_json)
+    scene = {"poses": poses, "background": background, "marker": marker}
+    synth(folder, views=views, size=size, seed=seed, **scene, dry_run=dry_run, quiet=quiet, as_json=as_json)
 
 
 app.add_typer(file_app)

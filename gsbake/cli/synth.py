@@ -12,15 +12,16 @@ from gsbake.text import duration
 
 
 def synth(
-    folder: Path, *, views: int, size: int, seed: int, poses: bool, background: bool, dry_run: bool, quiet: bool, as_json: bool
-) -> None:
+    folder: Path, *, views: int, size: int, seed: int, poses: bool, background: bool, marker: bool, dry_run: bool, quiet: bool,
+    as_json: bool,
+) -> None:  # fmt: skip
     """Write the capture and print its folder."""
     start = time.perf_counter()
     if not dry_run:
         from gsbake.synth.capture import write_capture
 
         try:
-            write_capture(folder, views=views, size=size, seed=seed, poses=poses, background=background)
+            write_capture(folder, views=views, size=size, seed=seed, poses=poses, background=background, marker=marker)
         except OSError as error:
             raise disk_error(error, folder) or BadInputError(f"The capture cannot be written to '{folder}': {error.strerror}.") from error
     if as_json:

@@ -96,10 +96,10 @@ def _write_png(path: Path, rgb: NDArray[np.uint8], alpha: NDArray[np.uint8] | No
         raise OSError(f"{path} cannot be written")
 
 
-def _write_view(folder: Path, camera: Camera, rig: LightRig, background: bool) -> None:
+def _write_view(folder: Path, camera: Camera, rig: LightRig, background: bool, marker: NDArray[np.uint8]) -> None:
     """Render one camera and write its photo and its ground-truth maps."""
     image, buffers = render(
-        camera.R, camera.centre, camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height, rig, background
+        camera.R, camera.centre, camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height, rig, background, marker
     )  # fmt: skip
     coverage = image[..., 3]
     alpha = np.round(255 * coverage).astype(np.uint8)
@@ -132,13 +132,16 @@ def _transforms(cams: tuple[Camera, ...]) -> dict[str, object]:
     }  # fmt: skip
 
 
-def write_capture(folder: Path, views: int = 24, size: int = 128, seed: int = 0, poses: bool = True, background: bool = False) -> None:
+def write_capture(
+    folder: Path, views: int = 24, size: int = 128, seed: int = 0, poses: bool = True, background: bool = False, marker: bool = False
+) -> None:
     """Write the capture into `folder` (created if missing).
 
-    `images/000.png`…: sRGB photos of `size`² pixels, RGBA with transparent background, or opaque with a textured ground when `background`;
-    `transforms.json` when `poses`; `truth/`: `mesh.ply`, `points.npz` (30 000 surface points with materials), `cameras.json`
-    (`CameraSet`), and per photo `masks/`, `albedo/` and `emission/` (sRGB), `normal/` (world, coded 0..1), `orm/` (1, roughness, metallic;
-    linear). Equal arguments write equal bytes. Raises UsageError for fewer than 3 views or a size below 16.
+    `images/000.png`…: sRGB photos of `size`² pixels, RGBA with transparent background, or opaque with a textured ground when `background`,
+    on which with `marker` a printed ArUco marker of `scene.MARKER_SIZE` units lies; `transforms.json` when `poses`; `truth/`: `mesh.ply`,
+    `points.npz` (30 000 surface points with materials), `cameras.json` (`CameraSet`), and per photo `masks/`, `albedo/` and `emission/`
+    (sRGB), `normal/` (world, coded 0..1), `orm/` (1, roughness, metallic; linear).
+    Equal arguments write equal bytes. Raises UsageError for fewer than 3 views or a size below 16.
     """
     if views < 3 or size < 16:
         raise UsageError(f"The built-in capture needs at least 3 views of 16 pixels, not {views} of {size}; increase --views or --size.")
@@ -146,10 +149,12 @@ def write_capture(folder: Path, views: int = 24, size: int = 128, seed: int = 0,
 
     for name in ("images", "truth/masks", "truth/albedo", "truth/normal", "truth/orm", "truth/emission"):
         (folder / name).mkdir(parents=True, exist_ok=True)
+    background = background or marker
     cams = cameras(views, size, seed, background)
+    cells = scene.marker_cells() if marker else np.zeros((0, 0), np.uint8)
     rig = studio_rig()
     with ThreadPoolExecutor(2) as pool:  # the renderer releases the GIL
-        list(pool.map(lambda camera: _write_view(folder, camera, rig, background), cams))
+        list(pool.map(lambda camera: _write_view(folder, camera, rig, background, cells), cams))
     if poses:
         (folder / "transforms.json").write_text(json.dumps(_transforms(cams), indent=1))
     truth = folder / "truth"

@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import cv2
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
@@ -33,6 +34,9 @@ HANDLE_X, HANDLE_Z, HANDLE_MAJOR, HANDLE_MINOR = 0.40, 0.52, 0.22, 0.04
 GLAZE_Z, GLAZE_ALBEDO, GLAZE_ROUGHNESS = (0.16, 0.34), (0.05, 0.12, 0.34), 0.22
 #: The emissive patch, in direction (-1, 0) from the axis: height, radius and radiance (linear; above 1 would clip in the photos).
 EMITTER_Z, EMITTER_RADIUS, EMITTER_RADIANCE = 0.66, 0.09, (0.95, 0.80, 0.45)
+
+#: The printed marker on the ground: number in OpenCV's dictionary of 4 × 4 cells, edge and centre (world), its white margin in cells.
+MARKER_NUMBER, MARKER_SIZE, MARKER_CENTRE, MARKER_MARGIN = 7, 0.2, (0.33, 0.48), 1.0
 
 _compiled: Any = njit(cache=True, nogil=True, error_model="numpy")
 _inlined: Any = njit(cache=True, nogil=True, error_model="numpy", inline="always")
@@ -154,9 +158,24 @@ def material(x: float, y: float, z: float) -> tuple[float, float, float, float, 
     return r * scale, g * scale, b * scale, 0.75, 0.0
 
 
+def marker_cells() -> NDArray[np.uint8]:
+    """The printed marker's cells (6, 6), 1 = white, its black border included; the first row is at high y, columns go along x."""
+    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
+    return np.asarray(cv2.aruco.generateImageMarker(dictionary, MARKER_NUMBER, 6) > 0, np.uint8)
+
+
 @_compiled
-def ground(x: float, y: float) -> tuple[float, float, float]:
-    """Linear albedo of the diffuse ground z = 0 (used only for photos with a background)."""
+def ground(x: float, y: float, marker: NDArray[np.uint8]) -> tuple[float, float, float]:
+    """Linear albedo of the diffuse ground z = 0 (used only for photos with a background), with a printed `marker` (k, k); k = 0: none."""
+    cells = len(marker)
+    if cells:
+        column = (x - MARKER_CENTRE[0]) / MARKER_SIZE * cells + 0.5 * cells
+        row = (MARKER_CENTRE[1] - y) / MARKER_SIZE * cells + 0.5 * cells
+        if 0 <= column < cells and 0 <= row < cells:
+            paper = 0.03 + 0.77 * marker[int(row), int(column)]
+            return paper, paper, paper
+        if min(column, row) >= -MARKER_MARGIN and max(column, row) < cells + MARKER_MARGIN:
+            return 0.8, 0.8, 0.8
     value = 0.55 * noise(5 * x, 5 * y, 40.5) + 0.45 * noise(13 * x, 13 * y, 80.5)
     dark = _step(0.42, 0.56, value)
     tint = noise(2 * x, 2 * y, 9.5)

@@ -303,14 +303,15 @@ def outgoing_radiance(
 
 @_compiled
 def render(
-    rotation: Array, centre: Array, fx: float, fy: float, cx: float, cy: float, width: int, height: int, rig: LightRig, background: bool
-) -> tuple[Array, Array]:
+    rotation: Array, centre: Array, fx: float, fy: float, cx: float, cy: float, width: int, height: int, rig: LightRig, background: bool,
+    marker: NDArray[np.uint8],
+) -> tuple[Array, Array]:  # fmt: skip
     """One photo with 2x2 samples per pixel: linear RGB + coverage (h, w, 4) and the surface buffers (h, w, 11), premultiplied.
 
     Buffers: albedo (3), normal (3), roughness, metallic, emission (3).
 
     `rotation` (3, 3) world→camera with OpenCV axes, `centre` (3,) of the camera in the world. With `background` the colour channels include
-    the ground and the environment; coverage remains that of the object.
+    the ground with the cells (k, k) of a printed `marker` (k = 0: none) and the environment; coverage remains that of the object.
     """
     image, buffers = np.zeros((height, width, 4)), np.zeros((height, width, 11))
     ox, oy, oz = centre[0], centre[1], centre[2]
@@ -344,7 +345,7 @@ def render(
                     continue
                 elif dz < -1e-3:
                     x, y = ox - oz / dz * dx, oy - oz / dz * dy
-                    albedo = ground(x, y)
+                    albedo = ground(x, y, marker)
                     surface = (albedo[0], albedo[1], albedo[2], 0.9, 0.0)
                     r, g, b = outgoing_radiance((x, y, 0.0), (0.0, 0.0, 1.0), (-dx, -dy, -dz), surface, rig, k)
                 else:

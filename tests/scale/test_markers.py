@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from gsbake.geometry.cameras import Camera
+from gsbake.imaging.srgb import decode, encode_bytes
 from gsbake.scale.markers import DICTIONARIES, find_markers
 from tests.support.cameras import look_at
 
@@ -24,7 +25,9 @@ def ring(count: int = 6) -> list[Camera]:
     ]
 
 
-def photograph(folder: Path, cameras: list[Camera], dictionary: str, number: int, at: tuple[float, float] = (0.1, -0.05)) -> None:
+def photograph(
+    folder: Path, cameras: list[Camera], dictionary: str, number: int, at: tuple[float, float] = (0.1, -0.05), brightness: float = 1.0
+) -> None:
     """Photos of a marker on the ground, over what the photos already show."""
     folder.mkdir(exist_ok=True)
     image = cv2.aruco.generateImageMarker(cv2.aruco.getPredefinedDictionary(DICTIONARIES[dictionary]), number, DOTS)
@@ -39,10 +42,11 @@ def photograph(folder: Path, cameras: list[Camera], dictionary: str, number: int
         file = folder / f"{camera.name}.png"
         before: Any = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE) if file.exists() else None
         photo = np.full((camera.height * 4, camera.width * 4), 128, np.uint8) if before is None else cv2.resize(before, None, fx=4, fy=4)
-        # Drawn four times as large and reduced: sharp edges with the coverage of each pixel.
+        # Drawn four times as large and reduced in linear light: sharp edges with the coverage of each pixel.
         larger = np.array([[4, 0, 1.5], [0, 4, 1.5], [0, 0, 1.0]]) @ transform
         cv2.warpPerspective(sheet, larger, photo.shape[::-1], dst=photo, borderMode=cv2.BORDER_TRANSPARENT)
-        cv2.imwrite(str(file), cv2.resize(photo, (camera.width, camera.height), interpolation=cv2.INTER_AREA))
+        light = cv2.resize(decode(photo.astype(np.float32) / 255), (camera.width, camera.height), interpolation=cv2.INTER_AREA)
+        cv2.imwrite(str(file), encode_bytes(brightness * light))
 
 
 @pytest.mark.parametrize("dictionary", ["aruco-4x4", "aruco-original", "apriltag-36h11"])
@@ -55,6 +59,13 @@ def test_the_edge_of_a_marker_is_measured(tmp_path: Path, dictionary: str) -> No
     assert abs(markers[0].sides.mean() / EDGE - 1) < 0.002
     truth = np.array([(-1, 1, 0), (1, 1, 0), (1, -1, 0), (-1, -1, 0)]) * EDGE / 2 + (0.1, -0.05, 0)
     assert np.abs(markers[0].corners - truth).max() < 0.002
+
+
+def test_dark_photos_show_their_marker(tmp_path: Path) -> None:
+    cameras = ring()
+    photograph(tmp_path / "photos", cameras, "aruco-4x4", 7, brightness=0.02)
+    (marker,) = find_markers(cameras, tmp_path / "photos")[1]
+    assert abs(marker.sides.mean() / EDGE - 1) < 0.004
 
 
 def test_markers_that_move_or_are_seen_twice_are_left_out(tmp_path: Path) -> None:

@@ -14,8 +14,10 @@ from scipy.spatial import cKDTree
 from gsbake.errors import UsageError
 from gsbake.geometry.cameras import Camera, CameraSet
 from gsbake.imaging.srgb import encode_bytes
+from gsbake.scale.markers import find_markers
 from gsbake.synth import scene
-from gsbake.synth.capture import cameras, true_mesh, write_capture
+from gsbake.synth.capture import cameras, look_at, true_mesh, write_capture
+from gsbake.synth.shade import render, studio_rig
 
 VIEWS, SIZE = 6, 64
 
@@ -167,3 +169,21 @@ def test_srgb_code_values() -> None:
 def test_too_small_is_a_usage_error(tmp_path: Path, views: int, size: int) -> None:
     with pytest.raises(UsageError, match="built-in capture"):
         write_capture(tmp_path, views=views, size=size)
+
+
+def test_the_printed_marker_is_read_and_has_its_size(tmp_path: Path) -> None:
+    rig, cells = studio_rig(), scene.marker_cells()
+    target = np.array([*scene.MARKER_CENTRE, 0.0])
+    cams = [look_at(str(k), target + (0.5 * k - 0.5, 0.7, 0.8), target, 0.1 * k, 256, (128, 128), 256) for k in range(3)]
+    for camera in cams:
+        image, _ = render(camera.R, camera.centre, camera.fx, camera.fy, camera.cx, camera.cy, 256, 256, rig, True, cells)
+        assert cv2.imwrite(str(tmp_path / f"{camera.name}.png"), encode_bytes(image[..., 2::-1]))
+    dictionary, (marker,) = find_markers(cams, tmp_path)
+    assert (dictionary, marker.number) == ("aruco-4x4", scene.MARKER_NUMBER)
+    assert abs(marker.sides.mean() / scene.MARKER_SIZE - 1) < 0.01
+    assert np.abs(marker.corners.mean(0) - target).max() < 0.002
+
+
+def test_a_marker_lies_on_a_ground(tmp_path: Path) -> None:
+    write_capture(tmp_path, views=3, size=32, marker=True)
+    assert cv2.imread(str(tmp_path / "images" / "000.png"), cv2.IMREAD_UNCHANGED).shape == (32, 32, 3)
