@@ -92,7 +92,7 @@ def _detect(path: Path, dictionary: str) -> dict[int, Array]:
     corners, numbers, _ = detector.detectMarkers(image)
     if numbers is None:
         return {}
-    flat = numbers.ravel().tolist()
+    flat = numbers.ravel().astype(int).tolist()
     # AprilTag's refinement counts from the photo's corner, as gsbake does, unlike the rest of OpenCV.
     return {n: np.asarray(c, np.float64).reshape(4, 2) for n, c in zip(flat, corners, strict=True) if flat.count(n) == 1}
 
