@@ -6,7 +6,7 @@ The fit works on two levels (`levels`): starts are compared and searches made on
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -19,7 +19,7 @@ from gsbake.config.schema import Bake
 from gsbake.geometry.cameras import Camera
 from gsbake.materials.adjacency import neighbours
 from gsbake.materials.fit_surface import FitSurface, Fitted
-from gsbake.materials.initialisation import DEFAULT_START, ChosenFit, Trials
+from gsbake.materials.initialisation import ChosenFit
 from gsbake.materials.levels import FitLevel, InterpolatedTransport, coarse_pixels, coarse_surface
 from gsbake.materials.map_selection import drop_unneeded_maps
 from gsbake.materials.metal_superresolution import superresolve_metals
@@ -133,7 +133,6 @@ class _Fitting:
     seed: int
     monitor: Monitor
     light_motion: LightMotion = LightMotion()
-    trials: Trials = field(default_factory=dict)
 
     def run(self) -> FittedTextures:
         """Choose the texture size, read the photos' pixels, trace visibility, fit, and resample to the full texture."""
@@ -247,10 +246,9 @@ class _Fitting:
             return pixels
         levels: dict[Motion, FitLevel] = {"static": self._coarse_level(texels, pixels)}
         levels |= {motion: self._coarse_level(texels, pixels.under(rotations)) for motion, rotations in under.items()}
-        trials = compare_light_motions(levels, self._plan(diffuse), self._each)
-        scores = {motion: fitted.held_out_psnr or 0.0 for motion, (_, fitted) in trials.items()}
+        scores = compare_light_motions(levels, self._plan(diffuse), self._each)
         best = max(scores, key=lambda motion: scores[motion] - (0 if motion == "static" else MIN_MOTION_GAIN))
-        self.light_motion, self.trials = LightMotion(best, under.get(best)), {DEFAULT_START: trials[best]}
+        self.light_motion = LightMotion(best, under.get(best))
         self.monitor.decide("light", _MOTIONS[best], ", ".join(f"{score:.2f} dB where it {_MOTIONS[m]}" for m, score in scores.items()))
         return pixels.under(self.light_motion.rotations)
 
@@ -258,7 +256,7 @@ class _Fitting:
         """Compare starts on the coarse level, and fit the fine one from the best; `diffuse`: without specular reflection."""
         fine, plan = FitLevel(fine_texels, pixels.fitted, pixels.validation), self._plan(diffuse)
         started = time.perf_counter()
-        choice = fit_two_levels(self._coarse_level(coarse_texels, pixels), fine, self.half, plan, self._each, self.trials)
+        choice = fit_two_levels(self._coarse_level(coarse_texels, pixels), fine, self.half, plan, self._each)
         seconds = time.perf_counter() - started
         self._report(choice, pixels, 0.0 if diffuse else seconds)
         return choice

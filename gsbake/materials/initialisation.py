@@ -71,17 +71,19 @@ def trial_schedule(steps: int, seed: int, diffuse: bool) -> FitSchedule:
     )
 
 
-def trial_fits(make: MakeFit, level: FitLevel, steps: int, seed: int, diffuse: bool, each: Each, known: Trials | None = None) -> Trials:
+def trial_fits(make: MakeFit, level: FitLevel, steps: int, seed: int, diffuse: bool, each: Each) -> Trials:
     """Fits of `steps` steps on the coarse `level`: from all `STARTS`, or the default one for a `diffuse` object or without validation
-    photos; those of the starts in `known` are taken from there."""
+    photos. Those that start dielectric, under a light that stands, start without the shading in the projected colours."""
     starts: tuple[Start, ...] = STARTS
     if diffuse or not any(map(len, level.held_out)):
         starts = (DIFFUSE_START if diffuse else DEFAULT_START,)
-    plan, found = trial_schedule(steps, seed, diffuse), dict(known or {})
-    for start in starts:
-        if start not in found:
-            fit = make(*start)
-            found[start] = fit, fit.run(level.fitted, level.held_out, plan, each)
+    plan, found = trial_schedule(steps, seed, diffuse), {}
+    stands = all(photo.to_light is None for photo in level.fitted)
+    for metallic, roughness in starts:
+        fit = make(metallic, roughness)
+        if stands and fit.mostly_dielectric:
+            fit.move_shading_to_light(seed)
+        found[metallic, roughness] = fit, fit.run(level.fitted, level.held_out, plan, each)
     return found
 
 

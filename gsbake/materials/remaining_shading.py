@@ -11,6 +11,11 @@ is least over pairs of points, half of them near each other and half anywhere on
 chromaticity and of brightness that is left (Geman–McClure), so that pairs of different base colours do not take part (Retinex with
 chromaticity: Grosse et al., ICCV 2009; global sparsity of reflectance: Gehler et al., *Recovering intrinsic images with a global sparsity
 prior on reflectance*, NIPS 2011). Gauss-Newton with iteratively reweighted least squares.
+
+That is not convex: where shading is strong, pairs across it look like different base colours and drop out before it is found. So it is
+solved twice, once with scales that start wide (graduated non-convexity: Blake & Zisserman, *Visual Reconstruction*, 1987), and the
+solution with which more pairs agree is taken; the wide one must win clearly, as it may take a base colour that varies with the normal
+for shading.
 """
 
 from __future__ import annotations
@@ -36,6 +41,9 @@ CHROMATICITY_SCALE, BRIGHTNESS_SCALE, NEARBY_BRIGHTNESS_SCALE = 0.06, 0.1, 0.2
 LOG_OFFSET, NOISE_FLOOR = 0.004, 0.03
 #: Ridge weight of the coefficients, rounds of reweighting, and damping of a step.
 RIDGE, ROUNDS, DAMPING = 1e-3, 25, 0.7
+#: Factor on all scales and on the noise floor where they start wide, the share of the rounds in which it falls to 1, and by how much the
+#: agreement must then be larger.
+WIDENING, WIDENED_SHARE, MIN_AGREEMENT_GAIN = 20.0, 0.6, 0.01
 #: Partial sums of the pairs: a fixed number, so that results do not depend on threads.
 CHUNKS = 16
 #: Points at which the irradiance of a changed light is matched, Gauss-Newton steps, their ridge weight and largest exponent.
@@ -45,38 +53,53 @@ MATCHED_POINTS, MATCHING_STEPS, MATCHING_RIDGE, MAX_EXPONENT = 4000, 4, 1e-3, 1.
 def remaining_shading(base_color: NDArray[Any], normal: NDArray[Any], position: NDArray[Any], generator: np.random.Generator) -> Doubles:
     """Coefficients e (8, 3) of the log shading that is left in the linear base colours (n, 3) of points with unit normals (n, 3) and
     positions (n, 3); zeros where there are fewer than two points."""
-    found = np.zeros((8, 3))
     if len(base_color) < 2:
-        return found
+        return np.zeros((8, 3))
     chosen = generator.choice(len(base_color), min(POINTS, len(base_color)), replace=False)
     logs = np.log(np.maximum(np.asarray(base_color[chosen], np.float64), 0) + LOG_OFFSET)
     basis = harmonics(normal[chosen])
-    first, second, share, scale = _pairs(np.asarray(position[chosen], np.float64), generator)
+    pairs = *_pairs(np.asarray(position[chosen], np.float64), generator), basis, logs
+    (small, agreement), (large, wider) = (_solve(pairs, widening) for widening in (1.0, WIDENING))
+    return large if wider > (1 + MIN_AGREEMENT_GAIN) * agreement else small
+
+
+def _solve(pairs: tuple[NDArray[Any], ...], widening: float) -> tuple[Doubles, float]:
+    """The coefficients (8, 3) found from none, with all scales multiplied by a factor that falls from `widening` to 1, and the agreement of
+    the pairs with them."""
+    first, second, share, scale, basis, logs = pairs
+    found = np.zeros((8, 3))
     matrices, rights, weights = (np.zeros((CHUNKS, 3, *shape)) for shape in ((8, 8), (8,), ()))
-    for _ in range(ROUNDS):
-        normal_equations(first, second, basis, logs, share, scale, found, matrices, rights, weights)
+    agreement = np.zeros(CHUNKS)
+    sums = matrices, rights, weights, agreement
+    for turn in range(ROUNDS):
+        wider = max(1.0, widening ** (1 - turn / (WIDENED_SHARE * ROUNDS)))
+        normal_equations(first, second, basis, logs, share, scale, found, wider, *sums)
         for channel in range(3):
             ridge = RIDGE * max(float(weights[:, channel].sum()), 1e-12)
             step = rights[:, channel].sum(0) - ridge * found[:, channel]
             found[:, channel] += DAMPING * np.linalg.solve(matrices[:, channel].sum(0) + ridge * np.eye(8), step)
-    return found
+    normal_equations(first, second, basis, logs, share, scale, found, 1.0, *sums)
+    return found, float(agreement.sum())
 
 
 @njit(parallel=True, cache=True, error_model="numpy", fastmath={"contract", "nsz"})
 def normal_equations(
-    first: Any, second: Any, basis: Any, logs: Any, share: Any, scale: Any, found: Any, matrices: Any, rights: Any, weights: Any
-) -> None:
+    first: Any, second: Any, basis: Any, logs: Any, share: Any, scale: Any, found: Any, wider: Any, matrices: Any, rights: Any,
+    weights: Any, agreement: Any,
+) -> None:  # fmt: skip
     """Matrix, right side and sum of weights of one round's least squares for each channel, in a fixed number of partial sums.
 
     The pairs (`first`, `second`) (m,) of points with harmonics `basis` (n, 8) and log base colours `logs` (n, 3) count as `share` (m,),
-    less where brightness differs by `scale` (m,) after the shading of the coefficients `found` (8, 3). `matrices` (CHUNKS, 3, 8, 8),
-    `rights` (CHUNKS, 3, 8) and `weights` (CHUNKS, 3) are overwritten.
+    less where brightness differs by `scale` (m,) after the shading of the coefficients `found` (8, 3); all scales are multiplied by
+    `wider`. `matrices` (CHUNKS, 3, 8, 8), `rights` (CHUNKS, 3, 8), `weights` (CHUNKS, 3) and `agreement` (CHUNKS,), the sum of what pairs
+    count, are overwritten.
     """
     chunks = matrices.shape[0]
     size = -(-len(first) // chunks)
     for chunk in prange(chunks):
         matrix, right, total = np.zeros((3, 8, 8)), np.zeros((3, 8)), np.zeros(3)
         slope, rest = np.empty(8), np.empty(3)
+        counted = 0.0
         for pair in range(chunk * size, min(len(first), (chunk + 1) * size)):
             i, j = first[pair], second[pair]
             for k in range(8):
@@ -87,9 +110,11 @@ def normal_equations(
                     rest[c] -= slope[k] * found[k, c]
             brightness = (rest[0] + rest[1] + rest[2]) / 3
             chromaticity = (rest[0] - brightness) ** 2 + (rest[1] - brightness) ** 2 + (rest[2] - brightness) ** 2
-            similar = share[pair] * math.exp(-chromaticity / CHROMATICITY_SCALE**2) / (1 + (brightness / scale[pair]) ** 2)
+            similar = share[pair] * math.exp(-chromaticity / (wider * CHROMATICITY_SCALE) ** 2)
+            similar /= 1 + (brightness / (wider * scale[pair])) ** 2
+            counted += similar
             for c in range(3):
-                weight = similar / max(abs(rest[c]), NOISE_FLOOR)
+                weight = similar / max(abs(rest[c]), wider * NOISE_FLOOR)
                 total[c] += weight
                 for k in range(8):
                     weighted = weight * slope[k]
@@ -100,7 +125,7 @@ def normal_equations(
             for k in range(8):
                 for m in range(k):
                     matrix[c, m, k] = matrix[c, k, m]
-        matrices[chunk], rights[chunk], weights[chunk] = matrix, right, total
+        matrices[chunk], rights[chunk], weights[chunk], agreement[chunk] = matrix, right, total, counted
 
 
 def _pairs(position: Doubles, generator: np.random.Generator) -> tuple[NDArray[np.int64], NDArray[np.int64], Doubles, Doubles]:

@@ -24,18 +24,21 @@ from gsbake.materials.options import FitSchedule
 
 
 class Fit:
-    """A fit with the validation error `error` that records its schedules."""
+    """A fit with the validation error `error` that records its schedules, and whether shading was removed before the first."""
 
-    def __init__(self, error: float, runs: list[FitSchedule]) -> None:
-        self._error, self._runs = error, runs
+    def __init__(self, error: float, runs: list[FitSchedule], mostly_dielectric: bool = True) -> None:
+        self._error, self._runs, self.mostly_dielectric, self.without_shading = error, runs, mostly_dielectric, False
+
+    def move_shading_to_light(self, seed: int) -> None:
+        self.without_shading = True
 
     def run(self, photos: Any, held_out: Any, schedule: FitSchedule, each: Any) -> Any:
         self._runs.append(schedule)
         return SimpleNamespace(held_out_loss=self._error if held_out else None)
 
 
-def level(held_out: bool = True) -> Any:
-    return SimpleNamespace(fitted=[[1]], held_out=[[1]] if held_out else [])
+def level(held_out: bool = True, to_light: Any = None) -> Any:
+    return SimpleNamespace(fitted=[SimpleNamespace(to_light=to_light)], held_out=[[1]] if held_out else [])
 
 
 def nothing(done: int, total: int) -> None:
@@ -56,6 +59,13 @@ def test_all_starts_are_tried_without_searches_for_the_light() -> None:
     assert tuple(trials) == STARTS and len(runs) == len(STARTS)
     assert all(run.iterations == 7 and run.metal_searches_at and not run.light_searches_at and not run.emission for run in runs)
     assert {m > 0.5 for m, _ in STARTS} == {True, False}
+
+
+@pytest.mark.parametrize("moves", [False, True])
+def test_dielectric_starts_have_no_shading_where_the_light_stands(moves: bool) -> None:
+    make: Any = lambda m, r: Fit(1.0, [], m < 0.5)  # noqa: E731
+    trials: Any = trial_fits(make, level(to_light="turned" if moves else None), 7, 0, False, nothing)
+    assert [fit.without_shading for fit, _ in trials.values()] == [metallic < 0.5 and not moves for metallic, _ in STARTS]
 
 
 @pytest.mark.parametrize(("diffuse", "held_out", "start"), [(True, True, DIFFUSE_START), (False, False, DEFAULT_START)])

@@ -42,6 +42,16 @@ def test_shading_of_two_colours_is_found() -> None:
     assert (harmonics(normal) @ TRUE).std() > 0.15
 
 
+def test_strong_coloured_shading_is_found() -> None:
+    """A warm sun against a blue sky: pairs across the terminator look like different base colours until the shading is known."""
+    normal = ball()
+    shading = np.outer(normal[:, 0], [1.0, 0.7, 0.3])
+    found = remaining_shading(two_colours(normal) * np.exp(shading), normal, normal, np.random.default_rng(0))
+    left = harmonics(normal) @ found - shading
+    assert shading.std() > 0.4
+    assert (left - left.mean(0)).std() < 0.03
+
+
 def test_base_colours_without_shading_stay() -> None:
     normal = ball()
     found = remaining_shading(two_colours(normal), normal, normal, np.random.default_rng(0))
@@ -71,21 +81,24 @@ def test_the_light_gets_the_irradiance() -> None:
     assert np.abs(irradiance(radiance) / wanted - 1).mean() > 0.1
 
 
-def test_normal_equations_equal_sums_of_arrays() -> None:
+@pytest.mark.parametrize("wider", [1.0, 3.0])
+def test_normal_equations_equal_sums_of_arrays(wider: float) -> None:
     rng, points, pairs = np.random.default_rng(2), 50, 333
     first, second = rng.integers(points, size=(2, pairs))
     basis, logs = rng.normal(size=(points, 8)), rng.normal(scale=0.1, size=(points, 3))
     share, scale, found = rng.uniform(size=pairs), rng.uniform(0.1, 0.2, pairs), rng.normal(scale=0.01, size=(8, 3))
     matrices, rights, weights = (np.ones((CHUNKS, 3, *shape)) for shape in ((8, 8), (8,), ()))
-    normal_equations(first, second, basis, logs, share, scale, found, matrices, rights, weights)
+    agreement = np.ones(CHUNKS)
+    normal_equations(first, second, basis, logs, share, scale, found, wider, matrices, rights, weights, agreement)
 
     slope = basis[first] - basis[second]
     rest = logs[first] - logs[second] - slope @ found
     brightness = rest.mean(1)
     chromaticity = np.linalg.norm(rest - brightness[:, None], axis=1)
-    similar = share * np.exp(-((chromaticity / CHROMATICITY_SCALE) ** 2)) / (1 + (brightness / scale) ** 2)
+    similar = share * np.exp(-((chromaticity / (wider * CHROMATICITY_SCALE)) ** 2)) / (1 + (brightness / (wider * scale)) ** 2)
+    assert np.isclose(agreement.sum(), similar.sum())
     for channel in range(3):
-        weight = similar / np.maximum(np.abs(rest[:, channel]), NOISE_FLOOR)
+        weight = similar / np.maximum(np.abs(rest[:, channel]), wider * NOISE_FLOOR)
         assert np.allclose(matrices[:, channel].sum(0), (slope * weight[:, None]).T @ slope)
         assert np.allclose(rights[:, channel].sum(0), slope.T @ (weight * rest[:, channel]))
         assert np.isclose(weights[:, channel].sum(), weight.sum())
