@@ -24,7 +24,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -59,7 +59,7 @@ from gsbake.materials.texel_optimiser import TexelOptimiser
 from gsbake.shading.cubemap import solid_angles
 from gsbake.shading.environment import EnvironmentLight
 from gsbake.shading.light_motion import mean_radiance, rotated
-from gsbake.shading.light_tables import prefilter_cube_map
+from gsbake.shading.light_tables import irradiance, prefilter_cube_map
 from gsbake.shading.neutral_light import neutral_light_loss
 from gsbake.texturing.resampling import DETAIL_OFFSET, MAX_DETAIL_RATIO
 
@@ -207,10 +207,10 @@ class MaterialFit:
         if self._surface.indirect:
             # Albedo of both lobes together, (1 − m) base colour + F0: indirect light is not sharp enough to depend on roughness.
             reflectance = self._values[:, :3] + np.float32(0.04) * (1 - self._values[:, 4:5])
-            irradiance = self._irradiance() * visible[:, None]
-            indirect = transport.indirect_irradiance(irradiance, reflectance)
+            lit = self._irradiance() * visible[:, None]
+            indirect = transport.indirect_irradiance(lit, reflectance)
             self._transport[:, INDIRECT] = indirect
-            self._transport[:, OUTGOING] = reflectance * (irradiance + indirect) + self._transport[:, EMISSION]
+            self._transport[:, OUTGOING] = reflectance * (lit + indirect) + self._transport[:, EMISSION]
 
     def _radiance(self) -> Floats:
         """The environment map (6, size, size, 3) in the frame in which it stands."""
@@ -220,10 +220,9 @@ class MaterialFit:
         """The environment map (6, size, size, 3) in the object's frame, the mean over photos where the light moves."""
         return mean_radiance(self._radiance(), self._rotations)
 
-    @torch.no_grad()
     def _irradiance(self) -> Floats:
         """Irradiance / π (n, 3) of unoccluded texels, the mean over photos where the light moves."""
-        return np.asarray(prefilter_cube_map(torch.from_numpy(self._mean_radiance())).diffuse(torch.from_numpy(self._normal)).numpy())
+        return irradiance(self._mean_radiance(), self._normal)
 
     def _lights(self) -> PhotoLights:
         """The present light as photos see it."""
@@ -313,20 +312,24 @@ class MaterialFit:
             new[:, 4] = np.minimum(new[:, 4] / np.median(new[:, 4]), self._options.max_metallic)
             self._texels.reinitialise(texel, new)
 
+    def remaining_shading(self, seed: int) -> NDArray[np.float64]:
+        """Coefficients (8, 3) of the log shading that is left in the base colours of dielectrics."""
+        texel = np.flatnonzero(self._dielectric())
+        position = np.asarray(self._surface.position)[texel]
+        return remaining_shading(self._values[texel, :3], self._unit_normals[texel], position, np.random.default_rng(seed))
+
     @torch.no_grad()
-    def move_shading_to_light(self, seed: int) -> None:
-        """Move the shading that is left in the base colours of dielectrics to the light."""
-        generator, texel = np.random.default_rng(seed), np.flatnonzero(self._dielectric())
-        unit = self._normal / np.maximum(np.linalg.norm(self._normal, axis=1, keepdims=True), 1e-12)
-        coefficients = remaining_shading(self._values[texel, :3], unit[texel], np.asarray(self._surface.position)[texel], generator)
-        matched = unit[generator.choice(texel, min(MATCHED_POINTS, len(texel)), replace=False)]
-        normals = torch.from_numpy(np.ascontiguousarray(matched))
-
-        def irradiance(radiance: Floats) -> Floats:
-            return np.asarray(prefilter_cube_map(torch.from_numpy(radiance)).diffuse(normals).numpy())
-
-        light = with_irradiance_factor(self._radiance(), coefficients, matched, irradiance)
+    def move_to_light(self, shading: NDArray[np.float64], seed: int) -> None:
+        """Move `shading` of these coefficients (8, 3) from the base colours of dielectrics to the light."""
+        texel = np.flatnonzero(self._dielectric())
+        matched = self._unit_normals[np.random.default_rng(seed).choice(texel, min(MATCHED_POINTS, len(texel)), replace=False)]
+        light = with_irradiance_factor(self._radiance(), shading, matched, partial(irradiance, normals=matched))
         self._change_light(EnvironmentLight.from_radiance(light), texel)
+
+    @property
+    def _unit_normals(self) -> Floats:
+        """The mesh's unit normals (n, 3) at the texels."""
+        return self._normal / np.maximum(np.linalg.norm(self._normal, axis=1, keepdims=True), 1e-12)
 
     @torch.no_grad()
     def _scale_light_to_metals(self) -> LightAdjustment:

@@ -78,11 +78,12 @@ def trial_fits(make: MakeFit, level: FitLevel, steps: int, seed: int, diffuse: b
     if diffuse or not any(map(len, level.held_out)):
         starts = (DIFFUSE_START if diffuse else DEFAULT_START,)
     plan, found = trial_schedule(steps, seed, diffuse), {}
-    stands = all(photo.to_light is None for photo in level.fitted)
+    stands, shading = all(photo.to_light is None for photo in level.fitted), None
     for metallic, roughness in starts:
         fit = make(metallic, roughness)
         if stands and fit.mostly_dielectric:
-            fit.move_shading_to_light(seed)
+            shading = fit.remaining_shading(seed) if shading is None else shading  # the same from every start
+            fit.move_to_light(shading, seed)
         found[metallic, roughness] = fit, fit.run(level.fitted, level.held_out, plan, each)
     return found
 

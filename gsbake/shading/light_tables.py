@@ -12,8 +12,10 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
+import numpy as np
 import scipy.sparse
 import torch
+from numpy.typing import NDArray
 
 from gsbake.shading import octahedral
 from gsbake.shading.prefilter import Layout, prefilter_operator
@@ -105,3 +107,10 @@ def prefilter_cube_map(radiance: torch.Tensor) -> LightTables:
     """Prefilter a cube map of radiance (6, N, N, 3), float32 or float64, on any device; differentiable once."""
     size = radiance.shape[1]
     return LightTables(_Filter.apply(radiance.reshape(-1, 3), size), prefilter_operator(size).layout)
+
+
+@torch.no_grad()
+def irradiance(radiance: NDArray[Any], normals: NDArray[Any]) -> NDArray[np.float32]:
+    """Irradiance / π (n, 3) at unit `normals` (n, 3) under the cube map `radiance` (6, N, N, 3)."""
+    light, directions = (torch.from_numpy(np.ascontiguousarray(array, np.float32)) for array in (radiance, normals))
+    return np.asarray(prefilter_cube_map(light).diffuse(directions).numpy())
