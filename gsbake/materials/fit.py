@@ -312,7 +312,7 @@ class MaterialFit:
             new[:, 4] = np.minimum(new[:, 4] / np.median(new[:, 4]), self._options.max_metallic)
             self._texels.reinitialise(texel, new)
 
-    def remaining_shading(self, seed: int) -> NDArray[np.float64]:
+    def find_remaining_shading(self, seed: int) -> NDArray[np.float64]:
         """Coefficients (8, 3) of the log shading that is left in the base colours of dielectrics."""
         texel = np.flatnonzero(self._dielectric())
         position = np.asarray(self._surface.position)[texel]

@@ -82,7 +82,7 @@ def trial_fits(make: MakeFit, level: FitLevel, steps: int, seed: int, diffuse: b
     for metallic, roughness in starts:
         fit = make(metallic, roughness)
         if stands and fit.mostly_dielectric:
-            shading = fit.remaining_shading(seed) if shading is None else shading  # the same from every start
+            shading = fit.find_remaining_shading(seed) if shading is None else shading  # the same from every start
             fit.move_to_light(shading, seed)
         found[metallic, roughness] = fit, fit.run(level.fitted, level.held_out, plan, each)
     return found

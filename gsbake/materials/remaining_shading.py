@@ -59,8 +59,8 @@ def remaining_shading(base_color: NDArray[Any], normal: NDArray[Any], position: 
     logs = np.log(np.maximum(np.asarray(base_color[chosen], np.float64), 0) + LOG_OFFSET)
     basis = harmonics(normal[chosen])
     pairs = *_pairs(np.asarray(position[chosen], np.float64), generator), basis, logs
-    (small, agreement), (large, wider) = (_solve(pairs, widening) for widening in (1.0, WIDENING))
-    return large if wider > (1 + MIN_AGREEMENT_GAIN) * agreement else small
+    (plain, agreement), (widened, widened_agreement) = (_solve(pairs, widening) for widening in (1.0, WIDENING))
+    return widened if widened_agreement > (1 + MIN_AGREEMENT_GAIN) * agreement else plain
 
 
 def _solve(pairs: tuple[NDArray[Any], ...], widening: float) -> tuple[Doubles, float]:

@@ -77,10 +77,10 @@ def fit_two_levels(coarse: FitLevel, fine: FitLevel, texture: CoarseTexture, pla
         refine = replace(refine, fixed_light=True)
         adapt = replace(refine, iterations=steps(ADAPT_SHARE), metal_searches_at=(), rate=ADAPT_RATE)
         for turn in range(SHADING_ROUNDS):
-            choice.fit.move_to_light(choice.fit.remaining_shading(plan.seed + turn), plan.seed + turn)
+            choice.fit.move_to_light(choice.fit.find_remaining_shading(plan.seed + turn), plan.seed + turn)
             choice.fit.run(coarse.fitted, [], adapt, each("material fit, coarse level"))
         last = plan.seed + SHADING_ROUNDS
-        choice.fit.move_to_light(choice.fit.remaining_shading(last), last)
+        choice.fit.move_to_light(choice.fit.find_remaining_shading(last), last)
     if not choice.fit.mostly_dielectric:
         choice.fit.rescale_metallic()
     fit = choice.fit.continued_on(fine.surface, texture.up)

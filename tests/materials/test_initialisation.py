@@ -29,11 +29,11 @@ class Fit:
     def __init__(self, error: float, runs: list[FitSchedule], mostly_dielectric: bool = True) -> None:
         self._error, self._runs, self.mostly_dielectric, self.without_shading = error, runs, mostly_dielectric, False
 
-    def remaining_shading(self, seed: int) -> float:
+    def find_remaining_shading(self, seed: int) -> float:
         return 3.0 + seed
 
     def move_to_light(self, shading: float, seed: int) -> None:
-        self.without_shading = shading == self.remaining_shading(seed)
+        self.without_shading = shading == self.find_remaining_shading(seed)
 
     def run(self, photos: Any, held_out: Any, schedule: FitSchedule, each: Any) -> Any:
         self._runs.append(schedule)

@@ -5,8 +5,8 @@ those of shiny materials decide what they reflect. Each face normal becomes the 
 and by a Gaussian of their difference, a few times: within smooth regions the ripple averages out, and edges, whose normals differ by much
 more than its angle, stay. The vertices then move to the planes of their faces with the new normals.
 
-Zheng et al., *Bilateral normal filtering for mesh denoising*, TVCG 2011, eq. 6; vertex update of Sun et al., *Fast and effective
-feature-preserving mesh denoising*, TVCG 2007, eq. 13.
+Zheng et al., *Bilateral normal filtering for mesh denoising*, TVCG 2011 (their local scheme, over the three faces across edges); vertex
+update of Sun et al., *Fast and effective feature-preserving mesh denoising*, TVCG 2007.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ Doubles = NDArray[np.float64]
 
 #: Standard deviation of the Gaussian in degrees: above the ripple of fused depth, below creases.
 ANGLE = 8.0
-#: Vertex updates after filtering: the vertices have converged to a few hundredths of the ripple.
+#: Vertex updates after filtering.
 VERTEX_UPDATES = 10
 
 
