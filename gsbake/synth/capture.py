@@ -151,7 +151,7 @@ def write_capture(
         (folder / name).mkdir(parents=True, exist_ok=True)
     background = background or marker
     cams = cameras(views, size, seed, background)
-    cells = scene.marker_cells() if marker else np.zeros((0, 0), np.uint8)
+    cells = scene.marker_cells() if marker else scene.NO_MARKER
     rig = studio_rig()
     with ThreadPoolExecutor(2) as pool:  # the renderer releases the GIL
         list(pool.map(lambda camera: _write_view(folder, camera, rig, background, cells), cams))

@@ -37,6 +37,8 @@ EMITTER_Z, EMITTER_RADIUS, EMITTER_RADIANCE = 0.66, 0.09, (0.95, 0.80, 0.45)
 
 #: The printed marker on the ground: number in OpenCV's dictionary of 4 × 4 cells, edge and centre (world), its white margin in cells.
 MARKER_NUMBER, MARKER_SIZE, MARKER_CENTRE, MARKER_MARGIN = 7, 0.2, (0.33, 0.48), 1.0
+#: The cells of no marker.
+NO_MARKER = np.zeros((0, 0), np.uint8)
 
 _compiled: Any = njit(cache=True, nogil=True, error_model="numpy")
 _inlined: Any = njit(cache=True, nogil=True, error_model="numpy", inline="always")

@@ -118,7 +118,7 @@ def relit_psnr(asset: Asset) -> float:
 def true_image(camera: Camera, rig: LightRig) -> tuple[np.ndarray, np.ndarray]:
     """Linear radiance (h, w, 3) of the true object over black, and its coverage (h, w)."""
     picture, _ = render(
-        camera.R, camera.centre, camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height, rig, False
+        camera.R, camera.centre, camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height, rig, False, scene.NO_MARKER
     )  # fmt: skip
     return picture[..., :3], picture[..., 3]
 

@@ -48,7 +48,7 @@ def turntable(folder: Path) -> tuple[list[dict[str, Any]], list[Camera]]:
             eye = target + 2.5 * np.array([math.cos(up) * math.cos(turn), math.cos(up) * math.sin(turn), math.sin(up)])
             camera = look_at(f"{row}{i:02}", eye, target, 0.0, 1.5 * SIZE, (SIZE / 2, SIZE / 2), SIZE)
             image, _ = render(
-                camera.R, camera.centre, camera.fx, camera.fy, camera.cx, camera.cy, SIZE, SIZE, rig, False
+                camera.R, camera.centre, camera.fx, camera.fy, camera.cx, camera.cy, SIZE, SIZE, rig, False, scene.NO_MARKER
             )  # fmt: skip
             alpha = image[..., 3:]
             photo = encode_bytes(image[..., :3] / np.maximum(alpha, 1e-9)) * alpha + wall * (1 - alpha) + rng.normal(0, 1.5, wall.shape)
