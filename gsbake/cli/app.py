@@ -399,8 +399,10 @@ def synth_command(
     """Write the built-in synthetic capture: renders of an analytic object, with ground truth."""
     from gsbake.cli.synth import synth
 
-    scene = {"poses": poses, "background": background, "marker": marker}
-    synth(folder, views=views, size=size, seed=seed, **scene, dry_run=dry_run, quiet=quiet, as_json=as_json)
+    synth(
+        folder, views=views, size=size, seed=seed, poses=poses, background=background, marker=marker, dry_run=dry_run, quiet=quiet,
+        as_json=as_json,
+    )  # fmt: skip
 
 
 app.add_typer(file_app)

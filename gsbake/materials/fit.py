@@ -326,7 +326,7 @@ class MaterialFit:
         light = with_irradiance_factor(self._radiance(), shading, matched, partial(irradiance, normals=matched))
         self._change_light(EnvironmentLight.from_radiance(light), texel)
 
-    @property
+    @cached_property
     def _unit_normals(self) -> Floats:
         """The mesh's unit normals (n, 3) at the texels."""
         return self._normal / np.maximum(np.linalg.norm(self._normal, axis=1, keepdims=True), 1e-12)

@@ -76,11 +76,11 @@ def fit_two_levels(coarse: FitLevel, fine: FitLevel, texture: CoarseTexture, pla
     if choice.fit.mostly_dielectric and not choice.fit.moving_light:
         refine = replace(refine, fixed_light=True)
         adapt = replace(refine, iterations=steps(ADAPT_SHARE), metal_searches_at=(), rate=ADAPT_RATE)
-        for turn in range(SHADING_ROUNDS):
-            choice.fit.move_to_light(choice.fit.find_remaining_shading(plan.seed + turn), plan.seed + turn)
-            choice.fit.run(coarse.fitted, [], adapt, each("material fit, coarse level"))
-        last = plan.seed + SHADING_ROUNDS
-        choice.fit.move_to_light(choice.fit.find_remaining_shading(last), last)
+        for turn in range(SHADING_ROUNDS + 1):
+            if turn:
+                choice.fit.run(coarse.fitted, [], adapt, each("material fit, coarse level"))
+            seed = plan.seed + turn
+            choice.fit.move_to_light(choice.fit.find_remaining_shading(seed), seed)
     if not choice.fit.mostly_dielectric:
         choice.fit.rescale_metallic()
     fit = choice.fit.continued_on(fine.surface, texture.up)

@@ -61,7 +61,7 @@ def find_markers(cameras: Sequence[Camera], folder: Path, dictionary: str = "aut
         return "", []
     seen: dict[int, list[list[Ray]]] = defaultdict(list)
     for camera in cameras:
-        for number, corners in _detect(folder / f"{camera.name}.png", dictionary).items():
+        for number, corners in _detect(_read(folder / f"{camera.name}.png"), dictionary).items():
             seen[number].append(camera_rays(camera, corners))
     markers = [_marker(number, views) for number, views in sorted(seen.items())]
     return dictionary, [marker for marker in markers if marker is not None]
@@ -71,20 +71,17 @@ def _most_seen(cameras: Iterable[Camera], folder: Path) -> str:
     """The dictionary whose markers several photos show most often; "" when there is none."""
     counts = {name: Counter[int]() for name in DICTIONARIES}
     for camera in cameras:
+        image = _read(folder / f"{camera.name}.png")
         for name, count in counts.items():
-            count.update(_detect(folder / f"{camera.name}.png", name).keys())
+            count.update(_detect(image, name).keys())
     # A pattern that only looks like a marker of a small dictionary is seldom read twice as the same one.
     repeated = {name: sum(n for n in count.values() if n > 1) for name, count in counts.items()}
     best = max(repeated, key=lambda name: repeated[name])
     return best if repeated[best] else ""
 
 
-def _detect(path: Path, dictionary: str) -> dict[int, Array]:
-    """Corners (4, 2) in pixels of each marker number that a photo shows once."""
-    photo: Any = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
-    if photo is None:
-        raise FileNotFoundError(path)
-    image = _linear(photo)
+def _detect(image: NDArray[np.uint8], dictionary: str) -> dict[int, Array]:
+    """Corners (4, 2) in pixels of each marker number that a photo, read by `_read`, shows once."""
     settings = cv2.aruco.DetectorParameters()
     # The others make markers too small: by .2 to 1.2 % (corners) and .7 to 2.8 % (contours) for edges of 160 to 40 pixels.
     settings.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_APRILTAG
@@ -97,12 +94,15 @@ def _detect(path: Path, dictionary: str) -> dict[int, Array]:
     return {n: np.asarray(c, np.float64).reshape(4, 2) for n, c in zip(flat, corners, strict=True) if flat.count(n) == 1}
 
 
-def _linear(photo: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """The sRGB `photo` in linear light, its brightest pixels white.
+def _read(path: Path) -> NDArray[np.uint8]:
+    """The sRGB photo in linear light (h, w), its brightest pixels white.
 
     A pixel half covered by white paper is half as bright, but nearer to white in sRGB, where black markers look smaller (by half a percent
     at edges of 70 pixels).
     """
+    photo: Any = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+    if photo is None:
+        raise FileNotFoundError(path)
     light = decode(np.linspace(0, 1, 256, dtype=np.float32))
     white = max(float(light[int(np.quantile(photo, WHITE_QUANTILE))]), MIN_WHITE)
     levels = np.clip(255 * light / white, 0, 255).round().astype(np.uint8)
