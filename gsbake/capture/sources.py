@@ -22,9 +22,16 @@ PHOTO_FOLDERS = ("images", "photos")
 #: Sub-folders of a photo folder that are skipped.
 SKIPPED_FOLDERS = frozenset({"masks", "gt", "sparse", "depths", "depth"})
 #: Pose formats that a user may name, for messages.
-POSE_FORMATS = "a transforms.json, a COLMAP model folder, a poses_bounds.npy or Metashape's cameras as XML"
+POSE_FORMATS = (
+    "a transforms.json, a COLMAP model folder, a poses_bounds.npy, or cameras of Metashape (XML), RealityScan (CSV, or the folder of its "
+    "XMP files), OpenSfM (reconstruction.json), OpenMVG (sfm_data.json) or Polycam (the folder corrected_cameras)"
+)
+#: File name suffixes of pose files.
+POSE_SUFFIXES = frozenset({".json", ".npy", ".xml", ".csv"})
 _MODEL_FILES = ("cameras.bin", "cameras.txt")
 _MODEL_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse")
+#: Further pose files and folders of a folder that the user names for its poses.
+_NAMED_POSES = ("reconstruction.json", "sfm_data.json", *(f"{a}{b}" for a in ("", "keyframes/") for b in ("corrected_cameras", "cameras")))
 
 
 @dataclass(frozen=True)
@@ -82,6 +89,11 @@ def is_colmap_model(folder: Path) -> bool:
     return any((folder / name).is_file() for name in _MODEL_FILES)
 
 
+def has_xmp(folder: Path) -> bool:
+    """Whether a folder holds XMP files."""
+    return any(path.suffix.lower() == ".xmp" for path in folder.iterdir())
+
+
 def find_poses(folder: Path) -> Path | None:
     """The pose file or COLMAP model folder inside `folder`, or None: transforms.json, a sparse model, poses_bounds.npy."""
     if (folder / "transforms.json").is_file():
@@ -99,11 +111,13 @@ def _given_poses(path: Path) -> Path:
     if not path.exists():
         raise BadInputError(f"The poses {path} do not exist; give {POSE_FORMATS}.")
     if path.is_dir():
-        found = path if is_colmap_model(path) else find_poses(path)
+        if is_colmap_model(path) or has_xmp(path) or (path.name in _NAMED_POSES and any(path.glob("*.json"))):
+            return path
+        found = find_poses(path) or next((path / name for name in _NAMED_POSES if (path / name).exists()), None)
         if found is None:
-            raise BadInputError(f"The folder {path} holds no poses (transforms.json, a COLMAP model or poses_bounds.npy).")
+            raise BadInputError(f"The folder {path} holds no poses; give {POSE_FORMATS}.")
         return found
-    if path.suffix.lower() not in (".json", ".npy", ".xml"):
+    if path.suffix.lower() not in POSE_SUFFIXES:
         raise BadInputError(f"The poses {path} have an unknown format; give {POSE_FORMATS}.")
     return path
 

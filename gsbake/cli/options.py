@@ -191,7 +191,8 @@ PosesOption = Annotated[
         "--poses",
         parser=given_path,
         metavar="PATH",
-        help="Known poses: transforms.json, a COLMAP model folder, poses_bounds.npy, or Metashape's cameras as XML.",
+        help="Known poses: transforms.json, a COLMAP model folder, poses_bounds.npy, or cameras of Metashape (XML), RealityScan (CSV, "
+        "XMP), OpenSfM, OpenMVG or Polycam (JSON).",
         show_default=False,
     ),
 ]

@@ -1,4 +1,4 @@
-"""Pose files of strangers: transforms.json, Metashape XML, LLFF, COLMAP text and binary."""
+"""Pose files of strangers: transforms.json, OpenSfM, OpenMVG, Polycam, Metashape XML, RealityScan, LLFF, COLMAP text and binary."""
 
 from __future__ import annotations
 
@@ -49,6 +49,68 @@ def test_transforms(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
 
     documents = replaced_values(TRANSFORMS).map(lambda body: json.dumps(body).encode())
     fuzz(capsys, "transforms.json", st.one_of(documents, damaged([json.dumps(TRANSFORMS).encode(), b"[" * 5000, b"{}"])), check)
+
+
+LENS = {"projection_type": "brown", "width": 200, "height": 100, "focal_x": 0.8, "focal_y": 0.8, "c_x": 0.0, "k1": 0.01, "p1": 0.0}
+OPENSFM = [{
+    "cameras": {"lens": LENS},
+    "shots": {"a.jpg": {"rotation": [0.1, 0.2, 0.3], "translation": [1.0, 2.0, 3.0], "camera": "lens"}},
+    "points": {"1": {"coordinates": [1.0, 2.0, 3.0], "color": [1, 2, 3]}},
+}]  # fmt: skip
+VIEW = {"filename": "a.jpg", "local_path": "", "id_intrinsic": 0, "id_pose": 0}
+PINHOLE = {"width": 200, "height": 100, "focal_length": 150.0, "principal_point": [100.0, 50.0]}
+OPENMVG = {
+    "sfm_data_version": "0.3",
+    "views": [{"key": 0, "value": {"ptr_wrapper": {"data": VIEW}}}],
+    "intrinsics": [{"key": 0, "value": {"ptr_wrapper": {"data": {"value0": PINHOLE, "disto_k3": [0.1, 0.0, 0.0]}}}}],
+    "extrinsics": [{"key": 0, "value": {"rotation": np.eye(3).tolist(), "center": [1.0, 2.0, 3.0]}}],
+}
+POLYCAM = {
+    "fx": 150.0, "fy": 150.0, "cx": 100.0, "cy": 50.0, "width": 200, "height": 100,
+    **{f"t_{i}{j}": float(i == j) for i in range(3) for j in range(4)},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("name", "body"), [("reconstruction.json", OPENSFM), ("sfm_data.json", OPENMVG), ("cameras/a.json", POLYCAM)]
+)
+def test_json_of_other_programs(tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str, body: Any) -> None:
+    path = tmp_path / name
+    path.parent.mkdir(exist_ok=True)
+    poses = path.parent if path.parent != tmp_path else path
+
+    def check(data: bytes) -> GivenPoses | None:
+        path.write_bytes(data)
+        return check_poses(outcome(lambda: read_poses(poses, list(SIZES), SIZES), BadInputError))
+
+    assert check(json.dumps(body).encode()) is not None
+    documents = replaced_values(body).map(lambda changed: json.dumps(changed).encode())
+    fuzz(capsys, name, st.one_of(documents, damaged([json.dumps(body).encode(), b"[" * 5000, b"{}"])), check)
+
+
+REALITY_SCAN = {
+    "c.csv": b"#name,x,y,alt,heading,pitch,roll,f,px,py,k1,k2,k3,k4,t1,t2\na.jpg,1,2,3,10,20,30,42,0.01,0,0.01,0,0,0,0,0\n",
+    "a.xmp": (
+        b'<x xmlns:xcr="http://www.capturingreality.com/ns/xcr/1.1#" xcr:FocalLength35mm="42" xcr:DistortionModel="brown3">'
+        b"<xcr:Rotation>1 0 0 0 1 0 0 0 1</xcr:Rotation><xcr:Position>1 2 3</xcr:Position>"
+        b"<xcr:DistortionCoeficients>0.01 0 0 0 0 0</xcr:DistortionCoeficients></x>"
+    ),
+}
+
+
+@pytest.mark.parametrize("name", REALITY_SCAN)
+def test_reality_scan(tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str) -> None:
+    path, content = tmp_path / name, REALITY_SCAN[name]
+
+    def check(data: bytes) -> GivenPoses | None:
+        path.write_bytes(data)
+        poses = path if path.suffix == ".csv" else tmp_path
+        return check_poses(outcome(lambda: read_poses(poses, list(SIZES), SIZES), BadInputError))
+
+    assert check(content) is not None
+    numbers = st.tuples(st.sampled_from([b"42", b"0.01", b"1", b"2", b"3"]), odd_floats.map(lambda x: repr(x).encode()))
+    replaced = numbers.map(lambda pair: content.replace(pair[0], pair[1]))
+    fuzz(capsys, f"RealityScan {name}", st.one_of(replaced, damaged([content, b"", b"<a>" * 5000])), check)
 
 
 METASHAPE = (

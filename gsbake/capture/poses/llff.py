@@ -6,6 +6,7 @@ Its camera axes are (down, right, backwards).
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from tokenize import TokenError
@@ -49,7 +50,8 @@ def _load(path: Path, count: int) -> NDArray[np.float64]:
     """The array (count, 17) of the file, whose header is checked before the data are read."""
     check_file_size(path)
     try:
-        with path.open("rb") as file:
+        with path.open("rb") as file, warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # of headers written by Python 2
             version = np.lib.format.read_magic(file)
             read_header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
             shape, _, dtype = read_header(file)
@@ -57,6 +59,7 @@ def _load(path: Path, count: int) -> NDArray[np.float64]:
                 raise BadInputError(f"{path} holds an array of shape {shape} of {dtype}; LLFF poses have 17 numbers per photo.")
             if shape[0] != count:
                 raise BadInputError(f"{path} has {shape[0]} poses but there are {count} photos; use the photos the poses were made with.")
-        return np.asarray(np.load(path, allow_pickle=False), np.float64)
+            file.seek(0)
+            return np.asarray(np.load(file, allow_pickle=False), np.float64)
     except _HEADER_ERRORS as error:
         raise BadInputError(f"{path} cannot be read as a NumPy array ({' '.join(str(error).split())[:200]}).") from error

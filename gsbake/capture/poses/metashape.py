@@ -23,12 +23,9 @@ from xml.etree import ElementTree
 import numpy as np
 
 from gsbake.capture.poses.frames import GivenPoses, PhotoSize, checked_rigid, match_cameras
-from gsbake.capture.poses.validation import MAX_FRAMES, check_file_size
+from gsbake.capture.poses.validation import MAX_FRAMES, read_xml, refuse_coefficient
 from gsbake.errors import BadInputError
 from gsbake.geometry.cameras import Camera
-
-#: Largest effect in pixels at which a coefficient that is not supported is ignored.
-NEGLIGIBLE_PIXELS = 0.1
 
 
 def read_metashape(path: Path, sizes: Mapping[str, PhotoSize]) -> GivenPoses:
@@ -64,17 +61,7 @@ def read_metashape(path: Path, sizes: Mapping[str, PhotoSize]) -> GivenPoses:
 
 
 def _parse(path: Path) -> ElementTree.Element:
-    check_file_size(path)
-    try:
-        content = path.read_bytes()
-    except OSError as error:
-        raise BadInputError(f"{path} cannot be read ({error.strerror}).") from error
-    if b"<!DOCTYPE" in content or b"<!ENTITY" in content:  # Metashape writes none; entities may expand without end
-        raise BadInputError(f"{path} declares XML entities, which no file of Metashape cameras does; export the cameras again.")
-    try:
-        document = ElementTree.fromstring(content)  # nosec B314: without entities
-    except (ElementTree.ParseError, ValueError, LookupError) as error:
-        raise BadInputError(f"{path} is not a valid XML file ({' '.join(str(error).split())[:200]}).") from error
+    document = read_xml(path, "file of Metashape cameras")
     if document.tag != "document" or document.find("chunk") is None:
         raise BadInputError(f"{path} is no file of Metashape cameras; export the cameras as Agisoft XML.")
     return document
@@ -103,11 +90,7 @@ def _intrinsics(sensor: ElementTree.Element, name: str, path: Path) -> dict[str,
         fx, fy, cx, cy = value["fx"], value["fy"], value.get("cx", width / 2), value.get("cy", height / 2)
     corner = math.hypot(width, height) / 2 / max(min(fx, fy), 1e-9)  # tangent of the angle to the corner
     skew = value.get("b2", value.get("skew", 0.0))
-    for text, pixels in (("k4", value.get("k4", 0.0) * corner**9 * fx), ("b2", skew * corner)):
-        if not abs(pixels) < NEGLIGIBLE_PIXELS:
-            raise BadInputError(
-                f"The camera of frame {name} in {path} has a coefficient {text}, which is not supported; undistort the photos, or "
-                f"align them without {text}."
-            )
+    refuse_coefficient("k4", value.get("k4", 0.0) * corner**9 * fx, name, str(path))
+    refuse_coefficient("b2", skew * corner, name, str(path))
     k = tuple(value.get(key, 0.0) for key in ("k1", "k2", "p2", "p1", "k3"))
     return {"width": width, "height": height, "fx": fx, "fy": fy, "cx": cx, "cy": cy, "distortion": k if any(k) else ()}

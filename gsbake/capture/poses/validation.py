@@ -7,9 +7,10 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeVar
+from xml.etree import ElementTree
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
 from gsbake.errors import BadInputError
 
@@ -19,6 +20,8 @@ MAX_FILE_SIZE = 256 << 20
 MAX_COORDINATE = 1e9
 #: Most frames of a pose file.
 MAX_FRAMES = 100_000
+#: Largest effect in pixels at which a coefficient that is not supported is ignored.
+NEGLIGIBLE_PIXELS = 0.1
 
 Size = Annotated[float, Field(ge=1, le=200_000)]
 Focal = Annotated[float, Field(gt=0, le=1e7)]
@@ -55,6 +58,46 @@ def check_file_size(path: Path) -> None:
         raise BadInputError(f"{path} cannot be read ({error.strerror}).") from error
     if size > MAX_FILE_SIZE:
         raise BadInputError(f"{path} has {size / 1e6:.0f} MB; a pose file has at most {MAX_FILE_SIZE / 1e6:.0f} MB.")
+
+
+def read_file(path: Path) -> bytes:
+    """The content of a pose file. Raises BadInputError when it is too large or cannot be read."""
+    check_file_size(path)
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise BadInputError(f"{path} cannot be read ({error.strerror}).") from error
+
+
+_Body = TypeVar("_Body")
+
+
+def read_json(path: Path, kind: type[_Body], what: str) -> _Body:
+    """The content of a JSON file as `kind`, a model or a container of models. Raises BadInputError when it is no valid `what`."""
+    try:
+        return TypeAdapter(kind).validate_json(read_file(path))
+    except ValidationError as error:
+        raise BadInputError(f"{path} is not a valid {what} ({first_error(error)}).") from error
+
+
+def read_xml(path: Path, what: str) -> ElementTree.Element:
+    """The root of an XML file. Raises BadInputError when it is no XML, or declares entities, which may expand without end."""
+    content = read_file(path)
+    if b"<!DOCTYPE" in content or b"<!ENTITY" in content:
+        raise BadInputError(f"{path} declares XML entities, which no {what} does; export it again.")
+    try:
+        return ElementTree.fromstring(content)  # nosec B314: without entities
+    except (ElementTree.ParseError, ValueError, LookupError) as error:
+        raise BadInputError(f"{path} is not a valid XML file ({' '.join(str(error).split())[:200]}).") from error
+
+
+def refuse_coefficient(coefficient: str, pixels: float, frame: str, source: str) -> None:
+    """Raise BadInputError when a `coefficient` without equal here moves the corner of the photo by a visible number of `pixels`."""
+    if not abs(pixels) < NEGLIGIBLE_PIXELS:
+        raise BadInputError(
+            f"The camera of frame {frame} in {source} has a coefficient {coefficient}, which is not supported; undistort the photos, or "
+            f"align them without {coefficient}."
+        )
 
 
 def validate(model: type[Strict], values: Any, what: str) -> Any:

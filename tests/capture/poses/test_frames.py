@@ -126,6 +126,15 @@ def test_llff_by_hand(tmp_path: Path) -> None:
         read_poses(tmp_path / "poses_bounds.npy", ["0.jpg", "a.jpg", "b.jpg"], SIZES)
 
 
+def test_llff_of_python_2(tmp_path: Path) -> None:
+    """NumPy warns of headers with long integers, which is of no use to anybody here."""
+    path, rows = tmp_path / "poses_bounds.npy", np.zeros((1, 17))
+    rows[0, :15] = np.array([[0, 0, 1, 5, 100], [0, 1, 0, 0, 200], [-1, 0, 0, 1, 150]], float).ravel()
+    np.save(path, rows)
+    path.write_bytes(path.read_bytes().replace(b"(1, 17), }  ", b"(1L, 17L), }"))
+    assert read_poses(path, ["a.jpg"], SIZES).cameras["a.jpg"].centre == pytest.approx([5, 0, 1])
+
+
 def colmap_text(folder: Path, tx: str = "0") -> Path:
     """A text model with one camera that looks along −x from (5, 0, 1): world→camera rows are right +y, down −z, forward −x."""
     folder.mkdir(exist_ok=True)
