@@ -13,8 +13,9 @@ def run(ctx: Context) -> dict[str, Any]:
 
     options = PoseOptions(ctx.settings.poses, ctx.settings.skip.redundant_photos)
     return estimate_poses(
-        ctx.inputs["ingest"], ctx.out, options, seed=ctx.seed, threads=ctx.threads, scratch=ctx.checkpoint, monitor=ctx
-    )
+        ctx.inputs["ingest"], ctx.out, options,
+        seed=ctx.seed, threads=ctx.threads, scratch=ctx.checkpoint, cache=ctx.cache, monitor=ctx,
+    )  # fmt: skip
 
 
 STAGE = Stage(

@@ -55,6 +55,7 @@ def estimate_poses(
     seed: int = 0,
     threads: int = 2,
     scratch: Path | None = None,
+    cache: Path | None = None,
     monitor: Monitor = SILENT,
 ) -> dict[str, Any]:
     """Estimate the cameras of the photos in the artifact folder `ingest`, write the posed capture into `out`; return the figures.
@@ -62,12 +63,14 @@ def estimate_poses(
     Written: `cameras.json` (`CameraSet`, unit frame), `photos/`, `masks/` (pinhole), `points.ply` (tie points, unit frame; may be absent),
     `photo_masks/` (masks that were guessed, as the photos show them), `photo_cameras.json` (cameras of the photos before undistortion,
     world frame), `sparse/` (COLMAP binary model, input frame). `scratch` holds the database of COLMAP, from which an interrupted run
-    resumes. Raises BadInputError when too few photos register, or required poses are missing.
+    resumes; `cache` keeps features and matches, which a run with more photos uses again. Raises BadInputError when too few photos register,
+    or required poses are missing.
     """
     if scratch is None:
         with tempfile.TemporaryDirectory(prefix="gsbake-poses-") as folder:
-            return estimate_poses(ingest, out, options, seed=seed, threads=threads, scratch=Path(folder), monitor=monitor)
-    run = _Estimation(ingest, out, options or PoseOptions(), seed, threads, scratch, monitor)
+            scratch = Path(folder)
+            return estimate_poses(ingest, out, options, seed=seed, threads=threads, scratch=scratch, cache=cache, monitor=monitor)
+    run = _Estimation(ingest, out, options or PoseOptions(), seed, threads, scratch, cache, monitor)
     return run.run()
 
 
@@ -81,13 +84,14 @@ class _Estimation:
     seed: int
     threads: int
     scratch: Path
+    cache: Path | None
     monitor: Monitor
 
     def run(self) -> dict[str, Any]:
         """Execute all steps; returns the figures."""
         monitor = self.monitor
         entries: list[dict[str, Any]] = json.loads((self.ingest / "photos.json").read_text())["photos"]
-        solver = PoseSolver(self.ingest, entries, self.scratch, self.options.poses, self.seed, self.threads, monitor)
+        solver = PoseSolver(self.ingest, entries, self.scratch, self.options.poses, self.seed, self.threads, monitor, self.cache)
         given = self._use_given(len(entries))
         solved = solver.triangulate() if given else solver.solve()
         CameraSet(tuple(solved.cameras), poses="given" if given else "solved").save(self.out / "photo_cameras.json")

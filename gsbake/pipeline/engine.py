@@ -280,7 +280,9 @@ class Engine:
 
     def _job(self, stage: Stage, out: Path, inputs: Mapping[str, Path], checkpoint: Path) -> Job:
         """The worker's job: run `stage` on `inputs` and write into the folder `out`."""
-        request = self.request
+        request, cache = self.request, self.store.cache(stage.name)
+        with suppress(OSError):
+            os.utime(cache)  # for the garbage collection
         schema = type(request.profile)
         return Job(
             stage=self.registry.references[stage.name],
@@ -292,6 +294,7 @@ class Engine:
             threads=request.threads,
             device=request.device if stage.uses_device else "cpu",
             checkpoint=str(checkpoint.resolve()),
+            cache=str(cache.resolve()),
             output_folder=str(request.out),
             parent=os.getpid(),
         )

@@ -16,13 +16,13 @@ from pathlib import Path
 from gsbake.pipeline.files import remove_tree
 from gsbake.pipeline.key import KEY_PREFIX_LENGTH
 from gsbake.pipeline.lease import Lease, LeaseHolder
-from gsbake.pipeline.store import ARTIFACT_FOLDER, REPLACEMENT_PREFIX, Store
+from gsbake.pipeline.store import ARTIFACT_FOLDER, CACHE, REPLACEMENT_PREFIX, Store
 
 
 @dataclass(frozen=True)
 class Entry:
-    """A folder or file that may be deleted: its kind ("artifact", "checkpoint", "temporary folder", "lease"), size in bytes and the time of
-    its last use in seconds since the epoch."""
+    """A folder or file that may be deleted: its kind ("artifact", "checkpoint", "cache", "temporary folder", "lease"), size in bytes and
+    the time of its last use in seconds since the epoch."""
 
     path: Path
     stage: str
@@ -48,12 +48,12 @@ def list_entries(store: Store, stages: Iterable[str]) -> list[Entry]:
 def choose(entries: Iterable[Entry], keep: int | None = None, older: float | None = None, now: float | None = None) -> list[Entry]:
     """The entries to delete.
 
-    Temporary folders and leases without a live holder: always. Artifacts and checkpoints: those unused for `older` seconds, except the
-    newest artifact of each stage; then, least recently used first, until at most `keep` bytes are left.
+    Temporary folders and leases without a live holder: always. Artifacts, checkpoints and caches: those unused for `older` seconds, except
+    the newest artifact of each stage; then, least recently used first, until at most `keep` bytes are left.
     """
     entries, now = list(entries), time.time() if now is None else now
     chosen = [e for e in entries if e.kind in ("temporary folder", "lease")]
-    rest = sorted((e for e in entries if e.kind in ("artifact", "checkpoint")), key=lambda e: (e.newest, e.used))
+    rest = sorted((e for e in entries if e.kind in ("artifact", "checkpoint", "cache")), key=lambda e: (e.newest, e.used))
     if older is not None:
         chosen += [e for e in rest if not e.newest and now - e.used > older]
     if keep is not None:
@@ -100,6 +100,8 @@ def _entry(path: Path, stage: str) -> Entry | None:
         kind = "temporary folder"
     elif name.endswith(".checkpoint"):
         kind = "checkpoint"
+    elif name == CACHE:
+        kind = "cache"
     elif ARTIFACT_FOLDER.fullmatch(name):
         kind = "artifact"
     else:

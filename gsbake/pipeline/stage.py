@@ -24,6 +24,7 @@ class Context(Monitor, Protocol):
     threads: int
     device: str  # "cpu" or "cuda"
     checkpoint: Path  # folder that survives an interruption of this stage; deleted when the artifact is published
+    cache: Path  # folder, not made yet, for parts of the work that later runs of this stage use again; found by content, never needed
 
 
 @dataclass(frozen=True)

@@ -26,6 +26,8 @@ from gsbake.pipeline.files import remove_tree, sync_tree
 from gsbake.pipeline.key import KEY_PREFIX_LENGTH, CacheKey
 
 MANIFEST = "manifest.json"
+#: Name of the folder of parts of a stage's work that later runs use again.
+CACHE = "cache"
 REPLACEMENT = "replaced.json"
 #: Start of the folder name of the user's replacement of a stage's output.
 REPLACEMENT_PREFIX = "by-hand"
@@ -81,6 +83,10 @@ class Store:
     def checkpoint(self, stage: str, key: str) -> Path:
         """Folder that survives an interruption of the stage."""
         return self.stage_folder(stage) / f"{key[:KEY_PREFIX_LENGTH]}.checkpoint"
+
+    def cache(self, stage: str) -> Path:
+        """Folder of parts of the stage's work that outlive its artifacts; may be deleted at any time."""
+        return self.stage_folder(stage) / CACHE
 
     def look_up(self, cache_key: CacheKey) -> Lookup:
         """The artifact of a key, or what is wrong with the stored one."""

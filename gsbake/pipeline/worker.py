@@ -52,6 +52,7 @@ class Job:
     threads: int
     device: str
     checkpoint: str
+    cache: str
     output_folder: str  # the user's output folder, for messages
     parent: int  # process id of the supervisor
 
@@ -94,6 +95,7 @@ class WorkerContext:
         self.threads = job.threads
         self.device = job.device
         self.checkpoint = Path(job.checkpoint)
+        self.cache = Path(job.cache)
         self.parts: dict[str, float] = {}
         self._pipe = pipe
         self._stop = threading.Event()

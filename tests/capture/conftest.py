@@ -45,12 +45,13 @@ class Runner:
         return ingest(found.photos, done.out, options, masks=found.masks, poses=found.poses, monitor=done), done
 
     def poses(
-        self, redundant_photos: Rule = "auto", out: str = "poses", threads: int = 2, **settings: Any
+        self, redundant_photos: Rule = "auto", out: str = "poses", threads: int = 2, cache: Path | None = None, **settings: Any
     ) -> tuple[dict[str, Any], Done]:  # fmt: skip
         done, scratch = Done(self.root / out), self.root / f"scratch of {out}"
         scratch.mkdir(exist_ok=True)
         options = PoseOptions(Poses(**settings), redundant_photos)
-        return estimate_poses(self.root / "ingest", done.out, options, threads=threads, scratch=scratch, monitor=done), done
+        figures = estimate_poses(self.root / "ingest", done.out, options, threads=threads, scratch=scratch, cache=cache, monitor=done)
+        return figures, done
 
 
 @pytest.fixture

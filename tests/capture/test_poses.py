@@ -160,6 +160,32 @@ def test_too_few_given_poses(tmp_path: Path, runner: Runner) -> None:
         runner.poses()
 
 
+def test_more_photos_cost_their_own_features_and_matches(tmp_path: Path) -> None:
+    """With kept features and matches the result has the same bytes; damaged files are computed again."""
+    board_capture(tmp_path / "cap", 7)
+    last, aside, cache = tmp_path / "cap" / "images" / "b6.png", tmp_path / "b6.png", tmp_path / "cache"
+
+    def solve(run: str, kept: Path | None) -> tuple[tuple[int, int], bytes]:
+        runner = Runner(tmp_path / run)
+        runner.ingest(tmp_path / "cap")
+        figures, done = runner.poses(max_features=2000, cache=kept)
+        return (figures["photos_detected"], figures["pairs_matched"]), (done.out / "photo_cameras.json").read_bytes()
+
+    last.rename(aside)
+    assert solve("six", cache)[0] == (6, 15)
+    aside.rename(last)
+    alone, expected = solve("alone", None)
+    assert alone[1] == 21
+    counts, found = solve("seven", cache)
+    assert counts == (1, 6) and found == expected
+    for kind in ("features", "matches"):
+        damaged = sorted((cache / kind).iterdir())
+        damaged[0].write_bytes(damaged[0].read_bytes()[:-40])
+        damaged[1].write_bytes(b"")
+    counts, found = solve("damaged", cache)
+    assert counts == (2, 2) and found == expected
+
+
 def test_a_stop_kills_the_process(tmp_path: Path) -> None:
     (tmp_path / "images").mkdir()
     rng = np.random.default_rng(0)
@@ -168,7 +194,7 @@ def test_a_stop_kills_the_process(tmp_path: Path) -> None:
     lens = {"names": [f"p{i}" for i in range(6)], "width": 1200, "height": 900, "focal": None}
     (tmp_path / "work").mkdir()
     job = {
-        "task": "solve", "photos": str(tmp_path / "images"), "masks": None, "work": str(tmp_path / "work"), "lenses": [lens],
+        "task": "solve", "photos": str(tmp_path / "images"), "masks": None, "work": str(tmp_path / "work"), "lenses": [lens], "cache": None,
         "max_features": 8192, "peak_threshold": 0.001, "max_size": 1600, "fine": True, "threads": 1, "seed": 0, "matching": "exhaustive",
         "mapper": "incremental",
     }  # fmt: skip

@@ -63,6 +63,19 @@ def test_leftovers_go_and_the_users_files_stay(store: Store, tmp_path: Path) -> 
     assert [path.read_text() for path in folder.glob("by-hand-*/total.txt")] == ["42"]
 
 
+def test_the_cache_of_a_stage_goes_with_age_and_size(store: Store, photos: Path) -> None:
+    cache = store.cache("sum")
+    (cache / "features").mkdir(parents=True)
+    (cache / "features" / "a").write_bytes(bytes(1000))
+    os.utime(cache, (1.0, 1.0))
+    entry = next(e for e in list_entries(store, ("sum",)) if e.kind == "cache")
+    assert entry.size == 1000 and entry in choose([entry], older=86400) and entry in choose([entry], keep=999)
+    assert choose([entry], keep=1000) == []
+    engine(store.out, photos, Toy(read=Read(limit=2)))[0].run()  # a run of the stage is a use
+    assert choose(list_entries(store, ("sum",)), older=86400)[0].kind == "artifact"
+    assert delete([entry]) == [entry] and not cache.exists()
+
+
 def test_what_a_process_works_on_stays(store: Store) -> None:
     entry = list_entries(store, ("sum",))[0]
     lease = Lease(entry.path.with_name(f"{entry.path.name}.lease"))

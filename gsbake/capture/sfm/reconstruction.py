@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from gsbake.capture.sfm import pairs as pairing
 from gsbake.capture.sfm.colmap import pycolmap
+from gsbake.capture.sfm.feature_cache import Descriptors, FeatureCache, Keypoints, photo_key
 from gsbake.capture.sfm.matching import match_pairs
 
 Tick = Callable[[str, int, int], None]
@@ -61,7 +62,8 @@ class FeatureOptions:
 class SfmPipeline:
     """One SfM run: photos `folder/<name>.png`, masks `mask_folder/<name>.png.png`, database and models in `work`.
 
-    `seconds` holds the time of each part, `upsampled` whether the features include the finest octave.
+    `cache` keeps features and matches beyond the run. `seconds` holds the time of each part, `upsampled` whether the features include the
+    finest octave, `detected` the photos whose features and `matched` the number of pairs whose matches were computed.
     """
 
     folder: Path
@@ -72,8 +74,11 @@ class SfmPipeline:
     threads: int
     seed: int
     tick: Tick
+    cache: FeatureCache = field(default_factory=lambda: FeatureCache(None))
     seconds: dict[str, float] = field(default_factory=dict)
     upsampled: bool = False
+    detected: set[str] = field(default_factory=set)
+    matched: int = 0
 
     @property
     def database(self) -> Path:
@@ -109,20 +114,53 @@ class SfmPipeline:
         """Whether the finest octave is needed, measured by the features of three photos."""
         names = self.names
         sample = [names[i] for i in sorted({0, len(names) // 2, len(names) - 1})]
-        base_file = self.work / "probe.db"
         self.upsampled = False
-        pycolmap.extract_features(
-            str(base_file),
-            str(self.folder),
-            [f"{name}.png" for name in sample],
-            pycolmap.CameraMode.PER_IMAGE,
-            self._reader(),
-            self._extraction(),
-            pycolmap.Device.cpu,
-        )
-        with closing(pycolmap.Database.open(str(base_file))) as base:
+        probe = self.work / "probe.db"
+        pycolmap.Database.open(str(probe)).close()
+        self._detect(probe, sample, pycolmap.CameraMode.PER_IMAGE)
+        with closing(pycolmap.Database.open(str(probe))) as base:
             counts = [base.num_keypoints_for_image(image.image_id) for image in base.read_all_images()]
         return not counts or float(np.median(counts)) < min(ENOUGH_FEATURES, 0.5 * self.options.max_features)
+
+    def _keys(self, names: Sequence[str]) -> dict[str, str]:
+        """Keys of the features of photos by their names."""
+        o = self.options
+        detection = {
+            "pycolmap": pycolmap.__version__, "size": o.max_size, "count": o.max_features, "peak": o.peak_threshold, "fine": self.upsampled,
+        }  # fmt: skip
+        masks = self.mask_folder
+        return {
+            name: photo_key(self.folder / f"{name}.png", None if masks is None else masks / f"{name}.png.png", detection) for name in names
+        }
+
+    def _detect(self, database: Path, names: Sequence[str], mode: Any) -> None:
+        """Write the features of photos, which share a lens, into a database: kept ones, and those of the other photos."""
+        keys, files = self._keys(names), {name: f"{name}.png" for name in names}
+        # Photos get their identifiers in this order; extraction would number them as its threads finish, and everything after it depends
+        # on the numbers.
+        pycolmap.import_images(str(database), str(self.folder), mode, list(files.values()), self._reader())
+        with closing(pycolmap.Database.open(str(database))) as base:
+            absent = [name for name in names if not self._write_features(base, name, self.cache.features(keys[name]))]
+        if not absent:
+            return
+        self.detected.update(absent)
+        pycolmap.extract_features(
+            str(database), str(self.folder), [files[name] for name in absent], mode, self._reader(), self._extraction(), pycolmap.Device.cpu
+        )
+        with closing(pycolmap.Database.open(str(database))) as base:
+            for name in absent:
+                image = _image(base, name).image_id
+                self.cache.keep_features(keys[name], np.asarray(base.read_keypoints(image)), np.asarray(base.read_descriptors(image).data))
+
+    @staticmethod
+    def _write_features(base: Any, name: str, found: tuple[Keypoints, Descriptors] | None) -> bool:
+        """Write kept features of a photo; returns whether there are any."""
+        if found is None:
+            return False
+        image, (keypoints, descriptors) = _image(base, name).image_id, found
+        base.write_keypoints(image, keypoints)
+        base.write_descriptors(image, pycolmap.FeatureDescriptors(pycolmap.FeatureExtractorType.SIFT, descriptors))
+        return True
 
     def _reader(self) -> Any:
         reader = pycolmap.ImageReaderOptions()
@@ -144,16 +182,9 @@ class SfmPipeline:
         self._clear()
         with self._timed("features", len(self.names)):
             self.upsampled = self._needs_fine() if self.options.fine == "auto" else bool(self.options.fine)
-            options = self._extraction()
             pycolmap.Database.open(str(self.database)).close()
-            # Photos get their identifiers in this order; extraction would number them as its threads finish, and everything after it
-            # depends on the numbers.
             for lens in self.lenses:
-                files = [f"{name}.png" for name in lens.names]
-                pycolmap.import_images(str(self.database), str(self.folder), pycolmap.CameraMode.SINGLE, files, self._reader())
-                pycolmap.extract_features(
-                    str(self.database), str(self.folder), files, pycolmap.CameraMode.SINGLE, self._reader(), options, pycolmap.Device.cpu
-                )
+                self._detect(self.database, lens.names, pycolmap.CameraMode.SINGLE)
         with closing(pycolmap.Database.open(str(self.database))) as base:
             for lens in self.lenses:
                 camera = base.read_camera(_image(base, lens.names[0]).camera_id)
@@ -195,9 +226,17 @@ class SfmPipeline:
         """Match the pairs that are not in the database yet, and verify all that are not verified."""
         names = self.names
         with self._timed("matching", len(pairs)), closing(pycolmap.Database.open(str(self.database))) as base:
-            ids = {image.name: image.image_id for image in base.read_all_images()}
-            numbered = [(ids[f"{names[i]}.png"], ids[f"{names[j]}.png"]) for i, j in pairs]
-            missing = [pair for pair in numbered if not base.exists_matches(*pair)]
+            ids = {image.name.rsplit(".", 1)[0]: image.image_id for image in base.read_all_images()}
+            key = {ids[name]: key for name, key in self._keys(names).items()}
+            missing = []
+            for pair in ((ids[names[i]], ids[names[j]]) for i, j in pairs):
+                if base.exists_matches(*pair):
+                    continue
+                if (kept := self.cache.matches((key[pair[0]], key[pair[1]]))) is None:
+                    missing.append(pair)
+                else:
+                    base.write_matches(*pair, kept)
+            self.matched += len(missing)
 
             @lru_cache(maxsize=CACHED_PHOTOS)
             def descriptors(image: int) -> NDArray[np.uint8]:
@@ -205,6 +244,7 @@ class SfmPipeline:
 
             for done, (pair, matches) in enumerate(match_pairs(missing, descriptors, self.threads), len(pairs) - len(missing) + 1):
                 base.write_matches(*pair, matches)
+                self.cache.keep_matches((key[pair[0]], key[pair[1]]), matches)
                 self.tick("matching", done, len(pairs))
         with self._timed("verification", 1):
             verifier, geometry = pycolmap.GeometricVerifierOptions(), pycolmap.TwoViewGeometryOptions()

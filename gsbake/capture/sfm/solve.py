@@ -60,7 +60,8 @@ class _Attempt:
 
 @dataclass(frozen=True)
 class PoseSolver:
-    """Solver of one capture: the artifact folder `ingest`, its photo `entries`, and the folder `scratch` for COLMAP's files."""
+    """Solver of one capture: the artifact folder `ingest`, its photo `entries`, the folder `scratch` for COLMAP's files, and the folder
+    `cache` of features and matches that outlive the run, if any."""
 
     ingest: Path
     entries: Sequence[dict[str, Any]]
@@ -69,6 +70,7 @@ class PoseSolver:
     seed: int
     threads: int
     monitor: Monitor
+    cache: Path | None = None
 
     @property
     def folder(self) -> Path:
@@ -108,6 +110,8 @@ class PoseSolver:
             "matching": kind,
             "masked_features": found.masked,
             "fine_features": result["fine_features"],
+            "photos_detected": result["detected"],
+            "pairs_matched": result["matched"],
             "seconds": result["seconds"],
         }
         if found.folder != self.folder:
@@ -202,6 +206,7 @@ class PoseSolver:
             "photos": str(self.ingest / "photos"),
             "masks": None if masks is None else str(masks),
             "work": str(self.scratch / "colmap"),
+            "cache": None if self.cache is None else str(self.cache),
             "lenses": _lenses(entries),
             "max_features": options.max_features,
             "peak_threshold": options.peak_threshold,

@@ -22,6 +22,7 @@ import numpy as np
 from gsbake.capture.poses.colmap_model import camera_of, cloud
 from gsbake.capture.poses.up_axis import up_direction, upright_rotation
 from gsbake.capture.sfm.colmap import pycolmap
+from gsbake.capture.sfm.feature_cache import FeatureCache
 from gsbake.capture.sfm.pairs import exhaustive, neighbouring_views
 from gsbake.capture.sfm.reconstruction import FeatureOptions, Lens, SfmPipeline, registered_names
 from gsbake.errors import InterruptedRun
@@ -53,6 +54,7 @@ def _pipeline(job: Mapping[str, Any]) -> SfmPipeline:
         threads=job["threads"],
         seed=job["seed"],
         tick=_report_progress,
+        cache=FeatureCache(Path(job["cache"]) if job["cache"] else None),
     )
 
 
@@ -89,7 +91,8 @@ def solve(job: Mapping[str, Any]) -> dict[str, Any]:
         return {"registered": 0, "points": 0, "reprojection_px": None, "missing": pipeline.names, "seconds": pipeline.seconds}
     out = Path(job["out"])
     model.extract_colors_for_all_images(str(pipeline.folder))
-    return _write(model, out, pipeline, True) | {"seconds": pipeline.seconds}
+    figures = {"detected": len(pipeline.detected), "matched": pipeline.matched, "seconds": pipeline.seconds}
+    return _write(model, out, pipeline, True) | figures
 
 
 def _posed_model(base: Any, cameras: Mapping[str, Camera]) -> Any:
