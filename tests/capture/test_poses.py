@@ -151,6 +151,19 @@ def test_photos_of_unrelated_places(tmp_path: Path, runner: Runner) -> None:
         runner.poses(max_features=500)
 
 
+def test_steps_of_registration_are_reported(tmp_path: Path, runner: Runner) -> None:
+    """A photo of another place: weaker thresholds are tried, and the report says what they gained."""
+    board_capture(tmp_path / "cap")
+    noise = np.random.default_rng(0).integers(0, 255, (30, 40, 3), np.uint8)
+    photo = cv2.resize(noise, (320, 240), interpolation=cv2.INTER_CUBIC)
+    Image.fromarray(np.asarray(photo, np.uint8)).save(tmp_path / "cap" / "images" / "other.png")
+    runner.ingest(tmp_path / "cap")
+    results, done = runner.poses(max_features=2000, fine_features=True)
+    assert results["not_registered"] == ["other"]
+    line = done.line("registration")
+    assert "8 of 9 photos after 2 steps" in line and "strict thresholds, finest octave of features: 8, weaker thresholds" in line
+
+
 def test_too_few_given_poses(tmp_path: Path, runner: Runner) -> None:
     true = board_capture(tmp_path / "cap", 4)
     transforms(tmp_path / "cap", true[:2])

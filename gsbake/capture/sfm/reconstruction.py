@@ -63,7 +63,8 @@ class SfmPipeline:
     """One SfM run: photos `folder/<name>.png`, masks `mask_folder/<name>.png.png`, database and models in `work`.
 
     `cache` keeps features and matches beyond the run. `seconds` holds the time of each part, `upsampled` whether the features include the
-    finest octave, `detected` the photos whose features and `matched` the number of pairs whose matches were computed.
+    finest octave, `detected` the photos whose features and `matched` the number of pairs whose matches were computed, `steps` what was
+    tried in turn and how many photos the best model had after it.
     """
 
     folder: Path
@@ -79,6 +80,7 @@ class SfmPipeline:
     upsampled: bool = False
     detected: set[str] = field(default_factory=set)
     matched: int = 0
+    steps: list[tuple[str, int]] = field(default_factory=list)
 
     @property
     def database(self) -> Path:
@@ -323,28 +325,38 @@ class SfmPipeline:
 
     def solve(self, kind: str, mapper: str) -> Any | None:
         """The largest reconstruction found, or None. With fine "auto", a poor one is repeated with the finest octave of features."""
-        model = self._solve(kind, mapper)
+        model = self._solve(kind, mapper, None)
         if self.options.fine == "auto" and not self.upsampled and len(self.missing(model)) > MAX_UNREGISTERED_SHARE * len(self.names):
             self._clear()
             self.options.fine = True
-            model = largest([m for m in (model, self._solve(kind, mapper)) if m is not None])
+            model = self._solve(kind, mapper, model)
         return model
 
-    def _solve(self, kind: str, mapper: str) -> Any | None:
+    def _solve(self, kind: str, mapper: str, model: Any | None) -> Any | None:
+        """The largest of `model` and those of all steps with the present features."""
+
+        def tried(step: str, found: Any | None) -> Any | None:
+            best = largest([m for m in (model, found) if m is not None])
+            self.steps.append((f"{step}, finest octave of features" if self.upsampled else step, len(registered_names(best))))
+            return best
+
         self.features()
         marker = self.work / "matches.done"
         if not marker.exists():
             self.match(self.choose_pairs(kind))
             marker.touch()
-        model = self._global() if mapper == "global" else self._incremental(False, None)
-        missing = self.missing(model)
-        if missing and mapper != "global":
+        if mapper == "global":
+            return tried("global mapping", self._global())
+        first = self._incremental(False, None)
+        model = tried("strict thresholds", first)
+        missing = self.missing(first)
+        if missing:
             if kind != "exhaustive" and len(missing) <= max(10, len(self.names) // 4):
                 count = len(self.names)
                 self.match(sorted({(min(i, j), max(i, j)) for i in missing for j in range(count) if i != j}))
-            model = largest([m for m in (model, self._incremental(True, model)) if m is not None])
-            if len(self.missing(model)) > 0.2 * len(self.names):  # the strict model was poor: start over with relaxed thresholds
-                model = largest([m for m in (model, self._incremental(True, None)) if m is not None])
+            model = tried("weaker thresholds", self._incremental(True, first))
+            if len(self.missing(model)) > 0.2 * len(self.names):  # the strict model was poor
+                model = tried("weaker thresholds from the start", self._incremental(True, None))
         return model
 
 

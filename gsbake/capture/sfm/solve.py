@@ -97,6 +97,9 @@ class PoseSolver:
             self.monitor.warn(f"{len(missing)} of {len(names)} photos could not be registered and were dropped ({shortlist(missing)}).")
             if found.masked and len(missing) > (1 - MIN_PLACED_SHARE) * len(names):
                 self.monitor.warn("If they show the object in another position, too few of its features join both: bake each by itself.")
+        if len(result["steps"]) > 1:
+            gains = ", ".join(f"{step}: {photos}" for step, photos in result["steps"])
+            self.monitor.decide("registration", f"{count} of {len(names)} photos after {len(result['steps'])} steps", f"photos by {gains}")
         error = f"reprojection error {result['reprojection_px']:.2f} px"
         self.monitor.decide("structure from motion", f"{count} of {len(names)} photos registered", error)
         figures = {
