@@ -178,25 +178,26 @@ def test_more_photos_cost_their_own_features_and_matches(tmp_path: Path) -> None
     board_capture(tmp_path / "cap", 7)
     last, aside, cache = tmp_path / "cap" / "images" / "b6.png", tmp_path / "b6.png", tmp_path / "cache"
 
-    def solve(run: str, kept: Path | None) -> tuple[tuple[int, int], bytes]:
+    def solve(run: str, kept: Path | None) -> tuple[tuple[int, ...], bytes]:
         runner = Runner(tmp_path / run)
         runner.ingest(tmp_path / "cap")
         figures, done = runner.poses(max_features=2000, cache=kept)
-        return (figures["photos_detected"], figures["pairs_matched"]), (done.out / "photo_cameras.json").read_bytes()
+        counts = tuple(figures[name] for name in ("photos_detected", "pairs_matched", "pairs_verified"))
+        return counts, (done.out / "photo_cameras.json").read_bytes()
 
     last.rename(aside)
-    assert solve("six", cache)[0] == (6, 15)
+    assert solve("six", cache)[0] == (6, 15, 15)
     aside.rename(last)
     alone, expected = solve("alone", None)
-    assert alone[1] == 21
+    assert alone[1:] == (21, 21)
     counts, found = solve("seven", cache)
-    assert counts == (1, 6) and found == expected
-    for kind in ("features", "matches"):
+    assert counts == (1, 6, 6) and found == expected
+    for kind in ("features", "matches", "geometry"):
         damaged = sorted((cache / kind).iterdir())
         damaged[0].write_bytes(damaged[0].read_bytes()[:-40])
         damaged[1].write_bytes(b"")
     counts, found = solve("damaged", cache)
-    assert counts == (2, 2) and found == expected
+    assert counts == (2, 2, 2) and found == expected
 
 
 def test_a_stop_kills_the_process(tmp_path: Path) -> None:

@@ -1,8 +1,8 @@
-"""Features of photos and matches of pairs that outlive a run: adding ten photos to a capture costs the features and matches of ten photos.
+"""Features of photos, and matches and geometry of pairs, that outlive a run: adding ten photos to a capture costs those of ten photos.
 
 Entries are found by content. The key of a photo's features is a digest of the photo, its mask and the settings of the detection; that of
-matches is the digests of both photos. So an entry is what a new computation would give, and results do not depend on it. An entry that is
-missing, damaged or cannot be written costs time only.
+matches is the keys of both photos, that of their geometry also a digest of what it depends on. So an entry is what a new computation would
+give, and results do not depend on it. An entry that is missing, damaged or cannot be written costs time only.
 """
 
 from __future__ import annotations
@@ -66,6 +66,14 @@ class FeatureCache:
     def keep_matches(self, keys: tuple[str, str], matches: Matches) -> None:
         """Keep the matches of a pair."""
         self._save("matches", "-".join(keys), matches=matches)
+
+    def geometry(self, name: tuple[str, str, str]) -> dict[str, NDArray[Any]] | None:
+        """Arrays of the two-view geometry of a pair, named by the keys of both photos and a digest, or None."""
+        return self._load("geometry", "-".join(name)) or None
+
+    def keep_geometry(self, name: tuple[str, str, str], arrays: Mapping[str, NDArray[Any]]) -> None:
+        """Keep the two-view geometry of a pair."""
+        self._save("geometry", "-".join(name), **arrays)
 
     def _load(self, kind: str, name: str) -> dict[str, NDArray[Any]]:
         if self._folder is None:

@@ -24,6 +24,7 @@ from gsbake.capture.sfm import pairs as pairing
 from gsbake.capture.sfm.colmap import pycolmap
 from gsbake.capture.sfm.feature_cache import Descriptors, FeatureCache, Keypoints, photo_key
 from gsbake.capture.sfm.matching import match_pairs
+from gsbake.capture.sfm.verification import verify
 
 Tick = Callable[[str, int, int], None]
 
@@ -63,8 +64,8 @@ class SfmPipeline:
     """One SfM run: photos `folder/<name>.png`, masks `mask_folder/<name>.png.png`, database and models in `work`.
 
     `cache` keeps features and matches beyond the run. `seconds` holds the time of each part, `upsampled` whether the features include the
-    finest octave, `detected` the photos whose features and `matched` the number of pairs whose matches were computed, `steps` what was
-    tried in turn and how many photos the best model had after it.
+    finest octave, `detected` the photos whose features, `matched` and `verified` the number of pairs whose matches and geometry were
+    computed, `steps` what was tried in turn and how many photos the best model had after it.
     """
 
     folder: Path
@@ -80,6 +81,7 @@ class SfmPipeline:
     upsampled: bool = False
     detected: set[str] = field(default_factory=set)
     matched: int = 0
+    verified: int = 0
     steps: list[tuple[str, int]] = field(default_factory=list)
 
     @property
@@ -225,13 +227,13 @@ class SfmPipeline:
             return sorted({*pairing.sequential(count), *loops})
 
     def match(self, pairs: Sequence[pairing.Pair]) -> None:
-        """Match the pairs that are not in the database yet, and verify all that are not verified."""
+        """Match and verify the pairs that are not in the database yet."""
         names = self.names
         with self._timed("matching", len(pairs)), closing(pycolmap.Database.open(str(self.database))) as base:
             ids = {image.name.rsplit(".", 1)[0]: image.image_id for image in base.read_all_images()}
             key = {ids[name]: key for name, key in self._keys(names).items()}
-            missing = []
-            for pair in ((ids[names[i]], ids[names[j]]) for i, j in pairs):
+            numbered, missing = [(ids[names[i]], ids[names[j]]) for i, j in pairs], []
+            for pair in numbered:
                 if base.exists_matches(*pair):
                     continue
                 if (kept := self.cache.matches((key[pair[0]], key[pair[1]]))) is None:
@@ -249,10 +251,7 @@ class SfmPipeline:
                 self.cache.keep_matches((key[pair[0]], key[pair[1]]), matches)
                 self.tick("matching", done, len(pairs))
         with self._timed("verification", 1):
-            verifier, geometry = pycolmap.GeometricVerifierOptions(), pycolmap.TwoViewGeometryOptions()
-            verifier.num_threads = self.threads
-            geometry.ransac.random_seed = self.seed
-            pycolmap.geometric_verification(str(self.database), verifier, pycolmap.ExistingMatchedPairingOptions(), geometry)
+            self.verified += verify(self.database, numbered, key, self.cache, self.seed)
 
     def _mapper(self, relaxed: bool) -> Any:
         options = pycolmap.IncrementalPipelineOptions()

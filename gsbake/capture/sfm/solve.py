@@ -115,6 +115,7 @@ class PoseSolver:
             "fine_features": result["fine_features"],
             "photos_detected": result["detected"],
             "pairs_matched": result["matched"],
+            "pairs_verified": result["verified"],
             "seconds": result["seconds"],
         }
         if found.folder != self.folder:

@@ -91,7 +91,8 @@ def solve(job: Mapping[str, Any]) -> dict[str, Any]:
         return {"registered": 0, "points": 0, "reprojection_px": None, "missing": pipeline.names, "seconds": pipeline.seconds}
     out = Path(job["out"])
     model.extract_colors_for_all_images(str(pipeline.folder))
-    figures = {"detected": len(pipeline.detected), "matched": pipeline.matched, "steps": pipeline.steps, "seconds": pipeline.seconds}
+    counts = {"detected": len(pipeline.detected), "matched": pipeline.matched, "verified": pipeline.verified}
+    figures = counts | {"steps": pipeline.steps, "seconds": pipeline.seconds}
     return _write(model, out, pipeline, True) | figures
 
 

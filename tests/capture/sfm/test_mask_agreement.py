@@ -71,7 +71,7 @@ def answers(monkeypatch: pytest.MonkeyPatch) -> Callable[[Callable[[Mapping[str,
             cameras = cameras_of(job)
             CameraSet(tuple(cameras), poses="solved").save(out / "cameras.json")
             figures = {"reprojection_px": 0.4, "points": 100, "track_length": 4.0, "fine_features": False, "seconds": {}}
-            counts = {"detected": 0, "matched": 0, "steps": [["strict thresholds", len(cameras)]]}
+            counts = {"detected": 0, "matched": 0, "verified": 0, "steps": [["strict thresholds", len(cameras)]]}
             return {"registered": len(cameras), "missing": [], **counts, **figures}
 
         monkeypatch.setattr(solve, "run_job", run_job)
