@@ -42,7 +42,7 @@ def read_poses(path: Path, listing: Sequence[str], sizes: Mapping[str, PhotoSize
 
 def _read_json(path: Path, sizes: Mapping[str, PhotoSize]) -> GivenPoses:
     """Poses of a JSON file: OpenSfM writes a list, OpenMVG the version of its format first, all others a transforms.json."""
-    start = read_file(path)[:1000].lstrip()
+    start = read_file(path, 1000).lstrip()
     if start.startswith(b"[") and path.name != "transforms.json":
         return read_opensfm(path, sizes)
     return (read_openmvg if b'"sfm_data_version"' in start else read_transforms)(path, sizes)

@@ -60,11 +60,12 @@ def check_file_size(path: Path) -> None:
         raise BadInputError(f"{path} has {size / 1e6:.0f} MB; a pose file has at most {MAX_FILE_SIZE / 1e6:.0f} MB.")
 
 
-def read_file(path: Path) -> bytes:
-    """The content of a pose file. Raises BadInputError when it is too large or cannot be read."""
+def read_file(path: Path, most: int = -1) -> bytes:
+    """The content of a pose file, or its first `most` bytes. Raises BadInputError when it is too large or cannot be read."""
     check_file_size(path)
     try:
-        return path.read_bytes()
+        with path.open("rb") as file:
+            return file.read(most)
     except OSError as error:
         raise BadInputError(f"{path} cannot be read ({error.strerror}).") from error
 

@@ -69,7 +69,8 @@ class FeatureCache:
 
     def geometry(self, name: tuple[str, str, str]) -> dict[str, NDArray[Any]] | None:
         """Arrays of the two-view geometry of a pair, named by the keys of both photos and a digest, or None."""
-        return self._load("geometry", "-".join(name)) or None
+        found = self._load("geometry", "-".join(name))
+        return found if {"config", "matches", "angle"} <= found.keys() else None
 
     def keep_geometry(self, name: tuple[str, str, str], arrays: Mapping[str, NDArray[Any]]) -> None:
         """Keep the two-view geometry of a pair."""

@@ -83,6 +83,7 @@ class SfmPipeline:
     matched: int = 0
     verified: int = 0
     steps: list[tuple[str, int]] = field(default_factory=list)
+    _known_keys: dict[bool, dict[str, str]] = field(default_factory=dict)
 
     @property
     def database(self) -> Path:
@@ -127,15 +128,16 @@ class SfmPipeline:
         return not counts or float(np.median(counts)) < min(ENOUGH_FEATURES, 0.5 * self.options.max_features)
 
     def _keys(self, names: Sequence[str]) -> dict[str, str]:
-        """Keys of the features of photos by their names."""
+        """Keys of the features of photos by their names; each photo is read once."""
         o = self.options
         detection = {
             "pycolmap": pycolmap.__version__, "size": o.max_size, "count": o.max_features, "peak": o.peak_threshold, "fine": self.upsampled,
         }  # fmt: skip
-        masks = self.mask_folder
-        return {
-            name: photo_key(self.folder / f"{name}.png", None if masks is None else masks / f"{name}.png.png", detection) for name in names
-        }
+        known = self._known_keys.setdefault(self.upsampled, {})
+        for name in (name for name in names if name not in known):
+            mask = None if self.mask_folder is None else self.mask_folder / f"{name}.png.png"
+            known[name] = photo_key(self.folder / f"{name}.png", mask, detection)
+        return {name: known[name] for name in names}
 
     def _detect(self, database: Path, names: Sequence[str], mode: Any) -> None:
         """Write the features of photos, which share a lens, into a database: kept ones, and those of the other photos."""
