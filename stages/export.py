@@ -18,7 +18,7 @@ def run(ctx: Context) -> dict[str, Any]:
 
 STAGE = Stage(
     name="export",
-    version=4,
+    version=5,
     title="Asset",
     run=run,
     summary="{megabytes:MB}, {triangles} triangles, {texture_size}² texels",

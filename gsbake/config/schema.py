@@ -261,6 +261,7 @@ class Scale(Section):
     known_distances: tuple[KnownDistanceText, ...] = Field((), max_length=100, description="Distances between two points of the photos, as in \"A.jpg:120,80 B.jpg:640,410 8cm\": file and pixel of each point. A point that is not on the object is given in two photos or more, as in \"A.jpg:120,80+C.jpg:131,77\".")
     marker_size: float = Field(0.0, ge=0, le=100, description="Edge length in metres of the printed ArUco or AprilTag markers in the photos; 0 looks for none.")
     marker_dictionary: Literal["auto", "aruco-4x4", "aruco-5x5", "aruco-6x6", "aruco-7x7", "aruco-original", "apriltag-16h5", "apriltag-25h9", "apriltag-36h11"] = Field("auto", description="Dictionary of the markers; auto: the one of which most are seen.")
+    gps: bool = Field(True, description="Without markers and known distances: use the photos' GPS positions where they tell the scale to 5 %, as of photos taken over tens of metres.")
 
 
 class Export(Section):

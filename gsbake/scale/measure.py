@@ -1,4 +1,4 @@
-"""The metric scale of a capture, from printed markers and known distances, with its uncertainty."""
+"""The metric scale of a capture, from printed markers and known distances, else from GPS positions, with its uncertainty."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from gsbake.errors import BadInputError
 from gsbake.geometry.cameras import Camera, CameraSet, Similarity
 from gsbake.geometry.raycast import RayCaster
 from gsbake.monitor import SILENT, Monitor
+from gsbake.scale.gps import MAX_ERROR, gps_scale
 from gsbake.scale.markers import find_markers
 from gsbake.scale.triangulation import PICK_NOISE, PickedPhotos, Point, triangulate
 
@@ -44,13 +45,13 @@ def measure_scale(
     ingest: Path, poses: Path, options: Scale, surface: RayCaster | None = None, to_world: Similarity | None = None, *,
     monitor: Monitor = SILENT,
 ) -> MetricScale | None:  # fmt: skip
-    """The scale of the posed photos in the artifact folders `ingest` and `poses`; None where it is not asked for or no marker is seen.
+    """The scale of the posed photos in the artifact folders `ingest` and `poses`; None where nothing tells it.
 
     A point that one photo names lies on `surface`, whose frame `to_world` maps to the world. Raises BadInputError for points that cannot
     be determined.
     """
     if not options.known_distances and not options.marker_size:
-        return None
+        return _measure_gps(ingest, poses, monitor) if options.gps else None
     cameras = CameraSet.load(poses / "photo_cameras.json").cameras
     found = []
     if options.marker_size:
@@ -69,6 +70,25 @@ def measure_scale(
         if off > max(MAX_DISAGREEMENT, MAX_DEVIATION * item.relative_error):
             monitor.warn(f"The scale by {item.name} differs by {100 * off:.0f} % from that by all; check its points and its length.")
     return scale
+
+
+def _measure_gps(ingest: Path, poses: Path, monitor: Monitor) -> MetricScale | None:
+    """The scale of solved poses by the positions in EXIF, where it is known well enough; reports why not."""
+    entries = json.loads((ingest / "photos.json").read_text())["photos"]
+    positions = {entry["name"]: entry["gps"] for entry in entries if entry.get("gps")}
+    if not positions or not (poses / "photo_cameras.json").exists():  # cameras that the user put in their place have none
+        return None
+    posed = CameraSet.load(poses / "photo_cameras.json")
+    found = gps_scale(posed.cameras, positions) if posed.poses == "solved" else None
+    if found is None:
+        return None
+    evidence = f"GPS positions of {found.photos} photos"
+    if found.relative_error > MAX_ERROR:
+        why = f"{evidence} tell it to {found.relative_error:.0%} only, of {MAX_ERROR:.0%}"
+        monitor.decide("scale", "unknown", why)
+        return None
+    monitor.decide("scale", f"{found.metres:.5g} metres per unit ± {100 * found.relative_error:.2g} %", evidence)
+    return MetricScale(found.metres, found.relative_error, evidence)
 
 
 def _measure_markers(cameras: Sequence[Camera], ingest: Path, options: Scale, monitor: Monitor) -> list[_Measurement]:

@@ -9,7 +9,7 @@ from typing import Any
 
 from gsbake.capture.masks.matching import read_photo_mask
 from gsbake.capture.photos.decode import UnreadablePhotoError, read_header, read_photo, to_working_size
-from gsbake.capture.photos.exif import camera_key, focal_pixels
+from gsbake.capture.photos.exif import camera_key, focal_pixels, gps_position
 from gsbake.capture.photos.quality import Quality, measure_quality
 from gsbake.imaging.png import write_png
 
@@ -80,6 +80,7 @@ def convert(what: Conversion) -> ConvertedPhoto:
         "source_height": photo.height,
         "focal_px": None if focal is None else focal * max(width, height) / max(photo.width, photo.height),
         "camera_model": camera_key(photo.tags),
+        "gps": gps_position(photo.tags),
         "blur": quality.blur,
         "exposure": quality.exposure,
         "duplicate_of": None,

@@ -1,6 +1,6 @@
-"""Focal length in pixels from EXIF (CIPA DC-008, "Exif 2.32").
+"""Focal length in pixels, and the position by satellite navigation, from EXIF (CIPA DC-008, "Exif 2.32").
 
-The value only initialises structure from motion: photos get cropped and resized without an update of their EXIF.
+The focal length only initialises structure from motion: photos get cropped and resized without an update of their EXIF.
 """
 
 from __future__ import annotations
@@ -62,3 +62,21 @@ def camera_key(tags: Mapping[str, Any]) -> str:
     if focal is not None:
         parts.append(f"{focal:g} mm")
     return " ".join(part for part in parts if part)
+
+
+def gps_position(tags: Mapping[str, Any]) -> tuple[float, float, float] | None:
+    """Latitude and longitude in degrees and altitude in metres where a photo was taken; None where EXIF does not have all three."""
+    try:
+        latitude, longitude = (_degrees(tags[f"GPS:{name}"], str(tags[f"GPS:{name}Ref"])) for name in ("Latitude", "Longitude"))
+        altitude = float(tags["GPS:Altitude"]) * (-1 if tags.get("GPS:AltitudeRef") == 1 else 1)
+    except (KeyError, TypeError, ValueError, OverflowError):
+        return None
+    known = abs(latitude) <= 90 and abs(longitude) <= 180 and abs(altitude) < 1e5  # false for NaN
+    return (latitude, longitude, altitude) if known else None
+
+
+def _degrees(angle: Any, reference: str) -> float:
+    """An angle of degrees, minutes and seconds, negative in the South and in the West."""
+    degrees, minutes, seconds = (float(part) for part in angle)
+    value = degrees + minutes / 60 + seconds / 3600
+    return -value if reference.strip().upper()[:1] in ("S", "W") else value

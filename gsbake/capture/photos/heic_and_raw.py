@@ -24,7 +24,10 @@ _EXIF_TAGS = {
     0x920A: "Exif:FocalLength", 0xA405: "Exif:FocalLengthIn35mmFilm", 0xA20E: "Exif:FocalPlaneXResolution",
     0xA210: "Exif:FocalPlaneResolutionUnit", 0xA002: "Exif:PixelXDimension",
 }  # fmt: skip
-_EXIF_DIRECTORY = 0x8769
+_GPS_TAGS = {
+    1: "GPS:LatitudeRef", 2: "GPS:Latitude", 3: "GPS:LongitudeRef", 4: "GPS:Longitude", 5: "GPS:AltitudeRef", 6: "GPS:Altitude",
+}  # fmt: skip
+_EXIF_DIRECTORY, _GPS_DIRECTORY = 0x8769, 0x8825
 
 
 class MissingReaderError(Exception):
@@ -82,6 +85,17 @@ def _exif_tags(data: bytes | None) -> dict[str, Any]:
         found = {name: exif.get(number) for number, name in _IMAGE_TAGS.items()}
         directory = exif.get_ifd(_EXIF_DIRECTORY)
         found |= {name: directory.get(number) for number, name in _EXIF_TAGS.items()}
+        directory = exif.get_ifd(_GPS_DIRECTORY)
+        found |= {name: directory.get(number) for number, name in _GPS_TAGS.items()}
+        return {name: _plain(value) for name, value in found.items() if value is not None}
     except Exception:  # damaged metadata does not make the photo unusable
         return {}
-    return {name: value if isinstance(value, str) else float(value) for name, value in found.items() if value is not None}
+
+
+def _plain(value: Any) -> str | float | tuple[float, ...]:
+    """A tag's value without Pillow's types; a byte is a number."""
+    if isinstance(value, str):
+        return value
+    if isinstance(value, bytes):
+        return float(value[0])
+    return tuple(map(float, value)) if isinstance(value, tuple) else float(value)
