@@ -31,7 +31,8 @@ POSE_SUFFIXES = frozenset({".json", ".npy", ".xml", ".csv"})
 _MODEL_FILES = ("cameras.bin", "cameras.txt")
 _MODEL_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse")
 #: Further pose files and folders of a folder that the user names for its poses.
-_NAMED_POSES = ("reconstruction.json", "sfm_data.json", *(f"{a}{b}" for a in ("", "keyframes/") for b in ("corrected_cameras", "cameras")))
+_POLYCAM_FOLDERS = ("corrected_cameras", "cameras")
+_NAMED_POSES = ("reconstruction.json", "sfm_data.json", *_POLYCAM_FOLDERS, *(f"keyframes/{name}" for name in _POLYCAM_FOLDERS))
 
 
 @dataclass(frozen=True)
@@ -111,9 +112,10 @@ def _given_poses(path: Path) -> Path:
     if not path.exists():
         raise BadInputError(f"The poses {path} do not exist; give {POSE_FORMATS}.")
     if path.is_dir():
-        if is_colmap_model(path) or has_xmp(path) or (path.name in _NAMED_POSES and any(path.glob("*.json"))):
-            return path
-        found = find_poses(path) or next((path / name for name in _NAMED_POSES if (path / name).exists()), None)
+        found = path if is_colmap_model(path) else find_poses(path)
+        if found is None and (has_xmp(path) or (path.name in _POLYCAM_FOLDERS and any(path.glob("*.json")))):
+            found = path
+        found = found or next((path / name for name in _NAMED_POSES if (path / name).exists()), None)
         if found is None:
             raise BadInputError(f"The folder {path} holds no poses; give {POSE_FORMATS}.")
         return found

@@ -45,6 +45,17 @@ def test_named_folders_override(tmp_path: Path) -> None:
     assert found == Sources(tmp_path / "images", tmp_path / "m", tmp_path / "p/poses_bounds.npy")
 
 
+def test_poses_of_a_named_folder(tmp_path: Path) -> None:
+    """XMP files are poses only where there are no others: photo editors write them beside photos as well."""
+    touch(tmp_path / "images/a.jpg", tmp_path / "xmp/a.xmp", tmp_path / "both/a.XMP", tmp_path / "both/transforms.json")
+    touch(tmp_path / "sfm/reconstruction.json", tmp_path / "scan/keyframes/cameras/1.json")
+    assert discover(tmp_path, poses=tmp_path / "xmp").poses == tmp_path / "xmp"
+    assert discover(tmp_path, poses=tmp_path / "both").poses == tmp_path / "both/transforms.json"
+    assert discover(tmp_path, poses=tmp_path / "sfm").poses == tmp_path / "sfm/reconstruction.json"
+    for named in (tmp_path / "scan", tmp_path / "scan/keyframes", tmp_path / "scan/keyframes/cameras"):
+        assert discover(tmp_path, poses=named).poses == tmp_path / "scan/keyframes/cameras"
+
+
 @pytest.mark.parametrize(
     ("make", "words"),
     [
