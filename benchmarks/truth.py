@@ -151,16 +151,6 @@ def read_centres(path: Path) -> dict[str, Array]:
     return {c.name: cameras.to_world.apply(c.centre) for c in cameras.cameras}
 
 
-def fit_similarity(source: Array, target: Array) -> Similarity:
-    """Least-squares similarity from `source` (n, 3) to `target` (n, 3) (Umeyama 1991)."""
-    mean_s, mean_t = source.mean(0), target.mean(0)
-    left, spread, right = np.linalg.svd((target - mean_t).T @ (source - mean_s))
-    handed = np.array([1.0, 1.0, np.sign(np.linalg.det(left @ right))])
-    rotation = (left * handed) @ right
-    scale = float((spread * handed).sum() / ((source - mean_s) ** 2).sum())
-    return Similarity(scale, rotation, mean_t - scale * rotation @ mean_s)
-
-
 def fit_robustly(source: Array, target: Array) -> Similarity:
     """Similarity between matched points (n, 3), n ≥ 3, with outliers (wrong camera poses).
 
@@ -172,10 +162,10 @@ def fit_robustly(source: Array, target: Array) -> Similarity:
 
     draw = np.random.default_rng(0)
     triples = [draw.choice(len(source), 3, replace=False) for _ in range(TRIPLE_COUNT)]
-    frame = min((fit_similarity(source[t], target[t]) for t in triples), key=lambda f: float(np.median(residuals(f))))
+    frame = min((Similarity.between(source[t], target[t]) for t in triples), key=lambda f: float(np.median(residuals(f))))
     for _ in range(3):
         good = residuals(frame) <= max(3 * float(np.median(residuals(frame))), 1e-9)
-        frame = fit_similarity(source[good], target[good])
+        frame = Similarity.between(source[good], target[good])
     return frame
 
 
@@ -201,7 +191,7 @@ def align(surface: Surface, centres: Mapping[str, Array], truth: Truth) -> Simil
     for _ in range(30):
         far, nearest = tree.query(frame.apply(points))
         close = far < max(reach, float(np.quantile(far, 0.7)))
-        frame = fit_similarity(points[close], anchors[nearest[close]])
+        frame = Similarity.between(points[close], anchors[nearest[close]])
         reach *= 0.85
     return frame
 

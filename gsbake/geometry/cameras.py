@@ -27,6 +27,17 @@ class Similarity:
     rotation: Array = field(default_factory=lambda: np.eye(3))
     translation: Array = field(default_factory=lambda: np.zeros(3))
 
+    @staticmethod
+    def between(source: Array, target: Array) -> Similarity:
+        """The least-squares similarity from `source` (n, 3) to `target` (n, 3), whose points differ (Umeyama, *Least-squares estimation of
+        transformation parameters between two point patterns*, PAMI 1991)."""
+        mean_s, mean_t = source.mean(0), target.mean(0)
+        left, spread, right = np.linalg.svd((target - mean_t).T @ (source - mean_s))
+        handed = np.array([1.0, 1.0, np.sign(np.linalg.det(left @ right))])
+        rotation = (left * handed) @ right
+        scale = float((spread * handed).sum() / ((source - mean_s) ** 2).sum())
+        return Similarity(scale, rotation, mean_t - scale * rotation @ mean_s)
+
     def apply(self, points: Array) -> Array:
         """Map points (..., 3) from the source to the target frame."""
         return self.scale * points @ self.rotation.T + self.translation

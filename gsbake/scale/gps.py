@@ -1,8 +1,7 @@
 """The metric scale by satellite navigation: cameras against the positions in EXIF.
 
 A receiver is off by metres, so that a capture of a small object says nothing; photos taken over tens of metres, as by a drone, give the
-scale to a few percent. The similarity is the least-squares one (Umeyama, *Least-squares estimation of transformation parameters between
-two point patterns*, PAMI 1991), and its residuals give the error of the scale.
+scale to a few percent. The residuals of the least-squares similarity give the error of its scale.
 """
 
 from __future__ import annotations
@@ -12,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gsbake.geometry.cameras import Array, Camera
+from gsbake.geometry.cameras import Array, Camera, Similarity
 
 #: Fewest photos with a position, and largest relative standard deviation of a scale that is used.
 MIN_PHOTOS, MAX_ERROR = 6, 0.05
@@ -46,13 +45,12 @@ def gps_scale(cameras: Sequence[Camera], positions: Mapping[str, Sequence[float]
     if len(known) < MIN_PHOTOS:
         return None
     centres = np.stack([camera.centre for camera in known])
-    b = local_metres(np.array([positions[camera.name] for camera in known], float))
-    a, b = centres - centres.mean(0), b - b.mean(0)
-    u, s, vt = np.linalg.svd(b.T @ a)
-    sign = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vt)) or 1.0])
-    spread = float((a * a).sum())
-    if spread <= 1e-12 * max(1.0, float((centres * centres).sum())) or not (metres := float((s * sign).sum()) / spread) > 0:
+    spread = float(np.linalg.norm(centres - centres.mean(0)))
+    if spread <= 1e-6 * max(1.0, float(np.linalg.norm(centres))):
         return None
-    residual = b - metres * a @ (u @ np.diag(sign) @ vt).T
-    deviation = float(np.sqrt((residual**2).sum() / (3 * len(known) - 7)))
-    return GpsScale(metres, max(deviation / (metres * spread**0.5), 1e-4), len(known))
+    metres = local_metres(np.array([positions[camera.name] for camera in known], float))
+    fitted = Similarity.between(centres, metres)
+    if not fitted.scale > 0:
+        return None
+    deviation = float(np.linalg.norm(fitted.apply(centres) - metres)) / (3 * len(known) - 7) ** 0.5
+    return GpsScale(fitted.scale, max(deviation / (fitted.scale * spread), 1e-4), len(known))

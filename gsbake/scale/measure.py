@@ -63,8 +63,7 @@ def measure_scale(
             found.append(_measure_distance(parse_known_distance(text), picked, surface, to_world or Similarity()))
     if not found:
         return None
-    scale = _combine(found)
-    monitor.decide("scale", f"{scale.metres:.5g} metres per unit ± {100 * scale.relative_error:.2g} %", scale.evidence)
+    scale = _reported(_combine(found), monitor)
     for item in found:
         off = abs(item.metres / scale.metres - 1)
         if off > max(MAX_DISAGREEMENT, MAX_DEVIATION * item.relative_error):
@@ -84,11 +83,15 @@ def _measure_gps(ingest: Path, poses: Path, monitor: Monitor) -> MetricScale | N
         return None
     evidence = f"GPS positions of {found.photos} photos"
     if found.relative_error > MAX_ERROR:
-        why = f"{evidence} tell it to {found.relative_error:.0%} only, of {MAX_ERROR:.0%}"
-        monitor.decide("scale", "unknown", why)
+        monitor.decide("scale", "unknown", f"{evidence} tell it to {found.relative_error:.0%}, not to {MAX_ERROR:.0%}")
         return None
-    monitor.decide("scale", f"{found.metres:.5g} metres per unit ± {100 * found.relative_error:.2g} %", evidence)
-    return MetricScale(found.metres, found.relative_error, evidence)
+    return _reported(MetricScale(found.metres, found.relative_error, evidence), monitor)
+
+
+def _reported(scale: MetricScale, monitor: Monitor) -> MetricScale:
+    """The scale itself, after a report of it."""
+    monitor.decide("scale", f"{scale.metres:.5g} metres per unit ± {100 * scale.relative_error:.2g} %", scale.evidence)
+    return scale
 
 
 def _measure_markers(cameras: Sequence[Camera], ingest: Path, options: Scale, monitor: Monitor) -> list[_Measurement]:

@@ -14,7 +14,6 @@ from benchmarks.truth import (
     Surface,
     Truth,
     align,
-    fit_similarity,
     measure,
     measure_aligned,
     measure_file,
@@ -122,7 +121,7 @@ def test_a_mesh_in_another_frame_is_aligned_with_the_ground_truth() -> None:
 def test_similarity_has_no_reflection() -> None:
     rng = np.random.default_rng(1)
     points = rng.normal(size=(20, 3))
-    found = fit_similarity(points, points * [1, 1, -1])
+    found = Similarity.between(points, points * [1, 1, -1])
     assert np.linalg.det(found.rotation) == pytest.approx(1)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from gsbake.capture.poses.frames import GivenPoses, PhotoSize
@@ -15,12 +15,6 @@ from gsbake.capture.poses.reality_scan import read_reality_scan_csv, read_realit
 from gsbake.capture.poses.transforms_json import read_transforms
 from gsbake.capture.poses.validation import read_file
 from gsbake.capture.sources import has_xmp, is_colmap_model
-
-#: Readers of files by suffix; JSON files are distinguished by their content.
-_READERS: dict[str, Callable[[Path, Mapping[str, PhotoSize]], GivenPoses]] = {
-    ".xml": read_metashape,
-    ".csv": read_reality_scan_csv,
-}
 
 
 def read_poses(path: Path, listing: Sequence[str], sizes: Mapping[str, PhotoSize]) -> GivenPoses:
@@ -37,7 +31,11 @@ def read_poses(path: Path, listing: Sequence[str], sizes: Mapping[str, PhotoSize
         return read_model(path, sizes)
     if path.suffix.lower() == ".npy":
         return read_llff(path, listing, sizes)
-    return _READERS.get(path.suffix.lower(), _read_json)(path, sizes)
+    if path.suffix.lower() == ".xml":
+        return read_metashape(path, sizes)
+    if path.suffix.lower() == ".csv":
+        return read_reality_scan_csv(path, sizes)
+    return _read_json(path, sizes)
 
 
 def _read_json(path: Path, sizes: Mapping[str, PhotoSize]) -> GivenPoses:

@@ -17,12 +17,11 @@ import numpy as np
 from pydantic import Field
 
 from gsbake.capture.poses.frames import GivenPoses, PhotoSize, checked_rigid, match_cameras
-from gsbake.capture.poses.validation import MAX_FRAMES, Coefficient, Coordinate, Focal, Principal, Size, Strict, read_json
+from gsbake.capture.poses.validation import MAX_FRAMES, Coefficient, Focal, Principal, Size, Strict, Vector, read_json
 from gsbake.errors import BadInputError
 from gsbake.geometry.cameras import Camera
 
 _Body = TypeVar("_Body")
-_Vector = Annotated[list[Coordinate], Field(min_length=3, max_length=3)]
 
 
 class _Pointer(Strict, Generic[_Body]):
@@ -46,20 +45,16 @@ class _View(Strict):
 
 
 class _Pinhole(Strict):
-    width: Size
-    height: Size
-    focal_length: Focal | None = None
-    principal_point: Annotated[list[Principal], Field(min_length=2, max_length=2)] | None = None
-
-
-class _Lens(Strict):
-    """A camera, whose pinhole stands in `value0` or, in older files, beside its distortion."""
-
-    value0: _Pinhole | None = None
     width: Size | None = None
     height: Size | None = None
     focal_length: Focal | None = None
     principal_point: Annotated[list[Principal], Field(min_length=2, max_length=2)] | None = None
+
+
+class _Lens(_Pinhole):
+    """A camera, whose pinhole stands in `value0` or, in older files, beside its distortion."""
+
+    value0: _Pinhole | None = None
     disto_k1: Annotated[list[Coefficient], Field(min_length=1, max_length=1)] | None = None
     disto_k3: Annotated[list[Coefficient], Field(min_length=3, max_length=3)] | None = None
     disto_t2: Annotated[list[Coefficient], Field(min_length=5, max_length=5)] | None = None
@@ -67,8 +62,8 @@ class _Lens(Strict):
 
 
 class _Pose(Strict):
-    rotation: Annotated[list[_Vector], Field(min_length=3, max_length=3)]
-    center: _Vector
+    rotation: Annotated[list[Vector], Field(min_length=3, max_length=3)]
+    center: Vector
 
 
 class _SfmData(Strict):

@@ -16,14 +16,12 @@ from pydantic import Field
 from scipy.spatial.transform import Rotation
 
 from gsbake.capture.poses.frames import GivenPoses, PhotoSize, checked_rigid, match_cameras
-from gsbake.capture.poses.validation import MAX_FRAMES, Coefficient, Coordinate, Focal, Size, Strict, read_json
+from gsbake.capture.poses.validation import MAX_FRAMES, Coefficient, Focal, Size, Strict, Vector, read_json
 from gsbake.errors import BadInputError
 from gsbake.geometry.cameras import Camera
 
 #: Models with one focal length, and models with two and a principal point.
 _MODELS = ("perspective", "simple_radial", "radial", "brown")
-
-_Vector = Annotated[list[Coordinate], Field(min_length=3, max_length=3)]
 
 
 class _Lens(Strict):
@@ -43,13 +41,13 @@ class _Lens(Strict):
 
 
 class _Shot(Strict):
-    rotation: _Vector
-    translation: _Vector
+    rotation: Vector
+    translation: Vector
     camera: str
 
 
 class _Point(Strict):
-    coordinates: _Vector
+    coordinates: Vector
     color: Annotated[list[Annotated[float, Field(ge=0, le=255)]], Field(min_length=3, max_length=3)]
 
 

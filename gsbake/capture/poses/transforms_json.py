@@ -24,8 +24,8 @@ from gsbake.capture.poses.validation import (
     Principal,
     Size,
     Strict,
-    check_file_size,
     first_error,
+    read_file,
 )
 from gsbake.errors import BadInputError
 from gsbake.geometry.cameras import Camera
@@ -117,13 +117,10 @@ def read_transforms(path: Path, sizes: Mapping[str, PhotoSize]) -> GivenPoses:
     Raises BadInputError for an invalid file, a value that is not finite or out of bounds, a matrix that is no rigid motion, and a fisheye
     camera.
     """
-    check_file_size(path)
     try:
-        body = _Transforms.model_validate_json(path.read_bytes())
+        body = _Transforms.model_validate_json(read_file(path))
     except ValidationError as error:
         raise BadInputError(f"{_frame_name(error)}{path} is not a valid transforms.json ({first_error(error)}).") from error
-    except OSError as error:
-        raise BadInputError(f"{path} cannot be read ({error.strerror}).") from error
     frames, index = [], PhotoIndex(sizes)
     for frame in body.frames:
         file, rows = frame.file_path, frame.transform_matrix

@@ -29,6 +29,7 @@ Principal = Annotated[float, Field(ge=-1e6, le=1e6)]
 Angle = Annotated[float, Field(gt=0, lt=math.pi)]
 Coefficient = Annotated[float, Field(ge=-1e3, le=1e3)]
 Coordinate = Annotated[float, Field(ge=-MAX_COORDINATE, le=MAX_COORDINATE)]
+Vector = Annotated[list[Coordinate], Field(min_length=3, max_length=3)]
 
 
 class Strict(BaseModel):
