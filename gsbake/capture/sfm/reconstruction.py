@@ -2,7 +2,8 @@
 
 Steps: SIFT features, pair selection, matching (`sfm.matching`), verification of matches by two-view geometry, mapping in two passes. The
 first pass uses strict thresholds; photos that it does not register are matched with all others and registered to its model under relaxed
-thresholds. Runs in the process of `sfm.worker`. The same photos and seed give the same bytes with any number of threads.
+thresholds. Where photos are still missing, models that mapping left apart are merged (`sfm.merging`). Runs in the process of `sfm.worker`.
+The same photos and seed give the same bytes with any number of threads.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from gsbake.capture.sfm import pairs as pairing
 from gsbake.capture.sfm.colmap import pycolmap
 from gsbake.capture.sfm.feature_cache import Descriptors, FeatureCache, Keypoints, photo_key
 from gsbake.capture.sfm.matching import match_pairs
+from gsbake.capture.sfm.merging import merge_all
 from gsbake.capture.sfm.verification import verify
 
 Tick = Callable[[str, int, int], None]
@@ -84,6 +86,7 @@ class SfmPipeline:
     verified: int = 0
     steps: list[tuple[str, int]] = field(default_factory=list)
     _known_keys: dict[bool, dict[str, str]] = field(default_factory=dict)
+    _models: list[Any] = field(default_factory=list)  # all that incremental mapping found
 
     @property
     def database(self) -> Path:
@@ -304,7 +307,15 @@ class SfmPipeline:
                 input_path=str(initial_folder) if initial is not None else "",
                 next_image_callback=registered,
             )
+        self._models += models.values()
         return largest(list(models.values()))
+
+    def _merged(self, model: Any) -> Any:
+        """`model` with all other models that can be tied to it, and photos that then register to it."""
+        others = [other for other in self._models if other is not model]
+        with self._timed("mapping", len(self.names)):
+            merged = merge_all(model, others, self.database, self.folder, self.work / "merged", self.seed)
+        return merged if merged is model or not self.missing(merged) else self._incremental(True, merged)
 
     def _global(self) -> Any | None:
         """The largest model of global mapping."""
@@ -341,6 +352,7 @@ class SfmPipeline:
             self.steps.append((f"{step}, finest octave of features" if self.upsampled else step, len(registered_names(best))))
             return best
 
+        self._models.clear()  # features of one kind have numbers of their own
         self.features()
         marker = self.work / "matches.done"
         if not marker.exists():
@@ -358,6 +370,8 @@ class SfmPipeline:
             model = tried("weaker thresholds", self._incremental(True, first))
             if len(self.missing(model)) > 0.2 * len(self.names):  # the strict model was poor
                 model = tried("weaker thresholds from the start", self._incremental(True, None))
+            if len(self._models) > 1 and self.missing(model) and any(model is found for found in self._models):
+                model = tried("merging of models", self._merged(model))
         return model
 
 
