@@ -36,6 +36,7 @@ from gsbake.materials import fit_kernel
 from gsbake.materials.bilateral import EdgeAwareFilter
 from gsbake.materials.emission import find_emission
 from gsbake.materials.fit_surface import FitSurface, Fitted
+from gsbake.materials.intensity_prior import IntensityPrior
 from gsbake.materials.light_intensity import LightAdjustment, adjust_radiance, search_light
 from gsbake.materials.linear_shading import PhotoSamples
 from gsbake.materials.metallic import find_metals
@@ -145,7 +146,7 @@ class MaterialFit:
                 self._adjustments.append(self._search_light(batches, generator, tint, rough=not self._adjustments))
                 update_common = True
             if step in {int(share * steps) for share in schedule.light_scaled_at} and not self.mostly_dielectric:
-                self._scale_light_to_metals()
+                self._scale_light()
             if not schedule.diffuse and step in {int(share * steps) for share in schedule.metal_searches_at}:
                 self._search_metals(batches)
                 update_common = True
@@ -246,7 +247,7 @@ class MaterialFit:
         """Search for the light's intensity and contrast and for a roughness shift, apply them, and adapt base colours."""
         o, values = self._options, self._values
         if not self.mostly_dielectric:
-            return self._scale_light_to_metals()
+            return self._scale_light()
         dielectric = self._dielectric()
         share = min(1.0, o.intensity_pixels / max(1, sum(map(len, batches))))
         chosen = dielectric & (generator.random(len(dielectric)) < share)
@@ -270,8 +271,7 @@ class MaterialFit:
             lights, texels = PhotoLights(light.radiance()), TexelInputs.of(values, transport)
             return [b.samples(texels, lights.tables(b.to_light)) for b in subset]
 
-        mean_base = float(np.exp(np.log(values[dielectric, :3].max(1) + o.log_offset).mean()))
-        found = search_light(samples_under, values[:, 3].copy(), tint, rough, mean_base)
+        found = search_light(samples_under, values[:, 3].copy(), tint, rough, self._intensity_prior())
         if found.improvement <= 0:
             return found
         values[dielectric, 3] = found.shifted_roughness(values[dielectric, 3])
@@ -331,14 +331,14 @@ class MaterialFit:
         """The mesh's unit normals (n, 3) at the texels."""
         return self._normal / np.maximum(np.linalg.norm(self._normal, axis=1, keepdims=True), 1e-12)
 
+    def _intensity_prior(self) -> IntensityPrior:
+        """The prior of the light's intensity under the present materials."""
+        return IntensityPrior.of(self._values, self._dielectric(), None if self.mostly_dielectric else self._mean_radiance())
+
     @torch.no_grad()
-    def _scale_light_to_metals(self) -> LightAdjustment:
-        """Scale the light and base colours so that metals are as bright as metals usually are: their reflections leave the scale open."""
-        o, metal = self._options, self._values[:, 4] > 0.5
-        if not metal.any():
-            return LightAdjustment(np.ones(3), 1.0, 0.0, 0.0)
-        bright = float(np.quantile(self._values[metal, :3].max(1), o.metal_quantile))
-        factor = np.clip(o.metal_base_color / max(bright, o.min_base_color), 1 / o.max_metal_factor, o.max_metal_factor)
+    def _scale_light(self) -> LightAdjustment:
+        """Scale the light to the intensity expected by the prior, and base colours with it: reflections of metal leave the scale open."""
+        o, factor = self._options, 1 / self._intensity_prior().mean_factor()
         self._light.raw.copy_(EnvironmentLight.from_radiance(self._radiance() / np.float32(factor)).raw)
         self._adam_light.state.clear()
         new = self._values[:, :5].copy()

@@ -19,11 +19,10 @@ reweighting, so that misplaced reflections do not decide. Residuals are of sRGB 
 sharp reflection that is misplaced by a few pixels would otherwise favour a darker light, by regression dilution (Fuller, *Measurement
 Error Models*, 1987).
 
-On rough materials reflections hardly tell the intensity, and the residual is flat over a factor of three. There a prior decides: the
-logarithms of mean base colours of objects follow Student's t with two degrees of freedom (some objects are black), and the residuals count
-as `OBSERVATIONS` independent ones of a Laplace distribution, so with z = log(mean / TYPICAL_BASE_COLOUR) / SPREAD
+On rough materials reflections hardly tell the intensity, and the residual is flat over a factor of three. There a prior decides
+(`intensity_prior`). The residuals count as `OBSERVATIONS` independent ones of a Laplace distribution:
 
-    −log p = OBSERVATIONS · log residual + 3/2 log(1 + z²/2)
+    −log p = OBSERVATIONS · log residual − log prior
 """
 
 from __future__ import annotations
@@ -36,6 +35,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from gsbake.materials.intensity_prior import IntensityPrior
 from gsbake.materials.linear_shading import BaseColourSolver, LinearShading, PhotoSamples
 
 Floats = NDArray[np.float64]
@@ -52,8 +52,6 @@ TINT_FACTOR = 1.1
 LIMITS = (3.0, 2.0, 3.0)
 #: Relative decrease of the residual that a step must bring; a step with more roughness; the result of the second search.
 MIN_DECREASE, MIN_ROUGHER_DECREASE, MIN_SECOND_DECREASE = 0.002, 0.01, 0.03
-#: Prior of the geometric mean of an object's base colours (strongest channel): median, and scale of the logarithm.
-TYPICAL_BASE_COLOUR, SPREAD = 0.3, 0.66
 #: Number of independent residuals that evidence for the intensity counts as: errors of the model are shared by all pixels.
 OBSERVATIONS = 10.0
 #: Costs below this are noise.
@@ -105,13 +103,13 @@ def search_light(
     roughness: NDArray[np.float32],
     tint: bool = True,
     rough: bool = True,
-    mean_base: float | None = None,
+    prior: IntensityPrior | None = None,
 ) -> LightAdjustment:
     """The intensity of each colour channel, the contrast and the roughness shift with the lowest residual.
 
     `samples` gives the pixels of all photos under the environment of an intensity (3,) and a contrast; `roughness` (n,) is that of the
     texels. Without `tint` the ratio of the channels is fixed. Without `rough` the roughness is fixed; with it, a second search starts at
-    `SECOND_START`. With `mean_base`, the geometric mean of present base colours (strongest channel), their prior counts as well.
+    `SECOND_START`. A `prior` of the intensity counts as well.
     """
     residuals: dict[_Candidate, Floats] = {}
     lit: dict[tuple[float, ...], Sequence[PhotoSamples]] = {}
@@ -125,8 +123,8 @@ def search_light(
         return residuals[candidate]
 
     def cost(candidate: _Candidate) -> float:
-        z = 0.0 if mean_base is None else float(np.log(mean_base / candidate.brightness / TYPICAL_BASE_COLOUR)) / SPREAD
-        return float(residual(candidate).sum() * (1 + z * z / 2) ** (1.5 / OBSERVATIONS))
+        open_to_prior = 0.0 if prior is None else prior.negative_log(candidate.brightness)
+        return float(residual(candidate).sum() * math.exp(open_to_prior / OBSERVATIONS))
 
     def descend(best: _Candidate) -> _Candidate:
         moved = True

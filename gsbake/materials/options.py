@@ -107,12 +107,6 @@ class FitOptions:
     min_dielectric_share: float = 0.5
     #: Photos that take part in it where the light moves: each has tables of its own.
     moving_light_photos: int = 12
-    #: Else this quantile of the strongest channel of metals' base colours is set to the following value, changed at most by the factor.
-    metal_quantile: float = 0.5
-    metal_base_color: float = 0.4
-    max_metal_factor: float = 4.0
-    #: Added to base colours before logarithms are averaged: black places do not decide.
-    log_offset: float = 0.01
     #: Texels below this metallic take part as dielectric.
     max_dielectric_metallic: float = 0.3
     #: Searches that include the light's tint on a diffuse object: its reflections hardly determine the tint, which then drifts.
