@@ -1,7 +1,8 @@
-"""Edge-aware filter on the surface: averages of texel values that stop at edges of the texture's colour.
+"""Edge-aware filter on the surface: averages of texel values that stop at edges of the texture's appearance.
 
 The average u of values f solves (1 + L) u = f, where L is the Laplacian of the graph of neighbouring texels, across seams included; edge
-weights fall with the change of colour. Two by two texels are one node; the system is factored once and solved for every f.
+weights fall with the change of appearance, such as colour. Two by two texels are one node; the system is factored once and solved for
+every f.
 
 Farbman, Fattal, Lischinski & Szeliski, *Edge-preserving decompositions for multi-scale tone and detail manipulation*, SIGGRAPH 2008
 (weighted least squares).
@@ -16,14 +17,11 @@ import scipy.sparse
 import scipy.sparse.linalg
 from numpy.typing import NDArray
 
-from gsbake.imaging.srgb import encode
 from gsbake.texturing.texels import Texels
 
-#: Radius of the filter on a uniform colour, in texels.
+#: Radius of the filter on a uniform surface, in texels.
 FILTER_RADIUS = 60.0
-#: Change of colour (sRGB, sum of channels) between adjacent texels that is as far as the whole radius.
-COLOUR_SCALE = 0.3
-#: Width in texels of the smoothing of colours before they are compared: fine patterns are one material.
+#: Width in texels of the smoothing of appearance before they are compared: fine patterns are one material.
 PREFILTER_WIDTH = 2.0
 #: Variance, in square texels, that averaging a texel with its four neighbours adds along either axis.
 AVERAGING_VARIANCE = 0.4
@@ -32,10 +30,13 @@ NODE_SIZE = 2
 
 
 class EdgeAwareFilter:
-    """The filter on `texels` with linear `colour` (n, 3) and neighbouring `pairs` (m, 2)."""
+    """The filter on `texels` with an `appearance` (n, c) of any channels and neighbouring `pairs` (m, 2).
 
-    def __init__(self, texels: Texels, pairs: NDArray[np.int64], colour: NDArray[Any]) -> None:
-        smooth = _prefiltered(encode(np.clip(np.asarray(colour, np.float32), 0, 1)), pairs)
+    A change by `scale`, summed over channels, between adjacent texels is as far as the whole radius.
+    """
+
+    def __init__(self, texels: Texels, pairs: NDArray[np.int64], appearance: NDArray[np.float32], scale: float) -> None:
+        smooth = _prefiltered(appearance, pairs)
         row, column = np.divmod(texels.index, texels.size)
         self._node = np.unique(row // NODE_SIZE * texels.size + column // NODE_SIZE, return_inverse=True)[1]
         size = np.bincount(self._node)
@@ -43,7 +44,7 @@ class EdgeAwareFilter:
         edge = np.sort(self._node[pairs], axis=1)
         edge = np.unique(edge[edge[:, 0] != edge[:, 1]], axis=0)
         change = np.abs(smooth[edge[:, 0]] - smooth[edge[:, 1]]).sum(1) / NODE_SIZE
-        weight = (FILTER_RADIUS / (1 + FILTER_RADIUS / COLOUR_SCALE * change)) ** 2
+        weight = (FILTER_RADIUS / (1 + FILTER_RADIUS / scale * change)) ** 2
         graph = _symmetric(edge, weight, len(size))
         degree = scipy.sparse.diags(np.asarray(graph.sum(1)).ravel() + size)
         # The matrix is symmetric and diagonally dominant: no pivoting is needed.
@@ -52,7 +53,7 @@ class EdgeAwareFilter:
         )
 
     def __call__(self, values: NDArray[Any]) -> NDArray[np.float64]:
-        """`values` (n,) averaged over the neighbourhood of similar colour of each texel."""
+        """`values` (n,) averaged over the neighbourhood of similar appearance of each texel."""
         return np.asarray(self._factor.solve(np.bincount(self._node, np.asarray(values, np.float64)))[self._node])
 
 

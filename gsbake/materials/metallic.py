@@ -15,8 +15,9 @@ outweighing the other pixels. Pixels clipped at white are lower bounds, and wher
 
 A metal must reflect clearly more of every channel than the 4 % of dielectrics, else glossy black would pass for a dark metal: clean metals
 reflect a third or more (gold's blue is .34: Lagarde & de Rousiers, *Moving Frostbite to PBR*, 2014), rusty, anodised and dirty ones go down
-to .1. A texel has too few pixels to decide by itself: likelihoods are averaged over neighbours of similar colour (`bilateral`), and
-isolated texels follow the majority around them.
+to .1. A texel has too few pixels to decide by itself: likelihoods are averaged over neighbours of similar appearance (`bilateral`), and
+isolated texels follow the majority around them. Neighbours of nearly the same fitted material come first; where even they do not tell, a
+wider neighbourhood of similar photos does, in which narrow metal between wood of its colour would be outvoted.
 """
 
 from __future__ import annotations
@@ -30,6 +31,8 @@ from numpy.typing import NDArray
 from gsbake.materials.linear_shading import CLIPPED, BaseColourSolver, LinearShading, PhotoSamples, observed_weight
 
 Floats = NDArray[np.float64]
+#: A filter of values (texels,).
+Average = Callable[[Floats], Floats]
 
 #: Roughnesses tried beside a texel's own.
 TRIED_ROUGHNESS = (0.1, 0.2, 0.35, 0.55)
@@ -39,6 +42,8 @@ MAX_METAL_ROUGHNESS = 0.6
 MIN_METAL_ALBEDO = 0.1
 #: Share of metal among similar neighbours above which a texel is metal: removes isolated texels and fills isolated gaps.
 MAJORITY = 0.5
+#: Mean log-likelihood ratio per pixel from which the nearer neighbourhood decides.
+CLEAR_EVIDENCE = 2.0
 #: Noise of sRGB values (0..1), and degrees of freedom of Student's t distribution of their errors.
 NOISE, DEGREES_OF_FREEDOM = 0.01, 3.0
 #: Standard deviation of normals, as a length added to the unit normal along each tangent.
@@ -83,27 +88,31 @@ class ShadingModel:
         return np.asarray(np.bincount(samples.texel, samples.weight * nll.sum(1), len(base)), np.float64)
 
 
-def majority_vote(metal: NDArray[np.bool_], decided: NDArray[np.bool_], average: Callable[[Floats], Floats]) -> NDArray[np.bool_]:
+def _itself(values: Floats) -> Floats:
+    return values
+
+
+def majority_vote(metal: NDArray[np.bool_], decided: NDArray[np.bool_], average: Average) -> NDArray[np.bool_]:
     """Which of the `decided` (n,) texels have a majority of `metal` (n,) among decided neighbours, weighed by the filter `average`."""
     share = average((metal & decided).astype(np.float64))
     return np.asarray(decided & (share > MAJORITY * average(decided.astype(np.float64))))
 
 
-def find_metals(
-    photos: Sequence[PhotoSamples], own: NDArray[np.float32], average: Callable[[Floats], Floats] = lambda values: values
-) -> MetalTexels:
+def find_metals(photos: Sequence[PhotoSamples], own: NDArray[np.float32], near: Average = _itself, wide: Average = _itself) -> MetalTexels:
     """The texels better explained as metal; `own` (texels,) is their present roughness.
 
-    `average` filters values (texels,) over similar neighbours, which decide together.
+    `near` and `wide` filter values (texels,) over a smaller and a larger neighbourhood of each texel, which decides together.
     """
     texels = len(own)
     dielectric, metal = _compare_models(photos, own)
     telling = [replace(e, weight=e.weight * (e.colour < CLIPPED).any(1)) for e in photos]
-    visible = sum((average((np.bincount(e.texel, e.weight, texels) > 0).astype(np.float64)) > MIN_PHOTO_SHARE for e in telling),
+    visible = sum((wide((np.bincount(e.texel, e.weight, texels) > 0).astype(np.float64)) > MIN_PHOTO_SHARE for e in telling),
                   np.zeros(texels, int))  # fmt: skip
     decided = (observed_weight(telling, texels) > MIN_WEIGHT) & (visible >= MIN_PHOTOS)
-    better = np.asarray(average(metal.cost - dielectric.cost) < 0)
-    is_metal = majority_vote(better, decided, average)
+    difference = metal.cost - dielectric.cost
+    evidence = near(difference) / np.maximum(near(observed_weight(photos, texels)), 1e-6)
+    better = np.where(np.abs(evidence) > CLEAR_EVIDENCE, evidence, wide(difference)) < 0
+    is_metal = majority_vote(better, decided, near)
     chosen, others = np.flatnonzero(is_metal), np.flatnonzero(decided & ~is_metal)
     rest = others, dielectric.base[others], dielectric.roughness[others]
     return MetalTexels(chosen, metal.base[chosen], metal.roughness[chosen], rest)

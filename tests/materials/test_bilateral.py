@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from gsbake.imaging.srgb import encode
 from gsbake.materials.adjacency import neighbours
 from gsbake.materials.bilateral import FILTER_RADIUS, EdgeAwareFilter
 from gsbake.texturing.texels import Texels, rasterise
 
-SIZE = 64
+SIZE, SCALE = 64, 0.3
 
 
 def chart(*corners: tuple[float, float]) -> Texels:
@@ -28,7 +29,8 @@ def make_filter(texels: Texels, colour: NDArray[Any], apart: float = 0.0) -> Edg
     """The filter of a texture on a plane, with its right half moved to the right by `apart`."""
     row, column = np.divmod(texels.index, SIZE)
     at = np.column_stack([column + apart * (column >= SIZE / 2), row, np.zeros(len(row))]).astype(float)
-    return EdgeAwareFilter(texels, neighbours(texels, at, np.tile([0.0, 0.0, 1.0], (len(row), 1))), colour)
+    appearance = encode(np.asarray(colour, np.float32))
+    return EdgeAwareFilter(texels, neighbours(texels, at, np.tile([0.0, 0.0, 1.0], (len(row), 1))), appearance, SCALE)
 
 
 def two_colours(texels: Texels, left: float, right: float) -> NDArray[np.float32]:
@@ -68,8 +70,19 @@ def test_decay_on_a_uniform_colour_follows_the_radius() -> None:
     strip = rasterise(np.array([(0, 0.4), (1, 0.4), (1, 0.5), (0, 0.5)]), np.array([[0, 1, 2], [0, 2, 3]]), 256)
     row, column = np.divmod(strip.index, 256)
     at = np.column_stack([column, row, np.zeros(len(row))]).astype(float)
-    filter_ = EdgeAwareFilter(strip, neighbours(strip, at, np.tile([0.0, 0.0, 1.0], (len(row), 1))), np.full((len(row), 3), 0.5))
+    filter_ = EdgeAwareFilter(strip, neighbours(strip, at, np.tile([0.0, 0.0, 1.0], (len(row), 1))), np.full((len(row), 3), 0.5), SCALE)
     filtered = filter_((column == 128).astype(float))
     # (1 − FILTER_RADIUS² ∂²) u = δ with reflecting boundaries 127 texels away
     fall = np.cosh((127 - 10) / FILTER_RADIUS) / np.cosh((127 - 40) / FILTER_RADIUS)
     assert filtered[column == 138].mean() / filtered[column == 168].mean() == pytest.approx(fall, rel=0.02)
+
+
+def test_a_smaller_scale_stops_at_weaker_edges() -> None:
+    """Two colours of which the wide filter makes one neighbourhood, and the near one two."""
+    texels = chart((0.1, 0.1))
+    left = texels.index % SIZE < 0.3 * SIZE
+    at = np.column_stack([texels.index % SIZE, texels.index // SIZE, np.zeros(len(left))]).astype(float)
+    pairs = neighbours(texels, at, np.tile([0.0, 0.0, 1.0], (len(left), 1)))
+    appearance = np.repeat(np.where(left, 0.5, 0.42)[:, None], 3, 1).astype(np.float32)
+    wide, near = (EdgeAwareFilter(texels, pairs, appearance, scale)(left.astype(float))[~left].mean() for scale in (0.3, 0.02))
+    assert near < 0.5 * wide

@@ -131,7 +131,28 @@ def test_neighbours_decide_together(wall: Wall) -> None:
 
     for few, many, found in ((metal, dielectric, 0), (dielectric, metal, TEXELS)):
         mixed = [replace(m, colour=np.where(np.arange(TEXELS)[:, None] == 7, f.colour, m.colour)) for f, m in zip(few, many, strict=True)]
-        assert len(find_metals(mixed, own, global_sum).texel) == found
+        assert len(find_metals(mixed, own, global_sum, global_sum).texel) == found
+
+
+def test_near_neighbours_decide_where_they_tell(wall: Wall) -> None:
+    """Twenty texels of metal among many dielectrics of their colour: their own neighbourhood finds them; where it cannot tell, which is
+    simulated by evidence that cancels out, all decide together."""
+    gold = np.tile(np.array([1.0, 0.77, 0.34], np.float32), (TEXELS, 1))
+    own, few = np.full(TEXELS, 0.2, np.float32), np.arange(TEXELS) < TEXELS // 8
+    metal, dielectric = wall.photos(gold, 0.2, 1.0), wall.photos(gold, 0.2, 0.0)
+    mixed = [replace(m, colour=np.where(few[:, None], m.colour, d.colour)) for m, d in zip(metal, dielectric, strict=True)]
+
+    def everywhere(values: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.full(TEXELS, values.mean())
+
+    def kind(values: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.where(few, values[few].mean(), values[~few].mean())
+
+    def untold(values: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.zeros(TEXELS) if values.min() < 0 else everywhere(values)  # votes and weights are not negative, likelihood ratios are
+
+    assert np.array_equal(find_metals(mixed, own, kind, everywhere).texel, np.flatnonzero(few))
+    assert len(find_metals(mixed, own, untold, everywhere).texel) == 0
 
 
 def test_majority_vote_removes_isolated_texels() -> None:
