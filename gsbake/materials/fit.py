@@ -276,7 +276,7 @@ class MaterialFit:
             lights, texels = PhotoLights(light.radiance()), TexelInputs.of(values, transport)
             return [b.samples(texels, lights.tables(b.to_light)) for b in subset]
 
-        found = search_light(samples_under, values[:, 3].copy(), tint, rough, self._intensity_prior())
+        found = search_light(samples_under, values[:, 3].copy(), tint, rough, self.intensity_prior(with_light=False))
         if found.improvement <= 0:
             return found
         values[dielectric, 3] = found.shifted_roughness(values[dielectric, 3])
@@ -336,14 +336,14 @@ class MaterialFit:
         """The mesh's unit normals (n, 3) at the texels."""
         return self._normal / np.maximum(np.linalg.norm(self._normal, axis=1, keepdims=True), 1e-12)
 
-    def _intensity_prior(self) -> IntensityPrior:
-        """The prior of the light's intensity under the present materials."""
-        return IntensityPrior.of(self._values, self._dielectric(), None if self.mostly_dielectric else self._mean_radiance())
+    def intensity_prior(self, with_light: bool) -> IntensityPrior:
+        """The prior of the present intensity of the light by the base colours of dielectrics, `with_light` by metals and the light too."""
+        return IntensityPrior.of(self._values, self._dielectric(), self._mean_radiance() if with_light else None)
 
     @torch.no_grad()
     def _scale_light(self) -> LightAdjustment:
         """Scale the light to the intensity expected by the prior, and base colours with it: reflections of metal leave the scale open."""
-        o, factor = self._options, 1 / self._intensity_prior().mean_factor()
+        o, factor = self._options, 1 / self.intensity_prior(with_light=True).mean_factor()
         self._light.raw.copy_(EnvironmentLight.from_radiance(self._radiance() / np.float32(factor)).raw)
         self._adam_light.state.clear()
         new = self._values[:, :5].copy()

@@ -7,17 +7,21 @@ not fitted to. On the way `MaterialFit` decides texel by texel between metal and
 close to the best are continued with all searches, on the coarse level, and compared again.
 
 They are compared by a robust error: a sharp reflection a few pixels off counts twice in the squared error, where it is and where it should
-be, so that the PSNR prefers materials that are too rough. Where both kinds explain the photos, the object is dielectric, as most are.
+be, so that the PSNR prefers materials that are too rough. Fits that started with another roughness often explain the photos as well, by a
+brighter or a dimmer light: there its prior decides (`intensity_prior`). Where both kinds explain the photos, the object is dielectric, as
+most are.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
 from gsbake.materials.fit import MaterialFit
 from gsbake.materials.fit_surface import Fitted
 from gsbake.materials.levels import FitLevel
+from gsbake.materials.light_intensity import OBSERVATIONS
 from gsbake.materials.options import FitSchedule
 
 #: Compared starts: metallic and roughness.
@@ -93,15 +97,20 @@ def best_fit(trials: Trials, level: FitLevel, plan: FitSchedule, each: Each) -> 
     errors = {start: _error(fitted) for start, (_, fitted) in trials.items()}
     evidence = _percent(errors) if len(errors) > 1 else ("diffuse object" if plan.diffuse else "no validation photos")
     found = {start: (trials[start][0], trials[start][0].run(level.fitted, level.held_out, plan, each)) for start in candidates(errors)}
-    continued = {start: _error(fitted) for start, (_, fitted) in found.items()}
+    continued = {start: _error(fitted) * _prior_factor(fit) for start, (fit, fitted) in found.items()}
     best = min(continued, key=lambda start: continued[start] * (1 - METAL_MARGIN if start[0] < 0.5 else 1))
     if len(continued) > 1:
-        evidence += f"; continued: {_percent(continued)}"
+        evidence += f"; continued, with the prior of the light: {_percent(continued)}"
     return ChosenFit(*found[best], *best, len(continued), evidence)
 
 
 def _error(fitted: Fitted) -> float:
     return fitted.held_out_loss or 0.0
+
+
+def _prior_factor(fit: MaterialFit) -> float:
+    """Factor on the error of a fit by the prior of its light's intensity, as in the search for that."""
+    return math.exp(fit.intensity_prior(with_light=True).negative_log(1) / OBSERVATIONS)
 
 
 def _percent(errors: dict[Start, float]) -> str:

@@ -20,14 +20,22 @@ from gsbake.materials.initialisation import (
     candidates,
     trial_fits,
 )
+from gsbake.materials.intensity_prior import RADIANCE, IntensityPrior
 from gsbake.materials.options import FitSchedule
 
 
 class Fit:
-    """A fit with the validation error `error` that records its schedules, and whether shading was removed before the first."""
+    """A fit with the validation error `error` under a light of mean `radiance` that records its schedules, and whether shading was removed
+    before the first."""
 
-    def __init__(self, error: float, runs: list[FitSchedule], mostly_dielectric: bool = True) -> None:
+    def __init__(
+        self, error: float, runs: list[FitSchedule], mostly_dielectric: bool = True, radiance: float = RADIANCE[0]
+    ) -> None:  # fmt: skip
         self._error, self._runs, self.mostly_dielectric, self.without_shading = error, runs, mostly_dielectric, False
+        self._radiance = radiance
+
+    def intensity_prior(self, with_light: bool) -> IntensityPrior:
+        return IntensityPrior(radiance=self._radiance if with_light else None)
 
     def find_remaining_shading(self, seed: int) -> float:
         return 3.0 + seed
@@ -48,10 +56,16 @@ def nothing(done: int, total: int) -> None:
     pass
 
 
-def chosen(trial_errors: dict[Start, float], full_errors: dict[Start, float]) -> tuple[ChosenFit, list[FitSchedule]]:
+def chosen(
+    trial_errors: dict[Start, float], full_errors: dict[Start, float], radiance: dict[Start, float] | None = None
+) -> tuple[ChosenFit, list[FitSchedule]]:
     runs: list[FitSchedule] = []
     trials: Any = {
-        start: (Fit(full_errors.get(start, 1.0), runs), SimpleNamespace(held_out_loss=error)) for start, error in trial_errors.items()
+        start: (
+            Fit(full_errors.get(start, 1.0), runs, radiance=(radiance or {}).get(start, RADIANCE[0])),
+            SimpleNamespace(held_out_loss=error),
+        )
+        for start, error in trial_errors.items()
     }
     return best_fit(trials, level(), FitSchedule(10), nothing), runs
 
@@ -81,7 +95,10 @@ def test_close_starts_are_continued_and_compared() -> None:
     near = 0.02 * (1 + CANDIDATE_FACTOR) / 2
     choice, runs = chosen({STARTS[0]: 0.02, STARTS[3]: near, STARTS[1]: 0.05}, {STARTS[0]: 0.018, STARTS[3]: 0.01})
     assert (choice.metallic, choice.roughness) == STARTS[3] and choice.fits == len(runs) == 2
-    assert "continued: 1.80% error" in choice.evidence and "2.00% error from metallic 0.05 roughness 0.2" in choice.evidence
+    assert (
+        "continued, with the prior of the light: 1.80% error" in choice.evidence
+        and "2.00% error from metallic 0.05 roughness 0.2" in choice.evidence
+    )
 
 
 def test_only_a_clear_winner_is_continued() -> None:
@@ -93,6 +110,13 @@ def test_a_metal_must_be_clearly_better() -> None:
     trials = {STARTS[0]: 0.02, STARTS[3]: 0.02}
     assert chosen(trials, {STARTS[0]: 0.02, STARTS[3]: 0.02 * (1 - METAL_MARGIN / 2)})[0].metallic < 0.5
     assert chosen(trials, {STARTS[0]: 0.02, STARTS[3]: 0.02 * (1 - METAL_MARGIN * 2)})[0].metallic > 0.5
+
+
+def test_the_prior_of_the_light_decides_between_equal_fits() -> None:
+    """A light three times as bright as usual loses by little error and wins by much."""
+    trials, bright = {STARTS[0]: 0.02, STARTS[1]: 0.02}, {STARTS[0]: 3 * RADIANCE[0]}
+    assert chosen(trials, {STARTS[0]: 0.02, STARTS[1]: 0.0202}, bright)[0].roughness == STARTS[1][1]
+    assert chosen(trials, {STARTS[0]: 0.015, STARTS[1]: 0.0202}, bright)[0].roughness == STARTS[0][1]
 
 
 def test_the_number_of_candidates_is_bounded() -> None:
