@@ -116,7 +116,7 @@ def test_the_prior_of_the_light_decides_between_equal_fits() -> None:
     """A light three times as bright as usual loses by little error and wins by much."""
     trials, bright = {STARTS[0]: 0.02, STARTS[1]: 0.02}, {STARTS[0]: 3 * RADIANCE[0]}
     assert chosen(trials, {STARTS[0]: 0.02, STARTS[1]: 0.0202}, bright)[0].roughness == STARTS[1][1]
-    assert chosen(trials, {STARTS[0]: 0.015, STARTS[1]: 0.0202}, bright)[0].roughness == STARTS[0][1]
+    assert chosen(trials, {STARTS[0]: 0.014, STARTS[1]: 0.0202}, bright)[0].roughness == STARTS[0][1]
 
 
 def test_the_number_of_candidates_is_bounded() -> None:
