@@ -310,9 +310,14 @@ class SfmPipeline:
         self._models += models.values()
         return largest(list(models.values()))
 
-    def _merged(self, model: Any) -> Any:
-        """`model` with all other models that can be tied to it, and photos that then register to it."""
-        others = [other for other in self._models if other is not model]
+    def _models_beside(self, model: Any | None) -> list[Any]:
+        """Models with photos that `model`, one of the present features, does not register."""
+        if not any(model is found for found in self._models):
+            return []
+        return [other for other in self._models if registered_names(other) - registered_names(model)]
+
+    def _merged(self, model: Any, others: Sequence[Any]) -> Any:
+        """`model` with all `others` that can be tied to it, and photos that then register to it."""
         with self._timed("mapping", len(self.names)):
             merged = merge_all(model, others, self.database, self.folder, self.work / "merged", self.seed)
         return merged if merged is model or not self.missing(merged) else self._incremental(True, merged)
@@ -370,8 +375,8 @@ class SfmPipeline:
             model = tried("weaker thresholds", self._incremental(True, first))
             if len(self.missing(model)) > 0.2 * len(self.names):  # the strict model was poor
                 model = tried("weaker thresholds from the start", self._incremental(True, None))
-            if len(self._models) > 1 and self.missing(model) and any(model is found for found in self._models):
-                model = tried("merging of models", self._merged(model))
+            if others := self._models_beside(model):
+                model = tried("merging of models", self._merged(model, others))
         return model
 
 
