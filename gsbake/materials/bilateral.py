@@ -10,6 +10,7 @@ Farbman, Fattal, Lischinski & Szeliski, *Edge-preserving decompositions for mult
 
 from __future__ import annotations
 
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -17,8 +18,12 @@ import scipy.sparse
 import scipy.sparse.linalg
 from numpy.typing import NDArray
 
+from gsbake.imaging.srgb import encode
 from gsbake.texturing.texels import Texels
 
+#: Change of colour (sRGB, sum of channels) between adjacent texels over which a wide and a near neighbourhood extend, and the factor on a
+#: change of roughness beside it.
+WIDE_SCALE, NEAR_SCALE, ROUGHNESS_FACTOR = 0.3, 0.15, 0.5
 #: Radius of the filter on a uniform surface, in texels.
 FILTER_RADIUS = 60.0
 #: Width in texels of the smoothing of appearance before they are compared: fine patterns are one material.
@@ -55,6 +60,25 @@ class EdgeAwareFilter:
     def __call__(self, values: NDArray[Any]) -> NDArray[np.float64]:
         """`values` (n,) averaged over the neighbourhood of similar appearance of each texel."""
         return np.asarray(self._factor.solve(np.bincount(self._node, np.asarray(values, np.float64)))[self._node])
+
+
+class Neighbourhoods:
+    """The neighbourhoods of texels that decide together, on `texels` with neighbouring `pairs` (m, 2) and the photos' linear colours
+    `photographed` (n, 3)."""
+
+    def __init__(self, texels: Texels, pairs: NDArray[np.int64], photographed: NDArray[Any]) -> None:
+        self._texels, self._pairs, self._photographed = texels, pairs, photographed
+
+    @cached_property
+    def wide(self) -> EdgeAwareFilter:
+        """The filter over texels of similar colour in photos; built on first use."""
+        colour = encode(np.clip(np.asarray(self._photographed, np.float32), 0, 1))
+        return EdgeAwareFilter(self._texels, self._pairs, colour, WIDE_SCALE)
+
+    def near(self, values: NDArray[np.float32]) -> EdgeAwareFilter:
+        """The filter over texels of nearly the same material `values` (n, ≥ 4): linear base colour and roughness."""
+        material = np.column_stack([encode(values[:, :3]), ROUGHNESS_FACTOR * values[:, 3]])
+        return EdgeAwareFilter(self._texels, self._pairs, material, NEAR_SCALE)
 
 
 def _prefiltered(values: NDArray[np.float32], pairs: NDArray[np.int64]) -> NDArray[np.float64]:

@@ -32,9 +32,8 @@ import torch
 from numpy.typing import NDArray
 
 from gsbake.imaging.metrics import decibels
-from gsbake.imaging.srgb import encode
 from gsbake.materials import fit_kernel
-from gsbake.materials.bilateral import EdgeAwareFilter
+from gsbake.materials.bilateral import Neighbourhoods
 from gsbake.materials.emission import find_emission
 from gsbake.materials.fit_surface import FitSurface, Fitted
 from gsbake.materials.intensity_prior import IntensityPrior
@@ -67,10 +66,6 @@ from gsbake.texturing.resampling import DETAIL_OFFSET, MAX_DETAIL_RATIO
 
 Floats = NDArray[np.float32]
 
-#: Change of colour (sRGB, sum of channels) between adjacent texels over which the two neighbourhoods of a texel extend that decide about
-#: metal, and the factor on a change of roughness beside it.
-WIDE_SCALE, NEAR_SCALE, ROUGHNESS_CHANGE = 0.3, 0.15, 0.5
-
 
 class MaterialFit:
     """Texels and light while they are optimised."""
@@ -91,6 +86,7 @@ class MaterialFit:
         values[:, :3] = np.clip(surface.base_color, *o.base_color_range)
         values[:, 3], values[:, 4] = roughness, metallic
         self._texels = TexelOptimiser(surface, priors, o, values)
+        self._neighbourhoods = Neighbourhoods(surface.texels, surface.pairs, surface.base_color)
         self._metal_start, self.emissive_regions = metallic > o.max_dielectric_metallic, 0
         self._adjustments: list[LightAdjustment] = []
         self._step_buffers = FitStep(n)
@@ -352,17 +348,6 @@ class MaterialFit:
         self._update_transport()
         return LightAdjustment(np.full(3, 1 / factor), 1.0, 0.0, 0.0)
 
-    @cached_property
-    def _wide_filter(self) -> EdgeAwareFilter:
-        """The filter over texels of similar photos; built on first use."""
-        colour = encode(np.clip(np.asarray(self._surface.base_color, np.float32), 0, 1))
-        return EdgeAwareFilter(self._surface.texels, self._surface.pairs, colour, WIDE_SCALE)
-
-    def _near_filter(self) -> EdgeAwareFilter:
-        """The filter over texels of nearly the same present material."""
-        material = np.column_stack([encode(self._values[:, :3]), ROUGHNESS_CHANGE * self._values[:, 3]])
-        return EdgeAwareFilter(self._surface.texels, self._surface.pairs, material, NEAR_SCALE)
-
     def _samples(self, batches: list[PhotoBatch], tilted: bool = False) -> list[PhotoSamples]:
         """All pixels under the present light, with `tilted` normals as well."""
         lights, texels = self._lights(), TexelInputs.of(self._values, self._transport)
@@ -373,7 +358,7 @@ class MaterialFit:
         o = self._options
         step = max(1, sum(map(len, batches)) // (o.metal_pixels * len(self._values)))
         samples = self._samples([batch.every(step) for batch in batches], tilted=True)
-        found = find_metals(samples, self._values[:, 3].copy(), self._near_filter(), self._wide_filter)
+        found = find_metals(samples, self._values[:, 3].copy(), self._neighbourhoods.near(self._values), self._neighbourhoods.wide)
         kinds = [(found.texel, found.base, found.roughness, o.detected_metallic)]
         if self._metal_start:
             kinds.append((*found.dielectric, o.detected_dielectric))

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from gsbake.imaging.srgb import encode
 from gsbake.materials.adjacency import neighbours
-from gsbake.materials.bilateral import FILTER_RADIUS, EdgeAwareFilter
+from gsbake.materials.bilateral import FILTER_RADIUS, EdgeAwareFilter, Neighbourhoods
 from gsbake.texturing.texels import Texels, rasterise
 
 SIZE, SCALE = 64, 0.3
@@ -85,4 +85,15 @@ def test_a_smaller_scale_stops_at_weaker_edges() -> None:
     pairs = neighbours(texels, at, np.tile([0.0, 0.0, 1.0], (len(left), 1)))
     appearance = np.repeat(np.where(left, 0.5, 0.42)[:, None], 3, 1).astype(np.float32)
     wide, near = (EdgeAwareFilter(texels, pairs, appearance, scale)(left.astype(float))[~left].mean() for scale in (0.3, 0.02))
+    assert near < 0.5 * wide
+
+
+def test_near_neighbours_share_the_material_and_wide_ones_the_colour_of_photos() -> None:
+    texels = chart((0.1, 0.1))
+    left = texels.index % SIZE < 0.3 * SIZE
+    at = np.column_stack([texels.index % SIZE, texels.index // SIZE, np.zeros(len(left))]).astype(float)
+    pairs = neighbours(texels, at, np.tile([0.0, 0.0, 1.0], (len(left), 1)))
+    neighbourhoods = Neighbourhoods(texels, pairs, np.full((len(left), 3), 0.3))
+    values = np.column_stack([np.full((len(left), 3), 0.3), np.where(left, 0.1, 0.9)]).astype(np.float32)
+    near, wide = (average(left.astype(float))[~left].mean() for average in (neighbourhoods.near(values), neighbourhoods.wide))
     assert near < 0.5 * wide
