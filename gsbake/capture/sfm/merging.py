@@ -10,8 +10,9 @@ object and the room behind it, have none.
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from contextlib import closing
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -77,29 +78,34 @@ def merge(model: Any, other: Any, database: Path, photos: Path, work: Path, seed
 
 def common_points(first: Any, second: Any, base: Any) -> tuple[Doubles, Doubles]:
     """Points (n, 3) of the model `first` and the same points (n, 3) in `second`: each pair of points once, in a fixed order."""
-    pairs: dict[tuple[int, int], None] = {}
-    registered = sorted(first.reg_image_ids()), sorted(second.reg_image_ids())
-    for one in registered[0]:
-        ours = first.image(one).points2D
-        for two in registered[1]:
-            theirs = second.image(two).points2D
-            for k, m in _same_features(one, two, len(ours), base):
-                if ours[k].has_point3D() and theirs[m].has_point3D():
-                    pairs[ours[k].point3D_id, theirs[m].point3D_id] = None
-    found = [(first.points3D[a].xyz, second.points3D[b].xyz) for a, b in sorted(pairs)]
-    both = np.asarray(found, np.float64).reshape(-1, 2, 3)
-    return both[:, 0], both[:, 1]
+    ours, theirs = (_points_of_features(model) for model in (first, second))
+    found = [np.zeros((0, 2), np.int64)]
+    for one, two in product(ours, theirs):
+        matches = _same_features(one, two, len(ours[one]), base)
+        both = np.column_stack([ours[one][matches[:, 0]], theirs[two][matches[:, 1]]])
+        found.append(both[(both >= 0).all(1)])
+    pairs = np.unique(np.concatenate(found), axis=0).tolist()
+    positions = np.asarray([(first.points3D[a].xyz, second.points3D[b].xyz) for a, b in pairs], np.float64).reshape(-1, 2, 3)
+    return positions[:, 0], positions[:, 1]
 
 
-def _same_features(one: int, two: int, count: int, base: Any) -> Iterator[tuple[int, int]]:
-    """Indices of features of two photos that show the same point."""
+def _points_of_features(model: Any) -> dict[int, NDArray[np.int64]]:
+    """For each registered photo the number of the point that every feature shows, -1 for none."""
+    return {
+        number: np.array([p.point3D_id if p.has_point3D() else -1 for p in model.image(number).points2D], np.int64)
+        for number in sorted(model.reg_image_ids())
+    }
+
+
+def _same_features(one: int, two: int, count: int, base: Any) -> NDArray[np.int64]:
+    """Indices (m, 2) of features of two photos that show the same point: all `count` of one photo, or those of a verified pair."""
     if one == two:
-        yield from ((k, k) for k in range(count))
-        return
+        return np.stack([np.arange(count)] * 2, 1)
     low, high = min(one, two), max(one, two)
-    if base.exists_two_view_geometry(low, high):
-        for k, m in np.asarray(base.read_two_view_geometry(low, high).inlier_matches).reshape(-1, 2).tolist():
-            yield (k, m) if one == low else (m, k)
+    if not base.exists_two_view_geometry(low, high):
+        return np.zeros((0, 2), np.int64)
+    matches = np.asarray(base.read_two_view_geometry(low, high).inlier_matches, np.int64).reshape(-1, 2)
+    return matches if one == low else matches[:, ::-1]
 
 
 def _similarity(source: Doubles, target: Doubles, seed: int) -> Any | None:
