@@ -272,7 +272,8 @@ class MaterialFit:
             lights, texels = PhotoLights(light.radiance()), TexelInputs.of(values, transport)
             return [b.samples(texels, lights.tables(b.to_light)) for b in subset]
 
-        found = search_light(samples_under, values[:, 3].copy(), tint, rough, self.intensity_prior(with_light=False))
+        prior = IntensityPrior(self.intensity_prior().dielectrics)  # reflections of dielectrics tell of the light
+        found = search_light(samples_under, values[:, 3].copy(), tint, rough, prior)
         if found.improvement <= 0:
             return found
         values[dielectric, 3] = found.shifted_roughness(values[dielectric, 3])
@@ -332,14 +333,14 @@ class MaterialFit:
         """The mesh's unit normals (n, 3) at the texels."""
         return self._normal / np.maximum(np.linalg.norm(self._normal, axis=1, keepdims=True), 1e-12)
 
-    def intensity_prior(self, with_light: bool) -> IntensityPrior:
-        """The prior of the present intensity of the light by the base colours of dielectrics, `with_light` by metals and the light too."""
-        return IntensityPrior.of(self._values, self._dielectric(), self._mean_radiance() if with_light else None)
+    def intensity_prior(self) -> IntensityPrior:
+        """The prior of the present intensity of the light."""
+        return IntensityPrior.of(self._values, self._dielectric(), None if self.moving_light else self._mean_radiance())
 
     @torch.no_grad()
     def _scale_light(self) -> LightAdjustment:
         """Scale the light to the intensity expected by the prior, and base colours with it: reflections of metal leave the scale open."""
-        o, factor = self._options, 1 / self.intensity_prior(with_light=True).mean_factor()
+        o, factor = self._options, 1 / self.intensity_prior().mean_factor()
         self._light.raw.copy_(EnvironmentLight.from_radiance(self._radiance() / np.float32(factor)).raw)
         self._adam_light.state.clear()
         new = self._values[:, :5].copy()
@@ -358,7 +359,9 @@ class MaterialFit:
         o = self._options
         step = max(1, sum(map(len, batches)) // (o.metal_pixels * len(self._values)))
         samples = self._samples([batch.every(step) for batch in batches], tilted=True)
-        found = find_metals(samples, self._values[:, 3].copy(), self._neighbourhoods.near(self._values), self._neighbourhoods.wide)
+        wide = self._neighbourhoods.wide  # errors of a moving light, which is an approximation, are much alike in a near one
+        near = wide if self.moving_light else self._neighbourhoods.near(self._values)
+        found = find_metals(samples, self._values[:, 3].copy(), near, wide)
         kinds = [(found.texel, found.base, found.roughness, o.detected_metallic)]
         if self._metal_start:
             kinds.append((*found.dielectric, o.detected_dielectric))

@@ -8,8 +8,8 @@ close to the best are continued with all searches, on the coarse level, and comp
 
 They are compared by a robust error: a sharp reflection a few pixels off counts twice in the squared error, where it is and where it should
 be, so that the PSNR prefers materials that are too rough. Fits that started with another roughness often explain the photos as well, by a
-brighter or a dimmer light: there its prior decides (`intensity_prior`). Where both kinds explain the photos, the object is dielectric, as
-most are.
+brighter or a dimmer light: there its prior decides (`intensity_prior`), but not between metal and dielectric. Where both kinds explain the
+photos, the object is dielectric, as most are.
 """
 
 from __future__ import annotations
@@ -97,10 +97,13 @@ def best_fit(trials: Trials, level: FitLevel, plan: FitSchedule, each: Each) -> 
     errors = {start: _error(fitted) for start, (_, fitted) in trials.items()}
     evidence = _percent(errors) if len(errors) > 1 else ("diffuse object" if plan.diffuse else "no validation photos")
     found = {start: (trials[start][0], trials[start][0].run(level.fitted, level.held_out, plan, each)) for start in candidates(errors)}
-    continued = {start: _error(fitted) * _prior_factor(fit) for start, (fit, fitted) in found.items()}
-    best = min(continued, key=lambda start: continued[start] * (1 - METAL_MARGIN if start[0] < 0.5 else 1))
+    continued = {start: _error(fitted) for start, (_, fitted) in found.items()}
+    weighed = {start: error * _prior_factor(trials[start][0]) for start, error in continued.items()}
+    kinds = [[start for start in weighed if (start[0] < 0.5) == dielectric] for dielectric in (True, False)]
+    finalists = [min(kind, key=lambda start: weighed[start]) for kind in kinds if kind]
+    best = min(finalists, key=lambda start: continued[start] * (1 - METAL_MARGIN if start[0] < 0.5 else 1))
     if len(continued) > 1:
-        evidence += f"; continued, with the prior of the light: {_percent(continued)}"
+        evidence += f"; continued: {_percent(continued)}; with the prior of the light: {_percent(weighed)}"
     return ChosenFit(*found[best], *best, len(continued), evidence)
 
 
@@ -109,8 +112,8 @@ def _error(fitted: Fitted) -> float:
 
 
 def _prior_factor(fit: MaterialFit) -> float:
-    """Factor on the error of a fit by the prior of its light's intensity, as in the search for that."""
-    return math.exp(fit.intensity_prior(with_light=True).negative_log(1) / OBSERVATIONS)
+    """Factor on the error of a fit by the prior of its light's intensity, as in the search for that; 1 where the light moves."""
+    return 1.0 if fit.moving_light else math.exp(fit.intensity_prior().negative_log(1) / OBSERVATIONS)
 
 
 def _percent(errors: dict[Start, float]) -> str:

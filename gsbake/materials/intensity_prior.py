@@ -5,8 +5,8 @@ Three quantities are known roughly before any photo is looked at, and an intensi
 - the geometric mean of the strongest channel of dielectrics' base colours,
 - the median of that of metals. Those of pure metals are tabulated (silver, aluminium, gold, copper, chromium, nickel, titanium, cobalt,
   platinum and iron: Lagarde & de Rousiers, *Moving Frostbite to PBR*, 2014, table 4),
-- the light's mean radiance, since photographers expose for it: in it white paper is as bright as that. `python -m benchmarks.light_levels`
-  measures environment maps that others have published.
+- the mean radiance of a light that stands, since photographers expose for it: in it white paper is as bright as that. `python -m
+  benchmarks.light_levels` measures environment maps that others have published. A flash, which moves with the camera, is one bright spot.
 
 The logarithm of each follows Student's t with two degrees of freedom: some objects are black, and some lights those of a night. The light's
 scale is that of the environment maps' quartiles; metals' .4 where the tabulated ones have .28, as worn and dirty ones differ more. Where
@@ -44,12 +44,12 @@ class IntensityPrior:
     @classmethod
     def of(cls, values: NDArray[Any], dielectric: NDArray[np.bool_], radiance: NDArray[Any] | None) -> IntensityPrior:
         """The prior for texels with `values` (n, ≥ 5), linear base colour, roughness and metallic, of which some (n,) are `dielectric`,
-        under the environment map `radiance` (6, s, s, 3). Without it dielectrics alone count: their reflections tell of the rest."""
+        under the environment map `radiance` (6, s, s, 3), which does not count without."""
         strongest, metal = values[:, :3].max(1), values[:, 4] > 0.5
         dielectrics = float(np.exp(np.log(strongest[dielectric] + LOG_OFFSET).mean())) if dielectric.mean() >= MIN_SHARE else None
-        if radiance is None:
-            return cls(dielectrics)
         metals = float(np.median(strongest[metal])) if metal.mean() >= MIN_SHARE else None
+        if radiance is None:
+            return cls(dielectrics, metals)
         area = solid_angles(radiance.shape[1])
         return cls(dielectrics, metals, float(((radiance @ LUMINANCE) * area).sum() / area.sum()))
 
