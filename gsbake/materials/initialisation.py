@@ -34,8 +34,9 @@ LIGHT_SCALED_AT = (0.6,)
 DIFFUSE_START, DEFAULT_START = (0.05, 0.8), (0.05, 0.45)
 #: Starts whose error is within this factor of the best one are continued as well, at most so many in all.
 CANDIDATE_FACTOR, MAX_CANDIDATES = 1.3, 3
-#: A metallic start must have less error than the best dielectric one, by this share.
-METAL_MARGIN = 0.04
+#: A metallic start must have less error than the best dielectric one, by this share; by more where the light moves, as such a light is an
+#: approximation, to whose errors rough metal adapts.
+METAL_MARGIN, MOVING_METAL_MARGIN = 0.04, 0.1
 
 #: Initial metallic and roughness.
 Start = tuple[float, float]
@@ -98,10 +99,11 @@ def best_fit(trials: Trials, level: FitLevel, plan: FitSchedule, each: Each) -> 
     evidence = _percent(errors) if len(errors) > 1 else ("diffuse object" if plan.diffuse else "no validation photos")
     found = {start: (trials[start][0], trials[start][0].run(level.fitted, level.held_out, plan, each)) for start in candidates(errors)}
     continued = {start: _error(fitted) for start, (_, fitted) in found.items()}
-    weighed = {start: error * _prior_factor(trials[start][0]) for start, error in continued.items()}
+    weighed = {start: error * _prior_factor(found[start][0]) for start, error in continued.items()}
     kinds = [[start for start in weighed if (start[0] < 0.5) == dielectric] for dielectric in (True, False)]
     finalists = [min(kind, key=lambda start: weighed[start]) for kind in kinds if kind]
-    best = min(finalists, key=lambda start: continued[start] * (1 - METAL_MARGIN if start[0] < 0.5 else 1))
+    margin = MOVING_METAL_MARGIN if any(fit.moving_light for fit, _ in found.values()) else METAL_MARGIN
+    best = min(finalists, key=lambda start: continued[start] * (1 - margin if start[0] < 0.5 else 1))
     if len(continued) > 1:
         evidence += f"; continued: {_percent(continued)}; with the prior of the light: {_percent(weighed)}"
     return ChosenFit(*found[best], *best, len(continued), evidence)

@@ -13,6 +13,7 @@ from gsbake.materials.initialisation import (
     DIFFUSE_START,
     MAX_CANDIDATES,
     METAL_MARGIN,
+    MOVING_METAL_MARGIN,
     STARTS,
     ChosenFit,
     Start,
@@ -109,6 +110,13 @@ def test_a_metal_must_be_clearly_better() -> None:
     trials = {STARTS[0]: 0.02, STARTS[3]: 0.02}
     assert chosen(trials, {STARTS[0]: 0.02, STARTS[3]: 0.02 * (1 - METAL_MARGIN / 2)})[0].metallic < 0.5
     assert chosen(trials, {STARTS[0]: 0.02, STARTS[3]: 0.02 * (1 - METAL_MARGIN * 2)})[0].metallic > 0.5
+
+
+def test_a_metal_under_a_moving_light_must_be_better_still(monkeypatch: pytest.MonkeyPatch) -> None:
+    trials, errors = {STARTS[0]: 0.02, STARTS[3]: 0.02}, {STARTS[0]: 0.02, STARTS[3]: 0.02 * (1 - METAL_MARGIN * 2)}
+    monkeypatch.setattr(Fit, "moving_light", True)
+    assert chosen(trials, errors)[0].metallic < 0.5
+    assert chosen(trials, errors | {STARTS[3]: 0.02 * (1 - MOVING_METAL_MARGIN * 1.1)})[0].metallic > 0.5
 
 
 def test_the_prior_of_the_light_decides_between_equal_fits() -> None:
