@@ -359,7 +359,7 @@ class MaterialFit:
         o = self._options
         step = max(1, sum(map(len, batches)) // (o.metal_pixels * len(self._values)))
         samples = self._samples([batch.every(step) for batch in batches], tilted=True)
-        wide = self._neighbourhoods.wide  # errors of a moving light, which is an approximation, are much alike in a near one
+        wide = self._neighbourhoods.wide  # errors of a moving light, which is an approximation, are similar all over a near one
         near = wide if self.moving_light else self._neighbourhoods.near(self._values)
         found = find_metals(samples, self._values[:, 3].copy(), near, wide)
         kinds = [(found.texel, found.base, found.roughness, o.detected_metallic)]
