@@ -7,7 +7,20 @@ this, so no other module imports pycolmap. Features, matching and mapping run in
 from __future__ import annotations
 
 import zlib  # must stay before pycolmap, see above
+from typing import Any
 
 import pycolmap
 
-__all__ = ["pycolmap", "zlib"]
+__all__ = ["pycolmap", "repeatable_mapping", "zlib"]
+
+
+def repeatable_mapping(seed: int) -> Any:
+    """Options of mapping and triangulation that give the same bytes every time.
+
+    Bundle adjustment of more than 50 000 residuals sums them in the order in which its threads finish. One thread costs little: features
+    and matching, which are most of the time, have all.
+    """
+    options = pycolmap.IncrementalPipelineOptions()
+    options.num_threads = 1
+    options.random_seed = seed
+    return options

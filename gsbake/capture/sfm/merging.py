@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gsbake.capture.sfm.colmap import pycolmap
+from gsbake.capture.sfm.colmap import pycolmap, repeatable_mapping
 
 Doubles = NDArray[np.float64]
 
@@ -40,8 +40,8 @@ def merge_all(model: Any, others: Sequence[Any], database: Path, photos: Path, w
     """
     left = list(others)
     while left:
-        left = [other for other in left if _new_photos(model, other)]
-        left.sort(key=lambda other: -len(_new_photos(model, other)))
+        left = [other for other in left if new_photos(model, other)]
+        left.sort(key=lambda other: -len(new_photos(model, other)))
         for k, other in enumerate(left):
             if (joint := merge(model, other, database, photos, work, seed)) is not None:
                 model, left = joint, left[:k] + left[k + 1 :]
@@ -63,7 +63,7 @@ def merge(model: Any, other: Any, database: Path, photos: Path, work: Path, seed
     joint = _with_poses_of(model, moved)
     shutil.rmtree(work, ignore_errors=True)
     work.mkdir(parents=True)
-    joint = pycolmap.triangulate_points(joint, str(database), str(photos), str(work), True, _mapping_options(seed))
+    joint = pycolmap.triangulate_points(joint, str(database), str(photos), str(work), True, repeatable_mapping(seed))
     shutil.rmtree(work)
     adjustment = pycolmap.BundleAdjustmentOptions()
     adjustment.print_summary = False
@@ -72,7 +72,7 @@ def merge(model: Any, other: Any, database: Path, photos: Path, work: Path, seed
     pycolmap.ObservationManager(joint).filter_all_points3D(MAX_REPROJECTION, MIN_ANGLE)
     bound = MAX_ERROR_INCREASE + max(m.compute_mean_reprojection_error() for m in (model, other))
     joint.update_point_3d_errors()
-    tied = _points_of_both(joint, set(model.reg_image_ids()), set(_new_photos(model, other)))
+    tied = _points_of_both(joint, set(model.reg_image_ids()), set(new_photos(model, other)))
     return joint if tied >= MIN_COMMON_POINTS and joint.compute_mean_reprojection_error() <= bound else None
 
 
@@ -133,14 +133,7 @@ def _with_poses_of(model: Any, moved: Any) -> Any:
     return joint
 
 
-def _mapping_options(seed: int) -> Any:
-    options = pycolmap.IncrementalPipelineOptions()
-    options.num_threads = 1  # as for bundle adjustment
-    options.random_seed = seed
-    return options
-
-
-def _new_photos(model: Any, other: Any) -> list[int]:
+def new_photos(model: Any, other: Any) -> list[int]:
     """Identifiers of the photos that only `other` registers."""
     return sorted(set(other.reg_image_ids()) - set(model.reg_image_ids()))
 

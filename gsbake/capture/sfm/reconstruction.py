@@ -22,10 +22,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsbake.capture.sfm import pairs as pairing
-from gsbake.capture.sfm.colmap import pycolmap
+from gsbake.capture.sfm.colmap import pycolmap, repeatable_mapping
 from gsbake.capture.sfm.feature_cache import Descriptors, FeatureCache, Keypoints, photo_key
 from gsbake.capture.sfm.matching import match_pairs
-from gsbake.capture.sfm.merging import merge_all
+from gsbake.capture.sfm.merging import merge_all, new_photos
 from gsbake.capture.sfm.verification import verify
 
 Tick = Callable[[str, int, int], None]
@@ -259,11 +259,8 @@ class SfmPipeline:
             self.verified += verify(self.database, numbered, key, self.cache, self.seed)
 
     def _mapper(self, relaxed: bool) -> Any:
-        options = pycolmap.IncrementalPipelineOptions()
-        # Bundle adjustment of more than 50 000 residuals sums them in the order in which its threads finish. One thread costs little:
-        # features and matching, which are most of the time, have all.
-        options.num_threads = options.mapper.num_threads = 1
-        options.random_seed = self.seed
+        options = repeatable_mapping(self.seed)
+        options.mapper.num_threads = 1
         options.mapper.random_seed = self.seed
         options.triangulation.random_seed = self.seed
         options.min_model_size = 3
@@ -314,7 +311,7 @@ class SfmPipeline:
         """Models with photos that `model`, one of the present features, does not register."""
         if not any(model is found for found in self._models):
             return []
-        return [other for other in self._models if registered_names(other) - registered_names(model)]
+        return [other for other in self._models if new_photos(model, other)]
 
     def _merged(self, model: Any, others: Sequence[Any]) -> Any:
         """`model` with all `others` that can be tied to it, and photos that then register to it."""
@@ -325,7 +322,7 @@ class SfmPipeline:
     def _global(self) -> Any | None:
         """The largest model of global mapping."""
         options = pycolmap.GlobalPipelineOptions()
-        options.num_threads = 1  # as in _mapper
+        options.num_threads = 1  # as in repeatable_mapping
         options.random_seed = self.seed
         out = self.work / "global"
         shutil.rmtree(out, ignore_errors=True)

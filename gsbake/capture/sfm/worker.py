@@ -21,7 +21,7 @@ import numpy as np
 
 from gsbake.capture.poses.colmap_model import camera_of, cloud
 from gsbake.capture.poses.up_axis import up_direction, upright_rotation
-from gsbake.capture.sfm.colmap import pycolmap
+from gsbake.capture.sfm.colmap import pycolmap, repeatable_mapping
 from gsbake.capture.sfm.feature_cache import FeatureCache
 from gsbake.capture.sfm.pairs import exhaustive, neighbouring_views
 from gsbake.capture.sfm.reconstruction import FeatureOptions, Lens, SfmPipeline, registered_names
@@ -136,9 +136,7 @@ def triangulate(job: Mapping[str, Any]) -> dict[str, Any]:
     pipeline.match(pairs)
     out = Path(job["out"])
     (out / "sparse").mkdir(parents=True, exist_ok=True)
-    options = pycolmap.IncrementalPipelineOptions()
-    options.num_threads = 1  # with more, its sums depend on the order in which threads finish
-    options.random_seed = pipeline.seed
+    options = repeatable_mapping(pipeline.seed)
     # Given lenses are right: COLMAP would leave out photos of long lenses, whose coefficients are large at small angles.
     options.max_extra_param = options.triangulation.max_extra_param = 1e6
     start = time.perf_counter()
