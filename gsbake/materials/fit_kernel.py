@@ -32,6 +32,8 @@ from gsbake.shading.split_sum_kernel import (
     _mirror_weight,
     _roughness_level,
     _table_cell,
+    _table_slopes,
+    _table_value,
     _taps,
 )
 
@@ -68,12 +70,12 @@ def specular_occlusion(cosine: Any, roughness: Any, occlusion: Any) -> Any:
 
 
 @njit(inline="always", **_FLAGS)
-def _specular_visibility(cosine: Any, roughness: Any, occlusion: Any, mirror: Any, reflected: Any, i: Any) -> Any:
+def _specular_visibility(cosine: Any, roughness: Any, occlusion: Any, reflected: Any, i: Any) -> Any:
     """Visible share of the specular lobe of pixel i, weight of the radiance that a traced ray meets, and the texel where it does.
 
-    `mirror` is the weight of the mirror direction; `reflected` (n,) as in `shade_and_differentiate`, empty: not traced.
+    `reflected` (n,) as in `shade_and_differentiate`, empty: not traced.
     """
-    visible = specular_occlusion(cosine, roughness, occlusion)
+    visible, mirror = specular_occlusion(cosine, roughness, occlusion), _mirror_weight(roughness)
     incident = _0
     hit = np.uint64(0)
     if reflected.shape[0] > 0:
@@ -146,27 +148,27 @@ def shade_and_differentiate(
             soft = _HALF * (c + soft_root)
             root = math.sqrt(soft)
             row, col, fx, fy = _table_cell(root, rough, lut)
-            a00, a01, a10, a11 = lut[row, col, 0], lut[row, col + _U1, 0], lut[row + _U1, col, 0], lut[row + _U1, col + _U1, 0]
-            b00, b01, b10, b11 = lut[row, col, 1], lut[row, col + _U1, 1], lut[row + _U1, col, 1], lut[row + _U1, col + _U1, 1]
-            scale = (_1 - fy) * (a00 + fx * (a01 - a00)) + fy * (a10 + fx * (a11 - a10))
-            bias = (_1 - fy) * (b00 + fx * (b01 - b00)) + fy * (b10 + fx * (b11 - b10))
+            scale = _table_value(lut, row, col, fx, fy, 0)
+            bias = _table_value(lut, row, col, fx, fy, 1)
+            share = _table_value(lut, row, col, fx, fy, 2)
+            lobe_rough = _table_value(lut, row, col, fx, fy, 3)
+            mirror = _table_value(lut, row, col, fx, fy, 4)
             transmitted = _1 - _F0 * scale - bias
-            mirror, mirror_slope = _mirror_weight(rough)
             coeff = _1 + mirror * (_2 * c - _1)
             rx = coeff * nx - mirror * vx
             ry = coeff * ny - mirror * vy
             rz = coeff * nz - mirror * vz
             u, v = _encode(rx, ry, rz)
-            level, t_level = _roughness_level(rough, knots)
+            level, t_level = _roughness_level(lobe_rough, knots)
             base0, stride0, fx0, fy0 = _taps(u, v, sizes[level], offsets[level])
             base1, stride1, fx1, fy1 = _taps(u, v, sizes[level + 1], offsets[level + 1])
             u, v = _encode(nx, ny, nz)
             base2, stride2, fx2, fy2 = _taps(u, v, sizes[last], offsets[last])
-            visible_s, incident, hit = _specular_visibility(soft, rough, occlusion, mirror, reflected, i)
+            visible_s, incident, hit = _specular_visibility(soft, rough, occlusion, reflected, i)
 
             # Shade, compare, differentiate; one channel at a time.
             w = weight[i]
-            g_u = g_v = g_un = g_vn = g_t = g_scale = g_bias = _0
+            g_u = g_v = g_un = g_vn = g_t = g_scale = g_bias = g_share = _0
             half0 = _HALF * np.float32(sizes[level])
             half1 = _HALF * np.float32(sizes[level + 1])
             squares = _0
@@ -177,7 +179,8 @@ def shade_and_differentiate(
                 lower = _bilinear(table, base0, stride0, fx0, fy0, ch)
                 upper = _bilinear(table, base1, stride1, fx1, fy1, ch)
                 irradiance = _bilinear(table, base2, stride2, fx2, fy2, ch)
-                light = lower + t_level * (upper - lower)
+                narrow = lower + t_level * (upper - lower)
+                light = narrow + share * (irradiance - narrow)
                 bounced = incident * transport[hit, np.uint64(8 + ch)]
                 reflectance = f0 * scale + bias
                 diffuse = visible * irradiance + local[2 + ch]
@@ -196,29 +199,35 @@ def shade_and_differentiate(
                 g_scale += g_s * light * f0 - _F0 * g * albedo * diffuse
                 g_bias += g_s * light - g * albedo * diffuse
                 g_light = g_s * reflectance
-                g_t += g_light * (upper - lower)
-                du, dv = _bilinear_backward(table, table_grad, base0, stride0, fx0, fy0, ch, g_light * (_1 - t_level))
+                g_share += g_light * (irradiance - narrow)
+                g_narrow = g_light * (_1 - share)
+                g_t += g_narrow * (upper - lower)
+                du, dv = _bilinear_backward(table, table_grad, base0, stride0, fx0, fy0, ch, g_narrow * (_1 - t_level))
                 g_u += du * half0
                 g_v += dv * half0
-                du, dv = _bilinear_backward(table, table_grad, base1, stride1, fx1, fy1, ch, g_light * t_level)
+                du, dv = _bilinear_backward(table, table_grad, base1, stride1, fx1, fy1, ch, g_narrow * t_level)
                 g_u += du * half1
                 g_v += dv * half1
-                du, dv = _bilinear_backward(table, table_grad, base2, stride2, fx2, fy2, ch, g * visible * albedo * transmitted)
+                g_irradiance = g * visible * albedo * transmitted + g_light * share
+                du, dv = _bilinear_backward(table, table_grad, base2, stride2, fx2, fy2, ch, g_irradiance)
                 g_un += du * half2
                 g_vn += dv * half2
             loss_sum += w * residual_weight * loss
             square_sum += w * squares
             weight_sum += w
 
-            # Split-sum table: derivatives along √(n·v) and roughness. Visibility and reflected radiance count as constants.
-            d_root = g_scale * ((_1 - fy) * (a01 - a00) + fy * (a11 - a10)) + g_bias * ((_1 - fy) * (b01 - b00) + fy * (b11 - b10))
-            d_rough = g_scale * ((_1 - fx) * (a10 - a00) + fx * (a11 - a01)) + g_bias * ((_1 - fx) * (b10 - b00) + fx * (b11 - b01))
-            g_c = d_root * np.float32(lut.shape[1] - 1) * _HALF / root * _HALF * (_1 + c / soft_root)
             gx, gy, gz = _encode_backward(rx, ry, rz, g_u, g_v)
             g_along = gx * nx + gy * ny + gz * nz
-            g_c += _2 * mirror * g_along
             g_mirror = (_2 * c - _1) * g_along - (gx * vx + gy * vy + gz * vz)
-            gradient[i, 6] = g_t / (knots[level + 1] - knots[level]) + d_rough * np.float32(lut.shape[0] - 1) + g_mirror * mirror_slope
+            # Split-sum table: derivatives along √(n·v) and roughness. Visibility and reflected radiance count as constants.
+            g_rough = g_t / (knots[level + 1] - knots[level])
+            d_root = d_row = _0
+            for k, g in ((0, g_scale), (1, g_bias), (2, g_share), (3, g_rough), (4, g_mirror)):
+                along_root, along_row = _table_slopes(lut, row, col, fx, fy, k)
+                d_root += g * along_root
+                d_row += g * along_row
+            g_c = d_root * np.float32(lut.shape[1] - 1) * _HALF / root * _HALF * (_1 + c / soft_root) + _2 * mirror * g_along
+            gradient[i, 6] = d_row * np.float32(lut.shape[0] - 1)
             hx, hy, hz = _encode_backward(nx, ny, nz, g_un, g_vn)
             hx += coeff * gx + g_c * vx
             hy += coeff * gy + g_c * vy
@@ -341,27 +350,26 @@ def linear_shading(
         vx, vy, vz = view[i, 0], view[i, 1], view[i, 2]
         soft = _HALF * (c + math.sqrt(c * c + _CLAMP_TERM))
         row, col, fx, fy = _table_cell(math.sqrt(soft), roughness, lut)
-        a0 = lut[row, col, 0] + fx * (lut[row, col + _U1, 0] - lut[row, col, 0])
-        a1 = lut[row + _U1, col, 0] + fx * (lut[row + _U1, col + _U1, 0] - lut[row + _U1, col, 0])
-        b0 = lut[row, col, 1] + fx * (lut[row, col + _U1, 1] - lut[row, col, 1])
-        b1 = lut[row + _U1, col, 1] + fx * (lut[row + _U1, col + _U1, 1] - lut[row + _U1, col, 1])
-        scale = a0 + fy * (a1 - a0)
-        bias = b0 + fy * (b1 - b0)
+        scale = _table_value(lut, row, col, fx, fy, 0)
+        bias = _table_value(lut, row, col, fx, fy, 1)
+        share = _table_value(lut, row, col, fx, fy, 2)
+        mirror = _table_value(lut, row, col, fx, fy, 4)
         transmitted = _1 - _F0 * scale - bias
-        mirror, _ = _mirror_weight(roughness)
         coeff = _1 + mirror * (_2 * c - _1)
         u, v = _encode(coeff * nx - mirror * vx, coeff * ny - mirror * vy, coeff * nz - mirror * vz)
-        level, t = _roughness_level(roughness, knots)
+        level, t = _roughness_level(_table_value(lut, row, col, fx, fy, 3), knots)
         base0, stride0, fx0, fy0 = _taps(u, v, sizes[level], offsets[level])
         base1, stride1, fx1, fy1 = _taps(u, v, sizes[level + 1], offsets[level + 1])
         u, v = _encode(nx, ny, nz)
         base2, stride2, fx2, fy2 = _taps(u, v, sizes[last], offsets[last])
-        visible_s, incident, hit = _specular_visibility(soft, roughness, local[i, 1], mirror, reflected, i)
+        visible_s, incident, hit = _specular_visibility(soft, roughness, local[i, 1], reflected, i)
         for ch in range(3):
             lower = _bilinear(table, base0, stride0, fx0, fy0, ch)
             upper = _bilinear(table, base1, stride1, fx1, fy1, ch)
-            light = visible_s * (lower + t * (upper - lower)) + incident * outgoing[hit, ch]
-            diffuse[i, ch] = transmitted * (local[i, 0] * _bilinear(table, base2, stride2, fx2, fy2, ch) + local[i, 2 + ch])
+            irradiance = _bilinear(table, base2, stride2, fx2, fy2, ch)
+            narrow = lower + t * (upper - lower)
+            light = visible_s * (narrow + share * (irradiance - narrow)) + incident * outgoing[hit, ch]
+            diffuse[i, ch] = transmitted * (local[i, 0] * irradiance + local[i, 2 + ch])
             scaled[i, ch] = light * scale
             constant[i, ch] = light * bias + local[i, 5 + ch]
 

@@ -7,15 +7,20 @@ the microfacet model is that of the glTF specification and of Cycles: GGX with �
 
 Half-vectors are sampled from the visible normals (Dupuy & Benyoub, *Sampling Visible GGX Normals with Spherical Caps*, HPG 2023) on a
 stratified grid. Each sample has the weight G2/G1 ≤ 1, so a small grid is accurate down to grazing angles.
+
+The same table has the parameters of the lobe from which the light comes (`specular_lobe`).
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+
+from gsbake.shading.specular_lobe import lobe_table
 
 #: Table nodes along √(n·v) and along roughness, both from 0 to 1 inclusive. The square root places more nodes at grazing angles, where the
 #: curvature of A and B is high.
@@ -49,23 +54,39 @@ def directional_albedo(cosine: NDArray[np.float64], alpha: NDArray[np.float64], 
 
 @lru_cache(maxsize=1)
 def split_sum_table() -> NDArray[np.float32]:
-    """The table (ROUGHNESS_NODES, COSINE_NODES, 2), read-only; computed once per process."""
+    """The table (ROUGHNESS_NODES, COSINE_NODES, 5), read-only; computed once per process.
+
+    Columns: A, B, and of the lobe the share of the cosine lobe, the roughness of the prefiltered one, and its mirror weight.
+    """
     rough, root = np.meshgrid(np.linspace(0.0, 1.0, ROUGHNESS_NODES), np.linspace(0.0, 1.0, COSINE_NODES), indexing="ij")
     # A perfect mirror at grazing incidence is 0/0; 1e-4 gives its limit to five digits.
     cosine, alpha = np.maximum(root.ravel() ** 2, 1e-4), np.maximum(rough.ravel() ** 2, 1e-4)
     rows = [directional_albedo(cosine[i : i + COSINE_NODES], alpha[i : i + COSINE_NODES]) for i in range(0, len(alpha), COSINE_NODES)]
-    out = np.concatenate(rows).reshape(ROUGHNESS_NODES, COSINE_NODES, 2).astype(np.float32)
-    out.flags.writeable = False
-    return out
+    out = np.concatenate([np.concatenate(rows), lobe_table(rough.ravel(), root.ravel())], axis=1)
+    table = out.reshape(ROUGHNESS_NODES, COSINE_NODES, 5).astype(np.float32)
+    table.flags.writeable = False
+    return table
 
 
 @lru_cache(maxsize=8)
 def _table_tensor(dtype: torch.dtype, device: torch.device) -> torch.Tensor:
-    return torch.tensor(split_sum_table().reshape(-1, 2), dtype=dtype, device=device)
+    return torch.tensor(split_sum_table().reshape(-1, 5), dtype=dtype, device=device)
 
 
-def scale_and_bias(cosine: torch.Tensor, roughness: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """A and B, (n,) each, at n·v (n,) > 0 and roughness (n,); bilinear in √(n·v) and roughness; differentiable in both."""
+@dataclass(frozen=True)
+class SplitSum:
+    """A row of the split-sum table for n pixels, (n,) each: `scale` A and `bias` B of F0, and the lobe's `share` of the cosine lobe,
+    `roughness` of the prefiltered lobe and weight `mirror` of the mirror direction in its direction."""
+
+    scale: torch.Tensor
+    bias: torch.Tensor
+    share: torch.Tensor
+    roughness: torch.Tensor
+    mirror: torch.Tensor
+
+
+def split_sum(cosine: torch.Tensor, roughness: torch.Tensor) -> SplitSum:
+    """The table at n·v (n,) > 0 and roughness (n,); bilinear in √(n·v) and roughness; differentiable in both."""
     lut = _table_tensor(cosine.dtype, cosine.device)
     x = cosine.sqrt() * (COSINE_NODES - 1)
     y = roughness.clamp(0.0, 1.0) * (ROUGHNESS_NODES - 1)
@@ -75,5 +96,4 @@ def scale_and_bias(cosine: torch.Tensor, roughness: torch.Tensor) -> tuple[torch
     base = row * COSINE_NODES + col
     top = lut[base] * (1.0 - fx) + lut[base + 1] * fx
     bottom = lut[base + COSINE_NODES] * (1.0 - fx) + lut[base + COSINE_NODES + 1] * fx
-    both = top * (1.0 - fy) + bottom * fy
-    return both[:, 0], both[:, 1]
+    return SplitSum(*(top * (1.0 - fy) + bottom * fy).T)

@@ -27,7 +27,6 @@ _0 = np.float32(0.0)
 _1 = np.float32(1.0)
 _2 = np.float32(2.0)
 _HALF = np.float32(0.5)
-_1_5 = np.float32(1.5)
 _U1 = np.uint64(1)
 _MIN_L1_NORM = np.float32(MIN_L1_NORM)
 _F0 = np.float32(0.04)
@@ -123,13 +122,11 @@ def _roughness_level(roughness: Any, knots: Any) -> Any:
 
 @njit(inline="always", **_FLAGS)
 def _mirror_weight(roughness: Any) -> Any:
-    """Weight of the mirror direction in the lobe's dominant direction, and its derivative in roughness."""
+    """Share of the lobe that follows the mirror direction, as in `split_sum`."""
     alpha = min(max(roughness, _0), _1)
     alpha *= alpha
     smoothness = _1 - alpha
-    root = math.sqrt(smoothness)
-    slope = _2 * roughness * (smoothness - alpha - _1_5 * root)
-    return smoothness * (root + alpha), slope if _0 <= roughness <= _1 else _0
+    return smoothness * (math.sqrt(smoothness) + alpha)
 
 
 @njit(inline="always", **_FLAGS)
@@ -153,6 +150,22 @@ def _table_cell(root: Any, roughness: Any, lut: Any) -> Any:
     return row, col, x - np.float32(np.int64(col)), y - np.float32(np.int64(row))
 
 
+@njit(inline="always", **_FLAGS)
+def _table_value(lut: Any, row: Any, col: Any, fx: Any, fy: Any, k: Any) -> Any:
+    """Column k of the split-sum table between its nodes."""
+    top = lut[row, col, k] + fx * (lut[row, col + _U1, k] - lut[row, col, k])
+    bottom = lut[row + _U1, col, k] + fx * (lut[row + _U1, col + _U1, k] - lut[row + _U1, col, k])
+    return top + fy * (bottom - top)
+
+
+@njit(inline="always", **_FLAGS)
+def _table_slopes(lut: Any, row: Any, col: Any, fx: Any, fy: Any, k: Any) -> Any:
+    """Derivatives of `_table_value` in fx and fy."""
+    a, b = lut[row, col, k], lut[row, col + _U1, k]
+    d, e = lut[row + _U1, col, k], lut[row + _U1, col + _U1, k]
+    return (b - a) + fy * ((e - d) - (b - a)), (d - a) + fx * ((e - b) - (d - a))
+
+
 @njit(parallel=True, **_FLAGS)
 def forward(
     normal: Any, view: Any, albedo: Any, roughness: Any, metallic: Any, visibility_d: Any, visibility_s: Any,
@@ -166,18 +179,16 @@ def forward(
             inverse, nx, ny, nz, c = _geometry(normal, view, i)
             root = math.sqrt(_HALF * (c + math.sqrt(c * c + _CLAMP_TERM)))
             row, col, fx, fy = _table_cell(root, roughness[i], lut)
-            a0 = lut[row, col, 0] + fx * (lut[row, col + _U1, 0] - lut[row, col, 0])
-            a1 = lut[row + _U1, col, 0] + fx * (lut[row + _U1, col + _U1, 0] - lut[row + _U1, col, 0])
-            b0 = lut[row, col, 1] + fx * (lut[row, col + _U1, 1] - lut[row, col, 1])
-            b1 = lut[row + _U1, col, 1] + fx * (lut[row + _U1, col + _U1, 1] - lut[row + _U1, col, 1])
-            scale = a0 + fy * (a1 - a0)
-            bias = b0 + fy * (b1 - b0)
+            scale = _table_value(lut, row, col, fx, fy, 0)
+            bias = _table_value(lut, row, col, fx, fy, 1)
+            share = _table_value(lut, row, col, fx, fy, 2)
+            rough = _table_value(lut, row, col, fx, fy, 3)
+            mirror = _table_value(lut, row, col, fx, fy, 4)
             transmitted = _1 - _F0 * scale - bias
 
-            mirror, _ = _mirror_weight(roughness[i])
             coeff = _1 + mirror * (_2 * c - _1)
             u, v = _encode(coeff * nx - mirror * view[i, 0], coeff * ny - mirror * view[i, 1], coeff * nz - mirror * view[i, 2])
-            level, t = _roughness_level(roughness[i], knots)
+            level, t = _roughness_level(rough, knots)
             base0, stride0, fx0, fy0 = _taps(u, v, sizes[level], offsets[level])
             base1, stride1, fx1, fy1 = _taps(u, v, sizes[level + 1], offsets[level + 1])
             u, v = _encode(nx, ny, nz)
@@ -189,7 +200,8 @@ def forward(
                 upper = _bilinear(table, base1, stride1, fx1, fy1, ch)
                 irradiance = _bilinear(table, base2, stride2, fx2, fy2, ch)
                 f0 = _F0 * (_1 - metal) + metal * albedo[i, ch]
-                light = lower + t * (upper - lower)
+                narrow = lower + t * (upper - lower)
+                light = narrow + share * (irradiance - narrow)
                 diffuse = (_1 - metal) * albedo[i, ch] * transmitted * irradiance
                 out[i, ch] = visibility_d[i] * diffuse + visibility_s[i] * light * (f0 * scale + bias)
 
@@ -210,19 +222,19 @@ def backward(
             soft_root = math.sqrt(c * c + _CLAMP_TERM)
             root = math.sqrt(_HALF * (c + soft_root))
             row, col, fx, fy = _table_cell(root, roughness[i], lut)
-            a00, a01, a10, a11 = lut[row, col, 0], lut[row, col + _U1, 0], lut[row + _U1, col, 0], lut[row + _U1, col + _U1, 0]
-            b00, b01, b10, b11 = lut[row, col, 1], lut[row, col + _U1, 1], lut[row + _U1, col, 1], lut[row + _U1, col + _U1, 1]
-            scale = (_1 - fy) * (a00 + fx * (a01 - a00)) + fy * (a10 + fx * (a11 - a10))
-            bias = (_1 - fy) * (b00 + fx * (b01 - b00)) + fy * (b10 + fx * (b11 - b10))
+            scale = _table_value(lut, row, col, fx, fy, 0)
+            bias = _table_value(lut, row, col, fx, fy, 1)
+            share = _table_value(lut, row, col, fx, fy, 2)
+            rough = _table_value(lut, row, col, fx, fy, 3)
+            mirror = _table_value(lut, row, col, fx, fy, 4)
             transmitted = _1 - _F0 * scale - bias
 
-            mirror, mirror_slope = _mirror_weight(roughness[i])
             coeff = _1 + mirror * (_2 * c - _1)
             rx = coeff * nx - mirror * view[i, 0]
             ry = coeff * ny - mirror * view[i, 1]
             rz = coeff * nz - mirror * view[i, 2]
             u, v = _encode(rx, ry, rz)
-            level, t = _roughness_level(roughness[i], knots)
+            level, t = _roughness_level(rough, knots)
             base0, stride0, fx0, fy0 = _taps(u, v, sizes[level], offsets[level])
             base1, stride1, fx1, fy1 = _taps(u, v, sizes[level + 1], offsets[level + 1])
             u, v = _encode(nx, ny, nz)
@@ -230,7 +242,7 @@ def backward(
             base2, stride2, fx2, fy2 = _taps(u, v, sizes[last], offsets[last])
             metal = metallic[i]
 
-            g_u = g_v = g_un = g_vn = g_t = g_scale = g_bias = g_metal = g_vd = g_vs = _0
+            g_u = g_v = g_un = g_vn = g_t = g_scale = g_bias = g_share = g_metal = g_vd = g_vs = _0
             half0 = _HALF * np.float32(sizes[level])
             half1 = _HALF * np.float32(sizes[level + 1])
             half2 = _HALF * np.float32(sizes[last])
@@ -241,7 +253,8 @@ def backward(
                 upper = _bilinear(table, base1, stride1, fx1, fy1, ch)
                 irradiance = _bilinear(table, base2, stride2, fx2, fy2, ch)
                 f0 = _F0 * (_1 - metal) + metal * base
-                light = lower + t * (upper - lower)
+                narrow = lower + t * (upper - lower)
+                light = narrow + share * (irradiance - narrow)
                 reflectance = f0 * scale + bias
                 diffuse = g * (_1 - metal) * base * irradiance  # gradient of visibility and transmittance together
                 g_d = g * visibility_d[i] * transmitted
@@ -253,34 +266,37 @@ def backward(
                 g_scale += g_s * light * f0 - _F0 * visibility_d[i] * diffuse
                 g_bias += g_s * light - visibility_d[i] * diffuse
                 g_light = g_s * reflectance
-                g_t += g_light * (upper - lower)
-                du, dv = _bilinear_backward(table, table_grad, base0, stride0, fx0, fy0, ch, g_light * (_1 - t))
+                g_share += g_light * (irradiance - narrow)
+                g_narrow = g_light * (_1 - share)
+                g_t += g_narrow * (upper - lower)
+                du, dv = _bilinear_backward(table, table_grad, base0, stride0, fx0, fy0, ch, g_narrow * (_1 - t))
                 g_u += du * half0
                 g_v += dv * half0
-                du, dv = _bilinear_backward(table, table_grad, base1, stride1, fx1, fy1, ch, g_light * t)
+                du, dv = _bilinear_backward(table, table_grad, base1, stride1, fx1, fy1, ch, g_narrow * t)
                 g_u += du * half1
                 g_v += dv * half1
-                du, dv = _bilinear_backward(table, table_grad, base2, stride2, fx2, fy2, ch, g_d * (_1 - metal) * base)
+                g_irradiance = g_d * (_1 - metal) * base + g_light * share
+                du, dv = _bilinear_backward(table, table_grad, base2, stride2, fx2, fy2, ch, g_irradiance)
                 g_un += du * half2
                 g_vn += dv * half2
             g_metallic[i] = g_metal
             g_visibility_d[i] = g_vd
             g_visibility_s[i] = g_vs
 
-            # Split-sum table: derivatives along √(n·v) and roughness.
-            d_root = g_scale * ((_1 - fy) * (a01 - a00) + fy * (a11 - a10)) + g_bias * ((_1 - fy) * (b01 - b00) + fy * (b11 - b10))
-            d_rough = g_scale * ((_1 - fx) * (a10 - a00) + fx * (a11 - a01)) + g_bias * ((_1 - fx) * (b10 - b00) + fx * (b11 - b01))
-            inside = _1 if _0 <= roughness[i] <= _1 else _0
-            g_c = d_root * np.float32(lut.shape[1] - 1) * _HALF / root * _HALF * (_1 + c / soft_root)
-
-            # Gradients of the dominant direction (1 + f (2c − 1)) n − f v and the cosine c = n·v, through the normalisation of the normal.
+            # Gradients of the lobe's direction (1 + m (2c − 1)) n − m v and the cosine c = n·v, through the normalisation of the normal.
             gx, gy, gz = _encode_backward(rx, ry, rz, g_u, g_v)
             g_along = gx * nx + gy * ny + gz * nz
-            g_c += _2 * mirror * g_along
             g_mirror = (_2 * c - _1) * g_along - (gx * view[i, 0] + gy * view[i, 1] + gz * view[i, 2])
-            g_roughness[i] = (
-                g_t / (knots[level + 1] - knots[level]) + inside * d_rough * np.float32(lut.shape[0] - 1) + g_mirror * mirror_slope
-            )
+
+            # Split-sum table: derivatives along √(n·v) and roughness.
+            g_rough = g_t / (knots[level + 1] - knots[level])
+            d_root = d_row = _0
+            for k, g in ((0, g_scale), (1, g_bias), (2, g_share), (3, g_rough), (4, g_mirror)):
+                along_root, along_row = _table_slopes(lut, row, col, fx, fy, k)
+                d_root += g * along_root
+                d_row += g * along_row
+            g_c = d_root * np.float32(lut.shape[1] - 1) * _HALF / root * _HALF * (_1 + c / soft_root) + _2 * mirror * g_along
+            g_roughness[i] = d_row * np.float32(lut.shape[0] - 1) if _0 <= roughness[i] <= _1 else _0
             hx, hy, hz = _encode_backward(nx, ny, nz, g_un, g_vn)
             hx += coeff * gx + g_c * view[i, 0]
             hy += coeff * gy + g_c * view[i, 1]
