@@ -42,9 +42,12 @@ from gsbake.materials.linear_shading import PhotoSamples
 from gsbake.materials.metallic import find_metals
 from gsbake.materials.options import FitOptions, FitSchedule, Priors
 from gsbake.materials.photo_batch import (
+    DIFFUSE,
     EMISSION,
+    F0,
     INDIRECT,
-    OUTGOING,
+    NORMAL,
+    ROUGHNESS,
     VISIBILITY,
     FitStep,
     KernelTables,
@@ -93,6 +96,7 @@ class MaterialFit:
         self._normal = np.ascontiguousarray(surface.normal, np.float32)
         self._transport = np.zeros((n, fit_kernel.TRANSPORT), np.float32)
         self._transport[:, :2] = surface.occlusion[:, None]
+        self._transport[:, NORMAL] = self._unit_normals
         self._light = EnvironmentLight(light_size)
         self._common = np.zeros((0, 4), np.float32)
         self._rotations: list[NDArray[np.float64] | None] = []  # of the fitted photos' lights
@@ -200,7 +204,7 @@ class MaterialFit:
         self._texels.step(self._step_buffers.gradient, residual, self._common, decay, normals)
 
     def _update_transport(self) -> None:
-        """Visibility, indirect light and outgoing radiance under the present light and materials."""
+        """Visibility, indirect light and what reflections show under the present light and materials."""
         transport = self._surface.transport
         if transport is None:
             return
@@ -212,7 +216,10 @@ class MaterialFit:
             lit = self._irradiance() * visible[:, None]
             indirect = transport.indirect_irradiance(lit, reflectance)
             self._transport[:, INDIRECT] = indirect
-            self._transport[:, OUTGOING] = reflectance * (lit + indirect) + self._transport[:, EMISSION]
+            metal = self._values[:, 4:5] * self._values[:, :3]
+            self._transport[:, DIFFUSE] = (self._values[:, :3] - metal) * (lit + indirect)
+            self._transport[:, F0] = metal + np.float32(0.04) * (1 - self._values[:, 4:5])
+            self._transport[:, ROUGHNESS] = self._values[:, 3]
 
     def _radiance(self) -> Floats:
         """The environment map (6, size, size, 3) in the frame in which it stands."""

@@ -49,8 +49,12 @@ _POWER = np.float32(1 / 2.4)
 PARAMETERS = 8
 #: Columns of a pixel's shading parameters: diffuse albedo (3), F0 (3), roughness, normal offset (3).
 SHADING = 10
-#: Columns of a texel's light transport: visibility, ambient occlusion, indirect irradiance / π (3), emission (3), outgoing radiance (3).
-TRANSPORT = 11
+#: Columns of a texel's light transport: visibility, ambient occlusion, indirect irradiance / π (3), emission (3), and for reflections of it
+#: diffuse radiosity / π (3), F0 (3), roughness, unit normal (3).
+TRANSPORT = 18
+#: Least share of the hemisphere that blocks the light where indirect light is divided by it.
+MIN_BLOCKED = 0.1
+_MIN_BLOCKED = np.float32(MIN_BLOCKED)
 
 
 @njit(inline="always", **_FLAGS)
@@ -88,6 +92,43 @@ def _specular_visibility(cosine: Any, roughness: Any, occlusion: Any, reflected:
     return visible, incident, hit
 
 
+@njit(inline="always", **_FLAGS)
+def _reflected_radiance(
+    transport: Any, hit: Any, x: Any, y: Any, z: Any, table: Any, knots: Any, sizes: Any, offsets: Any, lut: Any, out: Any
+) -> None:
+    """Set `out` (3,) to the radiance that the texel `hit` sends against the ray x, y, z that meets it.
+
+    Of what blocks its specular lobe the mean radiance counts, which its indirect light tells.
+    """
+    nx, ny, nz = transport[hit, 15], transport[hit, 16], transport[hit, 17]
+    roughness, occlusion = transport[hit, 14], transport[hit, 1]
+    c = -(nx * x + ny * y + nz * z)
+    soft = _HALF * (c + math.sqrt(c * c + _CLAMP_TERM))
+    row, col, fx, fy = _table_cell(math.sqrt(soft), roughness, lut)
+    scale = _table_value(lut, row, col, fx, fy, 0)
+    bias = _table_value(lut, row, col, fx, fy, 1)
+    share = _table_value(lut, row, col, fx, fy, 2)
+    mirror = _table_value(lut, row, col, fx, fy, 4)
+    transmitted = _1 - _F0 * scale - bias
+    coeff = _1 + mirror * (_2 * c - _1)
+    u, v = _encode(coeff * nx + mirror * x, coeff * ny + mirror * y, coeff * nz + mirror * z)
+    level, t = _roughness_level(_table_value(lut, row, col, fx, fy, 3), knots)
+    base0, stride0, fx0, fy0 = _taps(u, v, sizes[level], offsets[level])
+    base1, stride1, fx1, fy1 = _taps(u, v, sizes[level + 1], offsets[level + 1])
+    u, v = _encode(nx, ny, nz)
+    last = sizes.shape[0] - 1
+    base2, stride2, fx2, fy2 = _taps(u, v, sizes[last], offsets[last])
+    visible = specular_occlusion(soft, roughness, occlusion)
+    blocked = (_1 - visible) / max(_1 - occlusion, _MIN_BLOCKED)
+    for ch in range(3):
+        lower = _bilinear(table, base0, stride0, fx0, fy0, ch)
+        upper = _bilinear(table, base1, stride1, fx1, fy1, ch)
+        narrow = lower + t * (upper - lower)
+        light = narrow + share * (_bilinear(table, base2, stride2, fx2, fy2, ch) - narrow)
+        specular = (visible * light + blocked * transport[hit, 2 + ch]) * (transport[hit, 11 + ch] * scale + bias)
+        out[ch] = transmitted * transport[hit, 8 + ch] + transport[hit, 5 + ch] + specular
+
+
 @njit(parallel=True, **_FLAGS)
 def shade_and_differentiate(
     texel: Any, bilinear: Any, normal: Any, view: Any, colour: Any, weight: Any, reflected: Any,
@@ -112,6 +153,7 @@ def shade_and_differentiate(
         weight_sum = 0.0
         shading = np.empty(SHADING, np.float32)
         local = np.empty(8, np.float32)
+        bounced = np.zeros(3, np.float32)
         for pixel in range(chunk * n // CHUNKS, (chunk + 1) * n // CHUNKS):
             i = np.uint64(pixel)
             for c in range(SHADING):
@@ -165,6 +207,11 @@ def shade_and_differentiate(
             u, v = _encode(nx, ny, nz)
             base2, stride2, fx2, fy2 = _taps(u, v, sizes[last], offsets[last])
             visible_s, incident, hit = _specular_visibility(soft, rough, occlusion, reflected, i)
+            bounced[:] = _0
+            if incident > _0:
+                two = _2 * c
+                x, y, z = two * nx - vx, two * ny - vy, two * nz - vz
+                _reflected_radiance(transport, hit, x, y, z, table, knots, sizes, offsets, lut, bounced)
 
             # Shade, compare, differentiate; one channel at a time.
             w = weight[i]
@@ -181,10 +228,9 @@ def shade_and_differentiate(
                 irradiance = _bilinear(table, base2, stride2, fx2, fy2, ch)
                 narrow = lower + t_level * (upper - lower)
                 light = narrow + share * (irradiance - narrow)
-                bounced = incident * transport[hit, np.uint64(8 + ch)]
                 reflectance = f0 * scale + bias
                 diffuse = visible * irradiance + local[2 + ch]
-                linear = albedo * transmitted * diffuse + (visible_s * light + bounced) * reflectance + local[5 + ch]
+                linear = albedo * transmitted * diffuse + (visible_s * light + incident * bounced[ch]) * reflectance + local[5 + ch]
                 encoded, slope = srgb_and_slope(min(max(linear, _0), _1))
                 error = encoded - colour[i, ch]
                 squares += error * error
@@ -195,7 +241,7 @@ def shade_and_differentiate(
                     g = third * w * error / length * slope
                 g_s = g * visible_s
                 gradient[i, ch] = g * transmitted * diffuse
-                gradient[i, 3 + ch] = (g_s * light + g * bounced) * scale
+                gradient[i, 3 + ch] = (g_s * light + g * incident * bounced[ch]) * scale
                 g_scale += g_s * light * f0 - _F0 * g * albedo * diffuse
                 g_bias += g_s * light - g * albedo * diffuse
                 g_light = g_s * reflectance
@@ -333,13 +379,14 @@ def adam_step(
 
 @njit(parallel=True, **_FLAGS)
 def linear_shading(
-    texel: Any, normal: Any, view: Any, reflected: Any, local: Any, outgoing: Any, rough: Any, table: Any, knots: Any, sizes: Any,
+    texel: Any, normal: Any, view: Any, reflected: Any, local: Any, transport: Any, rough: Any, table: Any, knots: Any, sizes: Any,
     offsets: Any, lut: Any, diffuse: Any, scaled: Any, constant: Any,
 ) -> None:  # fmt: skip
     """Shading of n pixels as a linear function of base colour b.
 
     A dielectric shows b · `diffuse` + .04 · `scaled` + `constant`, a metal b · `scaled` + `constant`; (n, 3) each. `texel` (n,) is the
-    texel whose roughness `rough` (texels,) and `outgoing` radiance (texels, 3) count; `local` (n, 8) the light transport of the pixels.
+    texel whose roughness `rough` (texels,) counts; `local` (n, 8) the light transport of pixels, `transport` (texels, TRANSPORT) that of
+    the texels that they reflect.
     """
     n = normal.shape[0]
     last = sizes.shape[0] - 1
@@ -363,12 +410,17 @@ def linear_shading(
         u, v = _encode(nx, ny, nz)
         base2, stride2, fx2, fy2 = _taps(u, v, sizes[last], offsets[last])
         visible_s, incident, hit = _specular_visibility(soft, roughness, local[i, 1], reflected, i)
+        bounced = np.zeros(3, np.float32)
+        if incident > _0:
+            two = _2 * c
+            x, y, z = two * nx - vx, two * ny - vy, two * nz - vz
+            _reflected_radiance(transport, hit, x, y, z, table, knots, sizes, offsets, lut, bounced)
         for ch in range(3):
             lower = _bilinear(table, base0, stride0, fx0, fy0, ch)
             upper = _bilinear(table, base1, stride1, fx1, fy1, ch)
             irradiance = _bilinear(table, base2, stride2, fx2, fy2, ch)
             narrow = lower + t * (upper - lower)
-            light = visible_s * (narrow + share * (irradiance - narrow)) + incident * outgoing[hit, ch]
+            light = visible_s * (narrow + share * (irradiance - narrow)) + incident * bounced[ch]
             diffuse[i, ch] = transmitted * (local[i, 0] * irradiance + local[i, 2 + ch])
             scaled[i, ch] = light * scale
             constant[i, ch] = light * bias + local[i, 5 + ch]

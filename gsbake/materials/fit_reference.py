@@ -1,7 +1,8 @@
 """Reference implementation of a step of the material fit in PyTorch: shading and loss of one photo's pixels, and the priors.
 
 The split sum (`shading.split_sum`) with the light transport of each texel: visibility of the present light, indirect light and emission.
-Where a pixel's reflected ray was traced and meets the object, the outgoing radiance of the texel that it hits replaces the environment.
+Where a pixel's reflected ray was traced and meets the object, the radiance of the texel that it hits replaces the environment: its diffuse
+radiosity, its emission, and the environment that it reflects itself.
 `fit_kernel` computes the same with its gradient.
 """
 
@@ -13,21 +14,31 @@ import torch
 from torch import Tensor
 
 from gsbake.imaging.srgb_torch import linear_to_srgb
-from gsbake.materials.photo_batch import EMISSION, INDIRECT, OCCLUSION, OUTGOING, VISIBILITY
+from gsbake.materials.fit_kernel import MIN_BLOCKED
+from gsbake.materials.photo_batch import DIFFUSE, EMISSION, F0, INDIRECT, LOCAL, NORMAL, OCCLUSION, ROUGHNESS, VISIBILITY
 from gsbake.materials.pixels import Pixels
+from gsbake.shading import brdf
 from gsbake.shading.light_tables import LightTables
-from gsbake.shading.split_sum import mirror_reflection, shade, traced_specular_visibility, transmitted_share
+from gsbake.shading.split_sum import (
+    mirror_reflection,
+    shade,
+    soft_cosine,
+    specular_light,
+    specular_occlusion,
+    traced_specular_visibility,
+    transmitted_share,
+)
 
 
 @dataclass(frozen=True)
 class PixelTransport:
     """Light transport at n pixels: `local` (n, 8), the columns up to `EMISSION`; where reflections were traced, which are `blocked` (n,)
-    by the object, the `rows` (k,) of these and the `outgoing` radiance (k, 3) along their reflected rays."""
+    by the object, the `rows` (k,) of these and the transport `met` (k, 18) of the texels that their reflected rays meet."""
 
     local: Tensor
     blocked: Tensor | None
     rows: Tensor | None
-    outgoing: Tensor | None
+    met: Tensor | None
 
 
 @dataclass(frozen=True)
@@ -51,7 +62,7 @@ class Batch:
         return cls(texel, bilinear, view, colour, weight, _interpolate(normal, texel, bilinear), reflected)
 
     def shade(self, values: Tensor, normal_offset: Tensor, tables: LightTables, transport: Tensor) -> Tensor:
-        """Linear colours (n, 3) of the pixels for texels with material `values` (texels, 5) and light `transport` (texels, 11)."""
+        """Linear colours (n, 3) of the pixels for texels with material `values` (texels, 5) and light `transport` (texels, 18)."""
         metal = values[:, 4:]
         parameters = torch.cat([(1 - metal) * values[:, :3], 0.04 * (1 - metal) + metal * values[:, :3], values[:, 3:4]], 1)
         g = _interpolate(parameters, self.texel, self.bilinear)
@@ -71,13 +82,13 @@ class Batch:
         return self.normal + _interpolate(normal_offset, self.texel, self.bilinear)
 
     def _transport(self, transport: Tensor) -> PixelTransport:
-        """Light transport at each pixel from that of the texels (texels, 11)."""
-        local = _interpolate(transport[:, : OUTGOING.start], self.texel, self.bilinear)
+        """Light transport at each pixel from that of the texels (texels, 18)."""
+        local = _interpolate(transport[:, LOCAL], self.texel, self.bilinear)
         if self.reflected_texel is None:
             return PixelTransport(local, None, None, None)
         blocked = self.reflected_texel >= 0
         rows = torch.nonzero(blocked)[:, 0]
-        return PixelTransport(local, blocked, rows, transport[self.reflected_texel[rows], OUTGOING])
+        return PixelTransport(local, blocked, rows, transport[self.reflected_texel[rows]])
 
     def _shade(
         self, normal: Tensor, albedo: Tensor, roughness: Tensor, metallic: Tensor, tables: LightTables, transport: PixelTransport
@@ -87,11 +98,29 @@ class Batch:
         occlusion = local[:, OCCLUSION]
         visibility = None if blocked is None else traced_specular_visibility(normal, view, roughness, occlusion, blocked)
         lit = shade(normal, view, albedo, roughness, metallic, tables, occlusion, local[:, VISIBILITY], visibility)
-        if transport.rows is not None and transport.outgoing is not None:
-            at, outgoing = transport.rows, transport.outgoing
-            lit = lit.index_add(0, at, mirror_reflection(normal[at], view[at], albedo[at], roughness[at], metallic[at], outgoing))
+        if transport.rows is not None and transport.met is not None:
+            at = transport.rows
+            unit = torch.nn.functional.normalize(normal[at].detach(), dim=1)
+            ray = 2 * (unit * view[at]).sum(1, keepdim=True) * unit - view[at]
+            radiance = reflected_radiance(transport.met, ray, tables)
+            lit = lit.index_add(0, at, mirror_reflection(normal[at], view[at], albedo[at], roughness[at], metallic[at], radiance))
         transmitted = transmitted_share(normal, view, roughness)
         return lit + ((1 - metallic) * transmitted)[:, None] * albedo * local[:, INDIRECT] + local[:, EMISSION]
+
+
+@torch.no_grad()
+def reflected_radiance(met: Tensor, ray: Tensor, tables: LightTables) -> Tensor:
+    """Radiance (k, 3) that surfaces with light transport `met` (k, 18) send against the unit `ray` (k, 3) that meets each.
+
+    Of what blocks their specular lobe the mean radiance counts, which their indirect light tells.
+    """
+    normal, roughness, occlusion = met[:, NORMAL], met[:, ROUGHNESS], met[:, OCCLUSION]
+    split = brdf.split_sum(soft_cosine(-(normal * ray).sum(1)), roughness)
+    scale, bias = split.scale[:, None], split.bias[:, None]
+    visible = specular_occlusion(normal, -ray, roughness, occlusion)
+    blocked = ((1 - visible) / (1 - occlusion).clamp_min(MIN_BLOCKED))[:, None] * met[:, INDIRECT]
+    light = visible[:, None] * specular_light(normal, -ray, split, tables, tables.diffuse(normal)) + blocked
+    return (1 - 0.04 * scale - bias) * met[:, DIFFUSE] + met[:, EMISSION] + light * (met[:, F0] * scale + bias)
 
 
 def _interpolate(values: Tensor, texel: Tensor, bilinear: Tensor) -> Tensor:

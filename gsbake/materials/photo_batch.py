@@ -23,8 +23,11 @@ from gsbake.shading.light_tables import LightTables, prefilter_cube_map
 Floats = NDArray[np.float32]
 
 #: Columns of a texel's light transport: visibility (0..1) of the present light and, for specular reflection, of uniform light (ambient
-#: occlusion); indirect irradiance / π; emission; outgoing radiance, which reflections of the object show.
-VISIBILITY, OCCLUSION, INDIRECT, EMISSION, OUTGOING = 0, 1, slice(2, 5), slice(5, 8), slice(8, 11)
+#: occlusion); indirect irradiance / π; emission; for reflections of the object diffuse radiosity / π, F0, roughness and unit normal.
+VISIBILITY, OCCLUSION, INDIRECT, EMISSION = 0, 1, slice(2, 5), slice(5, 8)
+DIFFUSE, F0, ROUGHNESS, NORMAL = slice(8, 11), slice(11, 14), 14, slice(15, 18)
+#: The columns that pixels interpolate.
+LOCAL = slice(0, 8)
 
 
 @dataclass(frozen=True)
@@ -68,17 +71,17 @@ class PhotoLights:
 
 @dataclass(frozen=True)
 class TexelInputs:
-    """What searches read of the texels, each in one block of memory: normal offsets (n, 3), the light transport (n, 8) at a pixel, and the
-    outgoing radiance (n, 3) that reflections show."""
+    """What searches read of the texels, each in one block of memory: normal offsets (n, 3), the light transport (n, 8) at a pixel, and all
+    of it (n, TRANSPORT), which reflections show."""
 
     normal_offset: Floats
     local: Floats
-    outgoing: Floats
+    transport: Floats
 
     @classmethod
     def of(cls, values: Floats, transport: Floats) -> TexelInputs:
         """Of texel `values` (n, PARAMETERS) and their `transport` (n, TRANSPORT)."""
-        return cls(*(np.ascontiguousarray(x) for x in (values[:, 5:], transport[:, : OUTGOING.start], transport[:, OUTGOING])))
+        return cls(*(np.ascontiguousarray(x) for x in (values[:, 5:], transport[:, LOCAL], transport)))
 
 
 @dataclass(frozen=True)
@@ -140,19 +143,19 @@ class PhotoBatch:
     def samples(self, texels: TexelInputs, tables: KernelTables, tilted: bool = False) -> PhotoSamples:
         """The pixels for searches over all photos, with `tilted` normals as well; each counts for its dominant texel."""
         normal = self.normal + interpolate(texels.normal_offset, self.texel, self.bilinear)
-        light = tables, interpolate(texels.local, self.texel, self.bilinear), texels.outgoing
+        light = tables, interpolate(texels.local, self.texel, self.bilinear), texels.transport
         others = tuple(self._shader(n, *light) for n in _tilted(normal)) if tilted else ()
         return PhotoSamples(self.dominant_texel, decode(self.colour), self.weight, self.block, self._shader(normal, *light), others)
 
-    def _shader(self, normal: Floats, tables: KernelTables, local: Floats, outgoing: Floats) -> Shader:
-        """The function that shades the pixels with the `normal` (n, 3) and light transport `local` (n, 8) and `outgoing` (texels, 3)."""
+    def _shader(self, normal: Floats, tables: KernelTables, local: Floats, transport: Floats) -> Shader:
+        """The function that shades the pixels with the `normal` (n, 3), their light transport `local` (n, 8), and that of the texels."""
         last: list[tuple[NDArray[np.float32], tuple[Floats, Floats, Floats]]] = []
 
         def parts(roughness: NDArray[np.float32]) -> tuple[Floats, Floats, Floats]:
             if not last or last[0][0] is not roughness:
                 out = np.empty_like(normal), np.empty_like(normal), np.empty_like(normal)
                 fit_kernel.linear_shading(
-                    self.dominant_texel, normal, self.view, self.reflected, local, outgoing, np.ascontiguousarray(roughness, np.float32),
+                    self.dominant_texel, normal, self.view, self.reflected, local, transport, np.ascontiguousarray(roughness, np.float32),
                     *tables.arrays, *out,
                 )  # fmt: skip
                 last[:] = [(roughness, out)]

@@ -59,7 +59,7 @@ def shade(
         visibility_d = visibility_s = torch.ones_like(roughness)
     else:
         visibility_d = occlusion if diffuse_visibility is None else diffuse_visibility
-        visibility_s = _specular_occlusion(normal, view, roughness, occlusion) if specular_visibility is None else specular_visibility
+        visibility_s = specular_occlusion(normal, view, roughness, occlusion) if specular_visibility is None else specular_visibility
     inputs = (normal, view, albedo, roughness, metallic, visibility_d, visibility_s, tables.table)
     if all(t.device.type == "cpu" and t.dtype == torch.float32 for t in inputs):
         colour: torch.Tensor = _Kernel.apply(tables.layout, *inputs)
@@ -77,7 +77,7 @@ def traced_specular_visibility(
     """
     with torch.no_grad():
         mirror = _mirror_weight(roughness)
-    ambient = _specular_occlusion(normal, view, roughness, occlusion)
+    ambient = specular_occlusion(normal, view, roughness, occlusion)
     return (1.0 - mirror) * ambient + mirror * (~blocked)
 
 
@@ -89,7 +89,7 @@ def mirror_reflection(
     It replaces the share of the environment that `traced_specular_visibility` blocks. Gradients go to albedo and metallic only.
     """
     with torch.no_grad():
-        cosine = _soft_cosine((_unit(normal) * view).sum(dim=1))
+        cosine = soft_cosine((_unit(normal) * view).sum(dim=1))
         split = brdf.split_sum(cosine, roughness)
         incident = _mirror_weight(roughness).unsqueeze(1) * radiance
     metal = metallic.unsqueeze(1)
@@ -99,8 +99,18 @@ def mirror_reflection(
 
 def transmitted_share(normal: torch.Tensor, view: torch.Tensor, roughness: torch.Tensor) -> torch.Tensor:
     """Share (n,) of diffuse reflection that a dielectric's specular layer lets through, 1 − (.04 A + B)."""
-    split = brdf.split_sum(_soft_cosine((_unit(normal) * view).sum(dim=1)), roughness)
+    split = brdf.split_sum(soft_cosine((_unit(normal) * view).sum(dim=1)), roughness)
     return 1.0 - 0.04 * split.scale - split.bias
+
+
+def specular_light(
+    normal: torch.Tensor, view: torch.Tensor, split: brdf.SplitSum, tables: LightTables, irradiance: torch.Tensor
+) -> torch.Tensor:
+    """Light (n, 3) of the environment in the specular lobe of unit normals; `irradiance` / π (n, 3) is that at the normals."""
+    mirror, share = split.mirror.unsqueeze(1), split.share.unsqueeze(1)
+    cosine = (normal * view).sum(dim=1, keepdim=True)
+    direction = (1.0 + mirror * (2.0 * cosine - 1.0)) * normal - mirror * view
+    return (1.0 - share) * tables.specular(direction, split.roughness) + share * irradiance
 
 
 def _unit(normal: torch.Tensor) -> torch.Tensor:
@@ -109,7 +119,8 @@ def _unit(normal: torch.Tensor) -> torch.Tensor:
     return torch.where(squared > float(kernels.MIN_SQUARED_LENGTH), unit, unit.detach())
 
 
-def _soft_cosine(cosine: torch.Tensor) -> torch.Tensor:
+def soft_cosine(cosine: torch.Tensor) -> torch.Tensor:
+    """n·v (n,) clamped smoothly, see `shade`."""
     return 0.5 * (cosine + (cosine * cosine + 4.0 * float(kernels.COSINE_CLAMP_WIDTH) ** 2).sqrt())
 
 
@@ -121,10 +132,10 @@ def _mirror_weight(roughness: torch.Tensor) -> torch.Tensor:
     return smoothness.pow(1.5) + smoothness * alpha
 
 
-def _specular_occlusion(normal: torch.Tensor, view: torch.Tensor, roughness: torch.Tensor, occlusion: torch.Tensor) -> torch.Tensor:
+def specular_occlusion(normal: torch.Tensor, view: torch.Tensor, roughness: torch.Tensor, occlusion: torch.Tensor) -> torch.Tensor:
     """Specular occlusion (n,) of Lagarde & de Rousiers, 1 = unoccluded. Only the ambient occlusion gets a gradient."""
     with torch.no_grad():
-        cosine = _soft_cosine((_unit(normal) * view).sum(dim=1)).clamp_max(1.0)
+        cosine = soft_cosine((_unit(normal) * view).sum(dim=1)).clamp_max(1.0)
         exponent = torch.exp2(-16.0 * roughness - 1.0)
     return ((cosine + occlusion).clamp_min(1e-3) ** exponent - 1.0 + occlusion).clamp(0.0, 1.0)
 
@@ -142,15 +153,13 @@ def _reference(
     """Reference implementation of `shade` in PyTorch, for any device and precision."""
     unit = _unit(normal)
     cosine = (unit * view).sum(dim=1, keepdim=True)
-    split = brdf.split_sum(_soft_cosine(cosine.squeeze(1)), roughness)
-    scale, bias, share, mirror = (x.unsqueeze(1) for x in (split.scale, split.bias, split.share, split.mirror))
-    direction = (1.0 + mirror * (2.0 * cosine - 1.0)) * unit - mirror * view
+    split = brdf.split_sum(soft_cosine(cosine.squeeze(1)), roughness)
+    scale, bias = split.scale.unsqueeze(1), split.bias.unsqueeze(1)
     irradiance = tables.diffuse(unit)
-    light = (1.0 - share) * tables.specular(direction, split.roughness) + share * irradiance
     metal = metallic.unsqueeze(1)
     f0 = 0.04 * (1.0 - metal) + metal * albedo
     diffuse = (1.0 - metal) * albedo * (1.0 - 0.04 * scale - bias) * irradiance
-    specular = light * (f0 * scale + bias)
+    specular = specular_light(unit, view, split, tables, irradiance) * (f0 * scale + bias)
     return visibility_d.unsqueeze(1) * diffuse + visibility_s.unsqueeze(1) * specular
 
 

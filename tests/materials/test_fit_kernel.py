@@ -30,7 +30,8 @@ class Case:
         self.normal = (unit / np.linalg.norm(unit, axis=1, keepdims=True)).astype(np.float32)
         self.values = np.concatenate([rng.uniform(0.02, 0.98, (TEXELS, 5)), rng.normal(0, 0.1, (TEXELS, 3))], 1).astype(np.float32)
         self.transport = rng.uniform(0, 1, (TEXELS, fit_kernel.TRANSPORT)).astype(np.float32)
-        self.transport[:, 2:] *= 0.2
+        self.transport[:, 2:14] *= 0.2
+        self.transport[:, 15:] = self.normal[rng.permutation(TEXELS)]
         texel = rng.integers(0, TEXELS, (PIXELS, 4))
         bilinear = rng.dirichlet(np.ones(4), PIXELS).astype(np.float32)
         bilinear[:50] = [1, 0, 0, 0]
