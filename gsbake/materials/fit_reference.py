@@ -14,9 +14,9 @@ import torch
 from torch import Tensor
 
 from gsbake.imaging.srgb_torch import linear_to_srgb
-from gsbake.materials.fit_kernel import MIN_BLOCKED
 from gsbake.materials.photo_batch import DIFFUSE, EMISSION, F0, INDIRECT, LOCAL, NORMAL, OCCLUSION, ROUGHNESS, VISIBILITY
 from gsbake.materials.pixels import Pixels
+from gsbake.materials.reflection_kernel import MIN_BLOCKED
 from gsbake.shading import brdf
 from gsbake.shading.light_tables import LightTables
 from gsbake.shading.split_sum import (
