@@ -40,8 +40,7 @@ SCORER, PYTHON = ROOT.parent / "shared" / "score", ROOT / ".score" / "bin" / "py
 #: Names of the stages up to the mesh.
 TO_MESH = ("ingest", "poses", "stereo", "train", "refine", "mesh")
 #: Overrides that turn all priors off.
-PRIORS = ("smoothness", "base_color_l1", "metallic_l1", "neutral_light", "light_smoothness", "sparsity")
-NO_PRIORS = tuple(f"bake.{prior}=0" for prior in PRIORS)
+NO_PRIORS = tuple(f"bake.{prior}=0" for prior in ("smoothness", "base_color_l1", "metallic_l1", "neutral_light", "sparsity"))
 #: Overrides of each row.
 ROW_SETTINGS: dict[str, tuple[str, ...]] = {
     "projected": ("surfels.shading=pbr", "bake.materials=surfels"),

@@ -250,7 +250,6 @@ class Bake(Section):
     base_color_l1: Weight = Field(0.005, description="L1 norm of base colour; resolves the albedo–illumination ambiguity.")
     metallic_l1: Weight = Field(0.003, description="L1 norm of metallic; most surfaces are dielectric.")
     neutral_light: Weight = Field(0.0005, description="Regularisation of the environment map towards grey.")
-    light_smoothness: Weight = Field(0.03, description="Total variation of the square root of the environment map.")
     sparsity: Weight = Field(0.03, description="Reflectance sparsity prior: an object has few materials. Scaled by the mean residual.")
     light_motion: Literal["auto", "static", "turntable", "camera"] = Field("auto", description="How the light moves, as the object sees it. static: it stands; turntable: the object was turned under it; camera: it is on the camera (flash); auto: what explains validation photos best.")
     default_roughness: Fraction = Field(0.8, description="Roughness where none is fitted (bake.materials = none or delight).")

@@ -4,13 +4,12 @@ Inverse rendering in texture space: with mesh, atlas and cameras fixed, each ste
 takes an Adam step on texels, normal offsets and light. The loss is
 
     Σ w ρ(sRGB(shade) − photo) + smoothness · |∇ texture| + base_color_l1 · mean (1 − metallic) base colour + metallic_l1 · mean metallic
-    + neutral_light · colourfulness of the light + light_smoothness · total variation of the light
-    + sparsity · residual · |texture − common materials|²
+    + neutral_light · colourfulness of the light + sparsity · residual · |texture − common materials|²
 
 ρ is pseudo-Huber, so that a misplaced reflection has little influence; a plain L1 error ignores reflections that are slightly off and makes
 the light too dim. The other terms are priors for what photos under one light leave open: neighbouring texels are similar; the L1 norm of
-base colour resolves the albedo–illumination ambiguity; most surfaces are dielectric; most light is neutral and smooth; an object has few
-materials (`sparsity_prior`, scaled by the residual: where photos are explained, they decide).
+base colour resolves the albedo–illumination ambiguity; most surfaces are dielectric; most light is neutral; an object has few materials
+(`sparsity_prior`, scaled by the residual: where photos are explained, they decide).
 
 Some parameters are searched for at given steps, because gradients do not reach them: the light's intensity and contrast
 (`light_intensity`), metals (`metallic`) and emissive regions (`emission`). The steps that follow may revise what was found. The initial
@@ -64,8 +63,8 @@ from gsbake.materials.texel_optimiser import TexelOptimiser
 from gsbake.shading.cubemap import solid_angles
 from gsbake.shading.environment import EnvironmentLight
 from gsbake.shading.light_motion import mean_radiance, rotated
-from gsbake.shading.light_priors import light_smoothness_loss, neutral_light_loss
 from gsbake.shading.light_tables import irradiance, prefilter_cube_map
+from gsbake.shading.neutral_light import neutral_light_loss
 from gsbake.texturing.resampling import DETAIL_OFFSET, MAX_DETAIL_RATIO
 
 Floats = NDArray[np.float32]
@@ -189,8 +188,6 @@ class MaterialFit:
         loss = (tables.table * torch.from_numpy(self._step_buffers.table.sum(0))).sum()
         if self._priors.neutral_light:
             loss = loss + len(self._values) * self._priors.neutral_light * neutral_light_loss(radiance)
-        if self._priors.light_smoothness:
-            loss = loss + len(self._values) * self._priors.light_smoothness * light_smoothness_loss(radiance)
         loss.backward()
         self._adam_light.step()
         self._update_texels(decay, normals)

@@ -15,14 +15,12 @@ class Priors:
     base_color_l1: float
     metallic_l1: float
     neutral_light: float
-    light_smoothness: float
     sparsity: float
 
     @classmethod
     def of(cls, settings: Bake) -> Priors:
         """The weights in the settings of the bake."""
-        s = settings
-        return cls(s.smoothness, s.base_color_l1, s.metallic_l1, s.neutral_light, s.light_smoothness, s.sparsity)
+        return cls(settings.smoothness, settings.base_color_l1, settings.metallic_l1, settings.neutral_light, settings.sparsity)
 
 
 @dataclass(frozen=True)

@@ -40,7 +40,6 @@ CONDITIONS: dict[str, Condition] = {
     "bake.smoothness": fits_materials,
     "bake.*_l1": fits_materials,
     "bake.neutral_light": fits_materials,
-    "bake.light_smoothness": fits_materials,
     "bake.sparsity": fits_materials,
     "bake.visibility": lambda p: p.bake.materials in ("fit", "delight"),
     "bake.default_roughness": lambda p: p.bake.materials in ("none", "delight"),

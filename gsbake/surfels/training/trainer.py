@@ -124,7 +124,7 @@ class Trainer:
         weights = ImageWeights(w.ssim, w.normal, w.mask, w.distortion if late else 0.0, w.smoothness)
         total, colour = image_losses(out.planes, tables, view, self.masked, self._background(view), weights)
         if tables is not None and w.neutral_light:
-            from gsbake.shading.light_priors import neutral_light_loss
+            from gsbake.shading.neutral_light import neutral_light_loss
 
             total = total + w.neutral_light * neutral_light_loss(self.light.radiance())
         views = self.half_views if self.coarse() else self.views

@@ -11,8 +11,8 @@ from torch import Tensor
 
 from gsbake.imaging.srgb_torch import linear_to_srgb
 from gsbake.pipeline.machine import missing_cuda_requirement
-from gsbake.shading.light_priors import neutral_light_loss
 from gsbake.shading.light_tables import LightTables
+from gsbake.shading.neutral_light import neutral_light_loss
 from gsbake.shading.prefilter import prefilter_operator
 from gsbake.shading.split_sum import shade
 from gsbake.surfels import spherical_harmonics as harmonics
