@@ -22,7 +22,7 @@ def run(ctx: Context) -> dict[str, Any]:
 
 STAGE = Stage(
     name="refine",
-    version=3,
+    version=4,
     title="Surfel refinement",
     run=run,
     summary="{surfels} surfels, {steps} steps, {psnr:dB} on validation photos",
