@@ -14,8 +14,11 @@ from gsbake.geometry.raycast import RayCaster
 from gsbake.imaging.srgb import encode
 from gsbake.materials.adjacency import neighbours
 from gsbake.materials.fit import MaterialFit
+from gsbake.materials.fit_kernel import TRANSPORT
+from gsbake.materials.fit_reference import reflected_radiance
 from gsbake.materials.fit_surface import FitSurface
 from gsbake.materials.options import FitSchedule, Priors
+from gsbake.materials.photo_batch import EMISSION, F0, NORMAL, OCCLUSION, ROUGHNESS
 from gsbake.materials.pixels import PixelReader, Pixels
 from gsbake.materials.reflections import ReflectionTracer
 from gsbake.materials.visibility import Visibility
@@ -125,3 +128,15 @@ def test_reflection_does_not_change_base_colour(corner: Corner) -> None:
         return float(np.abs(encode(fitted.values[known, :3]) - encode(base_color[known])).mean())
 
     assert error(True) < 0.7 * error(False)
+
+
+def test_a_reflected_mirror_shows_the_light_behind_the_viewer() -> None:
+    """A ray that comes down onto a mirror at 45° leaves along +x: it carries F0 times the light from there, and what the texel emits."""
+    light = EnvironmentLight.from_function(lambda at: np.repeat(np.where(at[:, :1] > 0.5, 2.0, 0.1), 3, 1), 32).prefilter().detach()
+    met = torch.zeros(1, TRANSPORT)
+    met[0, OCCLUSION], met[0, EMISSION], met[0, F0], met[0, ROUGHNESS] = 1, torch.tensor([0, 0, 0.5]), torch.tensor([0.9, 0.6, 0.3]), 0.1
+    met[0, NORMAL] = torch.tensor([np.sqrt(0.5), 0, np.sqrt(0.5)])
+    found = reflected_radiance(met, torch.tensor([[0.0, 0, -1]]), light)[0]
+    fresnel = (1 - np.sqrt(0.5)) ** 5
+    expected = [2 * (f0 + (1 - f0) * fresnel) + emitted for f0, emitted in ((0.9, 0), (0.6, 0), (0.3, 0.5))]
+    assert found.tolist() == pytest.approx(expected, rel=0.03)
