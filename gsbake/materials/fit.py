@@ -42,16 +42,18 @@ from gsbake.materials.linear_shading import PhotoSamples
 from gsbake.materials.metallic import find_metals
 from gsbake.materials.options import FitOptions, FitSchedule, Priors
 from gsbake.materials.photo_batch import (
+    DIFFUSE,
     EMISSION,
+    F0,
     INDIRECT,
     NORMAL,
+    ROUGHNESS,
     VISIBILITY,
     FitStep,
     KernelTables,
     PhotoBatch,
     PhotoLights,
     TexelInputs,
-    set_reflected,
     texel_weight,
 )
 from gsbake.materials.pixels import Pixels
@@ -214,7 +216,10 @@ class MaterialFit:
             lit = self._irradiance() * visible[:, None]
             indirect = transport.indirect_irradiance(lit, reflectance)
             self._transport[:, INDIRECT] = indirect
-            set_reflected(self._transport, self._values, lit + indirect)
+            metal = self._values[:, 4:5] * self._values[:, :3]
+            self._transport[:, DIFFUSE] = (self._values[:, :3] - metal) * (lit + indirect)
+            self._transport[:, F0] = metal + np.float32(0.04) * (1 - self._values[:, 4:5])
+            self._transport[:, ROUGHNESS] = self._values[:, 3]
 
     def _radiance(self) -> Floats:
         """The environment map (6, size, size, 3) in the frame in which it stands."""

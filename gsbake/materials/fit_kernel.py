@@ -33,7 +33,7 @@ from gsbake.shading.split_sum_kernel import (
     _roughness_level,
     _table_cell,
     _table_slopes,
-    _table_values,
+    _table_value,
     _taps,
 )
 
@@ -122,7 +122,11 @@ def shade_and_differentiate(
             soft = _HALF * (c + soft_root)
             root = math.sqrt(soft)
             row, col, fx, fy = _table_cell(root, rough, lut)
-            scale, bias, share, lobe_rough, mirror = _table_values(lut, row, col, fx, fy)
+            scale = _table_value(lut, row, col, fx, fy, 0)
+            bias = _table_value(lut, row, col, fx, fy, 1)
+            share = _table_value(lut, row, col, fx, fy, 2)
+            lobe_rough = _table_value(lut, row, col, fx, fy, 3)
+            mirror = _table_value(lut, row, col, fx, fy, 4)
             transmitted = _1 - _F0 * scale - bias
             coeff = _1 + mirror * (_2 * c - _1)
             rx = coeff * nx - mirror * vx
@@ -325,11 +329,14 @@ def linear_shading(
         vx, vy, vz = view[i, 0], view[i, 1], view[i, 2]
         soft = _HALF * (c + math.sqrt(c * c + _CLAMP_TERM))
         row, col, fx, fy = _table_cell(math.sqrt(soft), roughness, lut)
-        scale, bias, share, lobe_rough, mirror = _table_values(lut, row, col, fx, fy)
+        scale = _table_value(lut, row, col, fx, fy, 0)
+        bias = _table_value(lut, row, col, fx, fy, 1)
+        share = _table_value(lut, row, col, fx, fy, 2)
+        mirror = _table_value(lut, row, col, fx, fy, 4)
         transmitted = _1 - _F0 * scale - bias
         coeff = _1 + mirror * (_2 * c - _1)
         u, v = _encode(coeff * nx - mirror * vx, coeff * ny - mirror * vy, coeff * nz - mirror * vz)
-        level, t = _roughness_level(lobe_rough, knots)
+        level, t = _roughness_level(_table_value(lut, row, col, fx, fy, 3), knots)
         base0, stride0, fx0, fy0 = _taps(u, v, sizes[level], offsets[level])
         base1, stride1, fx1, fy1 = _taps(u, v, sizes[level + 1], offsets[level + 1])
         u, v = _encode(nx, ny, nz)

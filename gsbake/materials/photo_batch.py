@@ -180,14 +180,6 @@ def _tilted(normal: Floats) -> tuple[Floats, Floats]:
     return unit + step * first, unit + step * np.cross(unit, first)
 
 
-def set_reflected(transport: Floats, values: Floats, irradiance: Floats) -> None:
-    """Set the columns of `transport` (n, TRANSPORT) that reflections show, of texels with `values` (n, ≥ 5) and `irradiance` / π (n, 3)."""
-    base, metallic = values[:, :3], values[:, 4:5]
-    transport[:, DIFFUSE] = (1 - metallic) * base * irradiance
-    transport[:, F0] = metallic * base + np.float32(0.04) * (1 - metallic)
-    transport[:, ROUGHNESS] = values[:, 3]
-
-
 def texel_weight(batches: Iterable[PhotoBatch], count: int) -> Floats:
     """Total weight (count,) of the pixels that show each texel."""
     weight = np.zeros(count)

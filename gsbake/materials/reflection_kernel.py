@@ -21,7 +21,7 @@ from gsbake.shading.split_sum_kernel import (
     _mirror_weight,
     _roughness_level,
     _table_cell,
-    _table_values,
+    _table_value,
     _taps,
 )
 
@@ -73,11 +73,14 @@ def reflected_radiance(
     c = -(nx * x + ny * y + nz * z)
     soft = _HALF * (c + math.sqrt(c * c + _CLAMP_TERM))
     row, col, fx, fy = _table_cell(math.sqrt(soft), roughness, lut)
-    scale, bias, share, rough, mirror = _table_values(lut, row, col, fx, fy)
+    scale = _table_value(lut, row, col, fx, fy, 0)
+    bias = _table_value(lut, row, col, fx, fy, 1)
+    share = _table_value(lut, row, col, fx, fy, 2)
+    mirror = _table_value(lut, row, col, fx, fy, 4)
     transmitted = _1 - _F0 * scale - bias
     coeff = _1 + mirror * (_2 * c - _1)
     u, v = _encode(coeff * nx + mirror * x, coeff * ny + mirror * y, coeff * nz + mirror * z)
-    level, t = _roughness_level(rough, knots)
+    level, t = _roughness_level(_table_value(lut, row, col, fx, fy, 3), knots)
     base0, stride0, fx0, fy0 = _taps(u, v, sizes[level], offsets[level])
     base1, stride1, fx1, fy1 = _taps(u, v, sizes[level + 1], offsets[level + 1])
     u, v = _encode(nx, ny, nz)

@@ -159,15 +159,6 @@ def _table_value(lut: Any, row: Any, col: Any, fx: Any, fy: Any, k: Any) -> Any:
 
 
 @njit(inline="always", **_FLAGS)
-def _table_values(lut: Any, row: Any, col: Any, fx: Any, fy: Any) -> Any:
-    """All columns of the split-sum table between its nodes: scale, bias, share, roughness, mirror weight."""
-    return (
-        _table_value(lut, row, col, fx, fy, 0), _table_value(lut, row, col, fx, fy, 1), _table_value(lut, row, col, fx, fy, 2),
-        _table_value(lut, row, col, fx, fy, 3), _table_value(lut, row, col, fx, fy, 4),
-    )  # fmt: skip
-
-
-@njit(inline="always", **_FLAGS)
 def _table_slopes(lut: Any, row: Any, col: Any, fx: Any, fy: Any, k: Any) -> Any:
     """Derivatives of `_table_value` in fx and fy."""
     a, b = lut[row, col, k], lut[row, col + _U1, k]
@@ -188,7 +179,11 @@ def forward(
             inverse, nx, ny, nz, c = _geometry(normal, view, i)
             root = math.sqrt(_HALF * (c + math.sqrt(c * c + _CLAMP_TERM)))
             row, col, fx, fy = _table_cell(root, roughness[i], lut)
-            scale, bias, share, rough, mirror = _table_values(lut, row, col, fx, fy)
+            scale = _table_value(lut, row, col, fx, fy, 0)
+            bias = _table_value(lut, row, col, fx, fy, 1)
+            share = _table_value(lut, row, col, fx, fy, 2)
+            rough = _table_value(lut, row, col, fx, fy, 3)
+            mirror = _table_value(lut, row, col, fx, fy, 4)
             transmitted = _1 - _F0 * scale - bias
 
             coeff = _1 + mirror * (_2 * c - _1)
@@ -227,7 +222,11 @@ def backward(
             soft_root = math.sqrt(c * c + _CLAMP_TERM)
             root = math.sqrt(_HALF * (c + soft_root))
             row, col, fx, fy = _table_cell(root, roughness[i], lut)
-            scale, bias, share, rough, mirror = _table_values(lut, row, col, fx, fy)
+            scale = _table_value(lut, row, col, fx, fy, 0)
+            bias = _table_value(lut, row, col, fx, fy, 1)
+            share = _table_value(lut, row, col, fx, fy, 2)
+            rough = _table_value(lut, row, col, fx, fy, 3)
+            mirror = _table_value(lut, row, col, fx, fy, 4)
             transmitted = _1 - _F0 * scale - bias
 
             coeff = _1 + mirror * (_2 * c - _1)
