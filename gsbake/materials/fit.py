@@ -23,7 +23,7 @@ together in this way; visibility per texel and weights per view are added by the
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import Any
 
@@ -38,6 +38,7 @@ from gsbake.materials.emission import find_emission
 from gsbake.materials.fit_surface import FitSurface, Fitted
 from gsbake.materials.intensity_prior import IntensityPrior
 from gsbake.materials.light_intensity import LightAdjustment, adjust_radiance, search_light
+from gsbake.materials.light_optimiser import LightOptimiser
 from gsbake.materials.linear_shading import PhotoSamples
 from gsbake.materials.metallic import find_metals
 from gsbake.materials.options import FitOptions, FitSchedule, Priors
@@ -70,6 +71,14 @@ from gsbake.texturing.resampling import DETAIL_OFFSET, MAX_DETAIL_RATIO
 Floats = NDArray[np.float32]
 
 
+@dataclass(frozen=True)
+class FitState:
+    """Materials `values` (n, 5) of the texels and the light's `radiance` (6, size, size, 3)."""
+
+    values: Floats
+    radiance: Floats
+
+
 class MaterialFit:
     """Texels and light while they are optimised."""
 
@@ -97,11 +106,10 @@ class MaterialFit:
         self._transport = np.zeros((n, fit_kernel.TRANSPORT), np.float32)
         self._transport[:, :2] = surface.occlusion[:, None]
         self._transport[:, NORMAL] = self._unit_normals
-        self._light = EnvironmentLight(light_size)
+        self._lit = LightOptimiser(light_size, o)
         self._common = np.zeros((0, 4), np.float32)
         self._rotations: list[NDArray[np.float64] | None] = []  # of the fitted photos' lights
         self._residual = np.zeros(2)  # sums of weighted squared errors and of weights
-        self._adam_light = torch.optim.Adam([self._light.raw], lr=o.light_rate, betas=o.betas)
 
     @property
     def _values(self) -> Floats:
@@ -114,14 +122,13 @@ class MaterialFit:
         Base colour takes its detail from the surface's initial one.
         """
         o = self._options
-        fit = MaterialFit(surface, self._light.size, self._priors, 0.5, options=o)
+        fit = MaterialFit(surface, self._lit.light.size, self._priors, 0.5, options=o)
         values = up(self._values)
         detail = (surface.base_color + DETAIL_OFFSET) / (up(self._surface.base_color) + DETAIL_OFFSET)
         values[:, :3] = np.clip(values[:, :3] * np.clip(detail, 1 / MAX_DETAIL_RATIO, MAX_DETAIL_RATIO), *o.base_color_range)
         values[:, 3:5] = np.clip(values[:, 3:5], o.min_base_color, 1 - o.min_base_color)
         fit._texels = TexelOptimiser(surface, self._priors, o, np.ascontiguousarray(values, np.float32))
-        with torch.no_grad():
-            fit._light.raw.copy_(self._light.raw)
+        fit._lit.replace(self._lit.light)
         if self.emissive_regions:
             fit._transport[:, EMISSION] = up(self._transport[:, EMISSION])
         fit._metal_start, fit.emissive_regions, fit._adjustments = self._metal_start, self.emissive_regions, self._adjustments
@@ -161,35 +168,32 @@ class MaterialFit:
             if schedule.sparsity and self._priors.sparsity and update_common and step >= o.sparsity_from * steps:
                 self._common = self._find_common_materials()
             order = order or generator.permutation(len(batches)).tolist()
-            self._step(batches[order.pop()], schedule.rate * o.final_rate ** (step / steps), given, schedule.normals)
+            decay, light_decay = (schedule.rate * final ** (step / steps) for final in (o.final_rate, o.light_final_rate))
+            self._step(batches[order.pop()], decay, light_decay, given, schedule.normals)
             if each is not None:
                 each(step + 1, steps)
         values, emission = self._values[:, :5].copy(), self._transport[:, EMISSION].copy()
         loss, squared = self._errors(held_out) or (None, None)
         psnr = None if squared is None else decibels(squared)
         offset = self._values[:, 5:].copy()
-        return Fitted(values, offset, weight, emission, self._light, psnr, loss, self.emissive_regions, tuple(self._adjustments))
+        return Fitted(values, offset, weight, emission, self._lit.light, psnr, loss, self.emissive_regions, tuple(self._adjustments))
 
     def _batches(self, photos: list[Pixels]) -> list[PhotoBatch]:
         return [PhotoBatch.of(p, self._normal) for p in photos if len(p)]
 
-    def _step(self, batch: PhotoBatch, decay: float, given: PhotoLights | None, normals: bool) -> None:
-        """One Adam step on the pixels of one photo, with learning rates times `decay`; of the texels alone under a `given` light."""
-        o = self._options
+    def _step(self, batch: PhotoBatch, decay: float, light_decay: float, given: PhotoLights | None, normals: bool) -> None:
+        """One Adam step on the pixels of one photo, with learning rates times the decays; of the texels alone under a `given` light."""
         if given is not None:
             self._shade(batch, given.tables(batch.to_light))
             self._update_texels(decay, normals)
             return
-        radiance = self._light.radiance()
+        radiance = self._lit.light.radiance()
         tables = prefilter_cube_map(rotated(radiance, batch.to_light))
         self._shade(batch, KernelTables.of(tables))
-        self._adam_light.zero_grad()
-        self._adam_light.param_groups[0]["lr"] = o.light_rate * decay
         loss = (tables.table * torch.from_numpy(self._step_buffers.table.sum(0))).sum()
         if self._priors.neutral_light:
             loss = loss + len(self._values) * self._priors.neutral_light * neutral_light_loss(radiance)
-        loss.backward()
-        self._adam_light.step()
+        self._lit.step(loss, light_decay)
         self._update_texels(decay, normals)
 
     def _shade(self, batch: PhotoBatch, tables: KernelTables) -> None:
@@ -221,13 +225,9 @@ class MaterialFit:
             self._transport[:, F0] = metal + np.float32(0.04) * (1 - self._values[:, 4:5])
             self._transport[:, ROUGHNESS] = self._values[:, 3]
 
-    def _radiance(self) -> Floats:
-        """The environment map (6, size, size, 3) in the frame in which it stands."""
-        return np.asarray(self._light.radiance().detach().numpy())
-
     def _mean_radiance(self) -> Floats:
         """The environment map (6, size, size, 3) in the object's frame, the mean over photos where the light moves."""
-        return mean_radiance(self._radiance(), self._rotations)
+        return mean_radiance(self._lit.radiance(), self._rotations)
 
     def _irradiance(self) -> Floats:
         """Irradiance / π (n, 3) of unoccluded texels, the mean over photos where the light moves."""
@@ -235,7 +235,7 @@ class MaterialFit:
 
     def _lights(self) -> PhotoLights:
         """The present light as photos see it."""
-        return PhotoLights(self._light.radiance().detach())
+        return PhotoLights(self._lit.light.radiance().detach())
 
     def _find_common_materials(self) -> Floats:
         """The common material (n, 4) that the sparsity prior draws each texel to; emissive texels, whose base colour hardly shows, keep
@@ -263,7 +263,7 @@ class MaterialFit:
         subset = [part for b in batches[::step] if len(part := b.select(chosen))]
         if not subset:
             return LightAdjustment(np.ones(3), 1.0, 0.0, 0.0)
-        radiance, area = self._radiance(), solid_angles(self._light.size)
+        radiance, area = self._lit.radiance(), solid_angles(self._lit.light.size)
         visible: dict[float, Floats] = {}  # the share does not depend on the intensity, and hardly on the tint
 
         def adjusted(intensity: NDArray[np.float64], contrast: float) -> EnvironmentLight:
@@ -292,8 +292,7 @@ class MaterialFit:
         """Replace the light, and change the base colours of the texels (m,) so that their diffuse colours stay."""
         o = self._options
         before = self._irradiance() * self._transport[:, :1] + self._transport[:, INDIRECT]
-        self._light.raw.copy_(light.raw)
-        self._adam_light.state.clear()
+        self._lit.replace(light)
         self._update_transport()
         after = self._irradiance() * self._transport[:, :1] + self._transport[:, INDIRECT]
         new = self._values[texel, :5]
@@ -332,7 +331,7 @@ class MaterialFit:
         """Move `shading` of these coefficients (8, 3) from the base colours of dielectrics to the light."""
         texel = np.flatnonzero(self._dielectric())
         matched = self._unit_normals[np.random.default_rng(seed).choice(texel, min(MATCHED_POINTS, len(texel)), replace=False)]
-        light = with_irradiance_factor(self._radiance(), shading, matched, partial(irradiance, normals=matched))
+        light = with_irradiance_factor(self._lit.radiance(), shading, matched, partial(irradiance, normals=matched))
         self._change_light(EnvironmentLight.from_radiance(light), texel)
 
     @cached_property
@@ -348,8 +347,7 @@ class MaterialFit:
     def _scale_light(self) -> LightAdjustment:
         """Scale the light to the intensity expected by the prior, and base colours with it: reflections of metal leave the scale open."""
         o, factor = self._options, 1 / self.intensity_prior().mean_factor()
-        self._light.raw.copy_(EnvironmentLight.from_radiance(self._radiance() / np.float32(factor)).raw)
-        self._adam_light.state.clear()
+        self._lit.replace(self._lit.radiance() / np.float32(factor))
         new = self._values[:, :5].copy()
         new[:, :3] = np.clip(new[:, :3] * np.float32(factor), o.min_base_color, o.base_color_range[1])
         self._texels.reinitialise(np.arange(len(new)), np.clip(new, 1e-6, 1 - 1e-6))
@@ -364,11 +362,9 @@ class MaterialFit:
     def _search_metals(self, batches: list[PhotoBatch]) -> None:
         """Reinitialise texels that are detected as metal, and from a metallic start those that are dielectric."""
         o = self._options
-        step = max(1, sum(map(len, batches)) // (o.metal_pixels * len(self._values)))
-        samples = self._samples([batch.every(step) for batch in batches], tilted=True)
         wide = self._neighbourhoods.wide  # errors of a moving light, which is an approximation, are similar all over a near one
         near = wide if self.moving_light else self._neighbourhoods.near(self._values)
-        found = find_metals(samples, self._values[:, 3].copy(), near, wide)
+        found = find_metals(self._metal_samples(batches), self._values[:, 3].copy(), near, wide)
         kinds = [(found.texel, found.base, found.roughness, o.detected_metallic)]
         if self._metal_start:
             kinds.append((*found.dielectric, o.detected_dielectric))
@@ -387,6 +383,34 @@ class MaterialFit:
         black[:, :3], black[:, 4] = o.base_color_range[0], o.detected_dielectric
         self._texels.reinitialise(found.texel, black)
         return found.regions
+
+    def state(self) -> FitState:
+        """The materials and the light, to return to with `restore`."""
+        return FitState(self._values[:, :5].copy(), self._lit.radiance())
+
+    def restore(self, state: FitState, photos: list[Pixels]) -> None:
+        """Return to a `state` of a fit to `photos`; moments of the optimisers start anew."""
+        self._rotations = [pixels.to_light for pixels in photos]
+        self._lit.replace(state.radiance)
+        self.set_materials(np.arange(len(state.values)), state.values)
+
+    def set_materials(self, texel: NDArray[np.int64], values: NDArray[Any]) -> None:
+        """Set the materials of texels (m,) to `values` (m, 5), within the range of logits, and what follows from them."""
+        tiny = self._options.min_base_color
+        self._texels.reinitialise(texel, np.clip(values, tiny, 1 - tiny))
+        self._update_transport()
+
+    def kind(self, metal: bool) -> float:
+        """Metallic of texels that become `metal` or dielectric."""
+        return self._options.detected_metallic if metal else self._options.detected_dielectric
+
+    def metal_samples(self, photos: list[Pixels]) -> list[PhotoSamples]:
+        """The pixels of `photos` that a search for metals uses, with tilted normals, under the present light."""
+        return self._metal_samples(self._batches(photos))
+
+    def _metal_samples(self, batches: list[PhotoBatch]) -> list[PhotoSamples]:
+        step = max(1, sum(map(len, batches)) // (self._options.metal_pixels * len(self._values)))
+        return self._samples([batch.every(step) for batch in batches], tilted=True)
 
     def samples_of(self, pixels: Pixels, chosen: NDArray[np.bool_]) -> tuple[NDArray[np.int64], PhotoSamples]:
         """Which (m,) of the `pixels` have a dominant texel that is `chosen` (n,), and their samples under the fitted light."""

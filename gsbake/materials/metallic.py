@@ -22,7 +22,7 @@ wider neighbourhood of similar photos does, in which narrow metal between wood o
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -129,17 +129,26 @@ class _BestModel:
         self.cost[better], self.base[better], self.roughness[better] = cost[better], base[better], roughness[better]
 
 
+def candidate_models(
+    photos: Sequence[PhotoSamples], solver: BaseColourSolver, metallic: float, roughnesses: Iterable[NDArray[np.float32]]
+) -> Iterator[tuple[Floats, Floats, NDArray[np.float32]]]:
+    """For each of the `roughnesses` (texels,) the best models at `metallic` 0 or 1: costs (texels,), which are negative log-likelihoods up
+    to a constant, base colours (texels, 3) and the roughness."""
+    lowest = MIN_METAL_ALBEDO if metallic else 0.0
+    for roughness in roughnesses:
+        models = [ShadingModel.of(samples, roughness, metallic) for samples in photos]
+        base = solver.solve([model.shading for model in models], lowest)
+        costs = [model.negative_log_likelihood(samples, base) for samples, model in zip(photos, models, strict=True)]
+        yield sum(costs, np.zeros(len(base))), base, roughness
+
+
 def _compare_models(photos: Sequence[PhotoSamples], own: NDArray[np.float32]) -> tuple[_BestModel, _BestModel]:
     """The best dielectric and the best metal of each texel over all roughnesses tried."""
     texels = len(own)
-    solver = BaseColourSolver(photos, texels)
-    dielectric, metal = _BestModel(texels), _BestModel(texels)
-    for tried in (own, *(np.full(texels, r, np.float32) for r in TRIED_ROUGHNESS)):
-        for metallic, lowest in ((0.0, 0.0), (1.0, MIN_METAL_ALBEDO)):
-            if metallic and tried is own:
-                tried = np.minimum(own, np.float32(MAX_METAL_ROUGHNESS))
-            models = [ShadingModel.of(samples, tried, metallic) for samples in photos]
-            b = solver.solve([model.shading for model in models], lowest)
-            cost = sum((m.negative_log_likelihood(s, b) for s, m in zip(photos, models, strict=True)), np.zeros(texels))
-            (metal if metallic else dielectric).offer(cost, b, tried)
-    return dielectric, metal
+    solver, tried = BaseColourSolver(photos, texels), [np.full(texels, r, np.float32) for r in TRIED_ROUGHNESS]
+    found = _BestModel(texels), _BestModel(texels)
+    for metallic, best in enumerate(found):
+        first = np.minimum(own, np.float32(MAX_METAL_ROUGHNESS)) if metallic else own
+        for cost, base, roughness in candidate_models(photos, solver, metallic, (first, *tried)):
+            best.offer(cost, base, roughness)
+    return found

@@ -56,8 +56,9 @@ class FitOptions:
     light_rate: float = 0.3
     #: Adam's learning rate of the normal offsets, per step; small, as the mesh's normals are nearly right.
     normal_rate: float = 0.01
-    #: Factor on all learning rates at the last step; the decay is exponential.
+    #: Factor on the learning rates of texels and of the light at the last step; the decay is exponential.
     final_rate: float = 0.1
+    light_final_rate: float = 0.03
     #: Adam's decay rates of the first and second moments; short, as a fit has a few hundred steps.
     betas: tuple[float, float] = (0.9, 0.99)
     #: Adam's ε for texels and normals, a gradient of the loss per texel: texels that few pixels show take smaller steps.

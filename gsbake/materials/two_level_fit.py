@@ -13,12 +13,15 @@ from functools import partial
 from gsbake.materials.fit import MaterialFit
 from gsbake.materials.initialisation import DEFAULT_START, ChosenFit, best_fit, trial_fits, trial_schedule
 from gsbake.materials.levels import FitLevel
+from gsbake.materials.metal_trials import try_kinds
 from gsbake.materials.options import FitSchedule, Priors
 from gsbake.shading.light_motion import Motion
 from gsbake.texturing.resampling import CoarseTexture
 
 #: Steps of a trial, of the continued fit on the coarse level, and on the fine one, as shares of the iterations.
 TRIAL_SHARE, COARSE_SHARE, FINE_SHARE = 0.25, 0.5, 0.25
+#: Steps of a trial of another kind for a group of texels, as a share of the iterations.
+KIND_SHARE = 0.15
 #: How often shading left in base colours is moved to the light at the end of the coarse level, where most is dielectric and the light
 #: stands, and the steps after each, as a share of the iterations, in which texels adapt to it, with their factor on the learning rates.
 #: From there the light is given: gradient steps would move it back, as that base colours have no shading is not part of their loss.
@@ -59,6 +62,13 @@ def compare_light_motions(levels: Mapping[Motion, FitLevel], plan: FitPlan, prog
     return found
 
 
+def _with_other_kinds(choice: ChosenFit, level: FitLevel, plan: FitPlan, each: Callable[[int, int], None]) -> ChosenFit:
+    """The choice with those groups of texels turned into metal or dielectric that validation photos prefer as such."""
+    steps = FitSchedule(plan.steps(KIND_SHARE), plan.seed, (), emission=False, light_searches_at=(), sparsity=False, normals=False)
+    found = try_kinds(choice.fit, choice.fitted, level, steps, each)
+    return replace(choice, fitted=found.fitted, evidence=f"{choice.evidence}; {found}")
+
+
 def fit_two_levels(coarse: FitLevel, fine: FitLevel, texture: CoarseTexture, plan: FitPlan, progress: Progress) -> ChosenFit:
     """The fit on the `fine` level, whose texels `texture` reduces to those of `coarse`."""
     steps = plan.steps
@@ -72,6 +82,8 @@ def fit_two_levels(coarse: FitLevel, fine: FitLevel, texture: CoarseTexture, pla
     trials = trial_fits(make, coarse, steps(TRIAL_SHARE), plan.seed, plan.diffuse, each("trial fits"))
     schedule = FitSchedule(steps(COARSE_SHARE), plan.seed, diffuse=plan.diffuse, normals=False)
     choice = best_fit(trials, coarse, schedule, each("material fit, coarse level"))
+    if not plan.diffuse:
+        choice = _with_other_kinds(choice, coarse, plan, each("trials of metal and dielectric"))
     refine = FitSchedule(steps(FINE_SHARE), plan.seed, FINE_METAL_SEARCHES_AT, emission=False, light_searches_at=(), diffuse=plan.diffuse)
     if choice.fit.mostly_dielectric and not choice.fit.moving_light:
         refine = replace(refine, fixed_light=True)

@@ -69,7 +69,8 @@ def room(directions: NDArray[np.float64]) -> NDArray[np.float64]:
 class Scene:
     """A sphere of two base colours, or of a uniform distribution between them (`even`), with constant `roughness`, in `count` photos.
 
-    With `reference` the images are made by `tests.support.monte_carlo`; `motion` is that of the light."""
+    With `reference` the images are made by `tests.support.monte_carlo`; `motion` is that of the light. With `striped` only the second base
+    colour has the `metallic` given, the first is dielectric: `metallic` (n,) has the true values."""
 
     def __init__(
         self,
@@ -79,6 +80,7 @@ class Scene:
         reference: bool = False,
         metallic: float = 0.0,
         motion: Motion = "static",
+        striped: bool = False,
     ) -> None:
         mesh, uv = sphere()
         caster = RayCaster(mesh.vertices, mesh.faces, 1)
@@ -89,6 +91,7 @@ class Scene:
         stripe = np.sin(5 * np.arctan2(self.normal[:, 1], self.normal[:, 0]) + 4 * self.normal[:, 2])[:, None]
         share = np.arcsin(stripe) / np.pi + 0.5 if even else stripe > 0
         self.base_color = (share * [0.6, 0.2, 0.1] + (1 - share) * [0.05, 0.3, 0.4]).astype(np.float32)
+        self.metallic = np.where(striped & (share[:, 0] > 0.5), 0.0, metallic).astype(np.float32)
         tables = EnvironmentLight.from_function(room, 16).prefilter()
         reader = PixelReader(caster, uv, self.texels, 2.0)
         self.photos: list[Pixels] = []
@@ -98,14 +101,14 @@ class Scene:
                 tables = EnvironmentLight.from_function(lambda d, turn=turned[k]: room(d @ turn.T), 16).prefilter()
             blank = reader.read(camera, np.zeros((camera.height, camera.width, 3), np.uint8), None)
             base_color, normal = (np.einsum("nk,nkc->nc", blank.bilinear, x[blank.texel]) for x in (self.base_color, self.normal))
-            n = len(blank)
+            n, metal = len(blank), np.einsum("nk,nk->n", blank.bilinear, self.metallic[blank.texel])
             if reference:
                 unit = normal / np.linalg.norm(normal, axis=1, keepdims=True)
-                linear = render(unit, blank.view, base_color, np.full(n, roughness), np.full(n, metallic), room)
+                linear = render(unit, blank.view, base_color, np.full(n, roughness), metal, room)
             else:
                 with torch.no_grad():
                     n_, base_ = torch.as_tensor(normal, dtype=torch.float32), torch.as_tensor(base_color, dtype=torch.float32)
-                    rough_, metal_ = torch.full((n,), roughness), torch.full((n,), metallic)
+                    rough_, metal_ = torch.full((n,), roughness), torch.as_tensor(metal, dtype=torch.float32)
                     linear = shade(n_, torch.as_tensor(blank.view), base_, rough_, metal_, tables).numpy()
             self.photos.append(replace(blank, colour=encode(linear)))
 

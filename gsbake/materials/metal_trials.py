@@ -1,0 +1,162 @@
+"""Trials of metal and dielectric: groups of texels are turned into the other kind, and validation photos decide.
+
+The search for metals (`metallic`) compares both kinds under the present light. But a light that was fitted while a region passed for the
+wrong kind has adapted to it, and goes on confirming it: gradient steps and searches in turn stay where they are (coordinate descent in a
+nonconvex problem). So here a whole group of similar texels is turned over, texels and light adapt for a few steps, and only then the two
+are compared, by the robust error on photos that the fit does not see.
+
+Groups are found by k-means in the space of fitted material and photographed colour. The group's pixels together choose the roughness of
+the other kind, and tell whether a trial is worth its time: likelihoods that clearly speak for the present kind are believed.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.cluster.vq import kmeans2
+
+from gsbake.materials.fit import MaterialFit
+from gsbake.materials.fit_surface import Fitted
+from gsbake.materials.levels import FitLevel
+from gsbake.materials.linear_shading import BaseColourSolver, observed_weight
+from gsbake.materials.metallic import TRIED_ROUGHNESS, candidate_models
+from gsbake.materials.options import FitSchedule
+
+Floats = NDArray[np.float64]
+
+#: Number of groups; those with less than this share of the observed texels have no trial.
+GROUPS, MIN_SHARE = 24, 0.008
+#: Weight from which a texel is observed.
+MIN_WEIGHT = 0.3
+#: What is added to linear colours before their logarithm is taken, and the factor on luminance beside chromaticity in groups.
+LOG_OFFSET, LUMINANCE_FACTOR = 0.02, 0.3
+#: Mean log-likelihood ratio per pixel for the present kind up to which a group has a trial.
+MAX_EVIDENCE = 2.0
+#: A group becomes metal when that lowers the validation error by this share, and dielectric when it does not rise: most things are.
+MIN_DECREASE = 0.005
+#: Factor on the learning rates: the fit adapts, and noise of single photos does not decide.
+RATE = 0.3
+
+#: Called after every step with the number of steps done and their total.
+Each = Callable[[int, int], None]
+
+
+@dataclass(frozen=True)
+class TrialResult:
+    """The fit's result `fitted` after trials, the number of `trials`, and of texels turned `to_metal` and `to_dielectric`."""
+
+    fitted: Fitted
+    trials: int
+    to_metal: int
+    to_dielectric: int
+
+    def __str__(self) -> str:
+        return f"{self.trials} trials of groups of texels: {self.to_metal} texels became metal, {self.to_dielectric} dielectric"
+
+
+def try_kinds(fit: MaterialFit, fitted: Fitted, level: FitLevel, schedule: FitSchedule, each: Each) -> TrialResult:
+    """Try groups of texels as the other kind and keep what validation photos prefer.
+
+    `fit` on the `level`, with the result `fitted`, changes in place; `schedule` has the steps of each trial. Without validation
+    photos nothing is tried. Under a light that moves, which is an approximation, to whose errors metals adapt, nothing becomes metal.
+    """
+    if not any(map(len, level.held_out)):
+        return TrialResult(fitted, 0, 0, 0)
+    trial = _Trials(fit, level, replace(schedule, rate=RATE), each)
+    trial.run((fitted.weight > MIN_WEIGHT) & (fitted.emission.sum(1) == 0))
+    return TrialResult(trial.fitted, trial.count, *trial.changed)
+
+
+class _Trials:
+    """Trials one after another: `state` is the best so far, `fitted` its result, after as many steps as any trial from it."""
+
+    def __init__(self, fit: MaterialFit, level: FitLevel, schedule: FitSchedule, each: Each) -> None:
+        self.fit, self.level, self.schedule, self.each = fit, level, schedule, each
+        self.count, self.changed = 0, [0, 0]
+        self._adapt()
+        self.state = fit.state()
+        self.fitted = self._adapt()
+
+    def _adapt(self) -> Fitted:
+        return self.fit.run(self.level.fitted, self.level.held_out, self.schedule, self.each)
+
+    def run(self, observed: NDArray[np.bool_]) -> None:
+        """Try the groups of `observed` (n,) texels, those first whose evidence for the other kind is strongest."""
+        self.fit.restore(self.state, self.level.fitted)
+        models, tries = _Models(self.fit, self.level), []
+        for group in _groups(self.state.values, np.asarray(self.level.surface.base_color), observed):
+            share, for_dielectric = (self.state.values[group, 4] > 0.5).mean(), models.evidence(group)
+            for metal, for_present in ((True, for_dielectric), (False, -for_dielectric)):
+                if share != metal and for_present < MAX_EVIDENCE and not (metal and self.fit.moving_light):
+                    tries.append((for_present, metal, group))
+        for _, metal, group in sorted(tries, key=lambda entry: entry[0]):
+            self._try(models, metal, group)
+        self.fit.restore(self.state, self.level.fitted)
+
+    def _try(self, models: _Models, metal: bool, group: NDArray[np.int64]) -> None:
+        """Turn the `group` (m,) of texels into `metal` or dielectric, and keep that where validation photos prefer it."""
+        texel = group[(self.state.values[group, 4] > 0.5) != metal]
+        if not len(texel):
+            return
+        base, roughness = models.best(metal, group, texel)
+        self.fit.restore(self.state, self.level.fitted)
+        metallic = self.fit.kind(metal)
+        self.fit.set_materials(texel, np.column_stack([base, np.full(len(texel), roughness), np.full(len(texel), metallic)]))
+        bound = _error(self.fitted) * (1 - MIN_DECREASE if metal else 1)
+        self.count += 1
+        if _error(self._adapt()) < bound:
+            self.state = self.fit.state()
+            self.fitted = self._adapt()
+            self.changed[not metal] += len(texel)
+
+
+class _Models:
+    """Dielectric and metallic models of all texels under the present light, at each of a few roughnesses."""
+
+    def __init__(self, fit: MaterialFit, level: FitLevel) -> None:
+        photos, texels = fit.metal_samples(level.fitted), len(level.surface.texels)
+        self._weight = observed_weight(photos, texels)
+        solver, tried = BaseColourSolver(photos, texels), [np.full(texels, r, np.float32) for r in TRIED_ROUGHNESS]
+        self._found = [[*candidate_models(photos, solver, metallic, tried)] for metallic in (0.0, 1.0)]
+
+    def _costs(self, metal: bool, group: NDArray[np.int64]) -> list[float]:
+        """Negative log-likelihood of all pixels of a `group` (m,) at each roughness."""
+        return [float(cost[group].sum()) for cost, *_ in self._found[metal]]
+
+    def evidence(self, group: NDArray[np.int64]) -> float:
+        """Mean log-likelihood ratio per pixel of the `group` (m,) for dielectric against metal, at one roughness of each."""
+        difference = min(self._costs(True, group)) - min(self._costs(False, group))
+        return difference / max(float(self._weight[group].sum()), 1e-6)
+
+    def best(self, metal: bool, group: NDArray[np.int64], texel: NDArray[np.int64]) -> tuple[Floats, float]:
+        """Base colours (k, 3) of the texels (k,), and the roughness at which the whole `group` (m,) is explained best."""
+        index = int(np.argmin(self._costs(metal, group)))
+        return self._found[metal][index][1][texel], TRIED_ROUGHNESS[index]
+
+
+def _groups(values: NDArray[Any], photographed: NDArray[Any], observed: NDArray[np.bool_]) -> list[NDArray[np.int64]]:
+    """Indices (m,) of the `observed` (n,) texels of each group that is large enough: similar in material `values` (n, 5) and linear
+    `photographed` colour (n, 3)."""
+    texel = np.flatnonzero(observed)
+    columns = [values[texel, 3:5].astype(np.float64)]
+    for colour in (photographed, values[:, :3]):
+        log = np.log(np.maximum(colour[texel], 0) + LOG_OFFSET)
+        columns.append(np.column_stack([log[:, 0] - log[:, 1], log[:, 2] - log[:, 1], LUMINANCE_FACTOR * log.mean(1)]))
+    points = np.column_stack(columns)
+    count = min(GROUPS, len(points))
+    if not count:
+        return []
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # of empty groups
+        label = kmeans2(points, count, minit="++", rng=np.random.default_rng(0))[1]
+    groups = [texel[label == group] for group in range(count)]
+    return [group for group in groups if len(group) >= max(1, MIN_SHARE * len(texel))]
+
+
+def _error(fitted: Fitted) -> float:
+    return fitted.held_out_loss or 0.0

@@ -1,0 +1,84 @@
+"""Trials of metal and dielectric on spheres of known kind, fitted as the other one."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from gsbake.materials.fit import MaterialFit
+from gsbake.materials.fit_surface import Fitted
+from gsbake.materials.levels import FitLevel
+from gsbake.materials.metal_trials import GROUPS, MIN_SHARE, TrialResult, _groups, try_kinds
+from gsbake.materials.options import FitSchedule
+from tests.materials.test_fit import Scene
+
+QUIET = FitSchedule(120, metal_searches_at=(), emission=False, light_searches_at=(), sparsity=False, normals=False)
+TRIAL = replace(QUIET, iterations=40)
+
+
+def nothing(done: int, total: int) -> None:
+    pass
+
+
+def tried(scene: Scene, start: float, validation: int = 2) -> tuple[MaterialFit, Fitted, TrialResult]:
+    """A fit in which all texels stay of the kind that they start as, and what trials made of it."""
+    fit = scene.fit(0.3, metallic=start)
+    level = FitLevel(scene.surface(), scene.photos[validation:], scene.photos[:validation])
+    before = fit.run(level.fitted, level.held_out, QUIET)
+    return fit, before, try_kinds(fit, before, level, TRIAL, nothing)
+
+
+@pytest.mark.parametrize("start", [0.05, 0.9])
+def test_groups_of_the_wrong_kind_are_turned(start: float) -> None:
+    scene = Scene(0.25, metallic=1.0, striped=True)
+    _, before, found = tried(scene, start)
+    known, truth = before.weight > 0.3, scene.metallic > 0.5
+    was, now = ((fitted.values[known, 4] > 0.5) for fitted in (before, found.fitted))
+    assert (was != truth[known]).mean() > 0.3
+    assert (now != was).mean() > 0.05
+    assert (now == truth[known])[now != was].mean() > 0.7
+    assert (found.to_dielectric if start > 0.5 else found.to_metal) > 0
+    assert before.held_out_loss is not None and found.fitted.held_out_loss is not None
+    assert found.fitted.held_out_loss < before.held_out_loss
+
+
+def test_groups_of_the_right_kind_stay() -> None:
+    fit, before, _ = tried(Scene(0.25), 0.05)
+    assert (fit.state().values[before.weight > 0.3, 4] > 0.5).mean() < 0.03
+
+
+def test_the_fit_ends_in_the_state_that_was_kept() -> None:
+    fit, _, found = tried(Scene(0.25, metallic=1.0), 0.05)
+    kept = fit.state().values
+    assert found.trials > 0
+    assert np.abs(kept[:, 4] - found.fitted.values[:, 4]).mean() < 0.1  # `fitted` is some steps further
+
+
+def test_nothing_is_tried_without_validation_photos() -> None:
+    _, before, found = tried(Scene(0.25), 0.05, validation=0)
+    assert found.trials == 0 and found.fitted is before
+
+
+def test_nothing_becomes_metal_under_a_light_that_moves() -> None:
+    scene = Scene(0.25, metallic=1.0)
+    scene.photos = [replace(photo, to_light=np.eye(3)) for photo in scene.photos]
+    assert tried(scene, 0.05)[2].to_metal == 0
+
+
+def test_texels_of_one_group_are_similar_and_small_groups_are_left_out() -> None:
+    rng = np.random.default_rng(0)
+    kind = rng.random(2000) < 0.3
+    colour = np.where(kind[:, None], [0.5, 0.2, 0.1], [0.2, 0.4, 0.3]) * rng.uniform(0.9, 1.1, (2000, 1))
+    values = np.column_stack([colour, np.full(2000, 0.4), np.full(2000, 0.05)])
+    observed = np.arange(2000) < 1900
+    groups = _groups(values, colour, observed)
+    assert 1 < len(groups) <= GROUPS
+    assert all(kind[group].all() or not kind[group].any() for group in groups)
+    assert all(len(group) >= MIN_SHARE * 1900 and observed[group].all() for group in groups)
+    assert len(np.unique(np.concatenate(groups))) == sum(map(len, groups))
+
+
+def test_no_texels_have_no_groups() -> None:
+    assert _groups(np.zeros((5, 5)), np.zeros((5, 3)), np.zeros(5, bool)) == []
