@@ -33,6 +33,7 @@ from numpy.typing import NDArray
 
 from gsbake.imaging.metrics import decibels
 from gsbake.materials import fit_kernel
+from gsbake.materials.base_color_noise import without_noise
 from gsbake.materials.bilateral import Neighbourhoods
 from gsbake.materials.emission import find_emission
 from gsbake.materials.fit_surface import FitSurface, Fitted
@@ -403,6 +404,13 @@ class MaterialFit:
     def kind(self, metal: bool) -> float:
         """Metallic of texels that become `metal` or dielectric."""
         return self._options.detected_metallic if metal else self._options.detected_dielectric
+
+    def remove_noise(self, photos: list[Pixels]) -> None:
+        """Take out of metals' base colours the noise that two halves of the `photos` tell."""
+        surface, metal = self._surface, (self._values[:, 4] > 0.5) & self._non_emissive()
+        base = without_noise(self.metal_samples(photos), self._values, metal, surface.texels, surface.pairs)
+        texel = np.flatnonzero(metal)
+        self.set_materials(texel, np.column_stack([base[texel], self._values[texel, 3:5]]))
 
     def metal_samples(self, photos: list[Pixels]) -> list[PhotoSamples]:
         """The pixels of `photos` that a search for metals uses, with tilted normals, under the present light."""

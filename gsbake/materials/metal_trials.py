@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -39,8 +39,6 @@ LOG_OFFSET, LUMINANCE_FACTOR = 0.02, 0.3
 MAX_EVIDENCE = 2.0
 #: A group becomes metal when that lowers the validation error by this share, and dielectric when it does not rise: most things are.
 MIN_DECREASE = 0.005
-#: Factor on the learning rates: the fit adapts, and noise of single photos does not decide.
-RATE = 0.3
 
 #: Called after every step with the number of steps done and their total.
 Each = Callable[[int, int], None]
@@ -67,7 +65,7 @@ def try_kinds(fit: MaterialFit, fitted: Fitted, level: FitLevel, schedule: FitSc
     """
     if not any(map(len, level.held_out)):
         return TrialResult(fitted, 0, 0, 0)
-    trial = _Trials(fit, level, replace(schedule, rate=RATE), each)
+    trial = _Trials(fit, level, schedule, each)
     trial.run((fitted.weight > MIN_WEIGHT) & (fitted.emission.sum(1) == 0))
     return TrialResult(trial.fitted, trial.count, *trial.changed)
 

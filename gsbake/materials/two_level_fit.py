@@ -20,12 +20,14 @@ from gsbake.texturing.resampling import CoarseTexture
 
 #: Steps of a trial, of the continued fit on the coarse level, and on the fine one, as shares of the iterations.
 TRIAL_SHARE, COARSE_SHARE, FINE_SHARE = 0.25, 0.5, 0.25
-#: Steps of a trial of another kind for a group of texels, as a share of the iterations.
-KIND_SHARE = 0.15
+#: How often the noise of metals' base colours is removed on the coarse level, and the steps after each, as after each trial of another kind
+#: for a group of texels, in which texels and light adapt, as a share of the iterations, with their factor on the learning rates: noise of
+#: single photos does not decide.
+NOISE_ROUNDS, ADAPT_SHARE, ADAPT_RATE = 2, 0.15, 0.3
 #: How often shading left in base colours is moved to the light at the end of the coarse level, where most is dielectric and the light
 #: stands, and the steps after each, as a share of the iterations, in which texels adapt to it, with their factor on the learning rates.
 #: From there the light is given: gradient steps would move it back, as that base colours have no shading is not part of their loss.
-SHADING_ROUNDS, ADAPT_SHARE, ADAPT_RATE = 4, 0.05, 0.5
+SHADING_ROUNDS, SHADING_SHARE, SHADING_RATE = 4, 0.05, 0.5
 #: When metals are searched for on the fine level, as a share of its steps.
 FINE_METAL_SEARCHES_AT = (0.3,)
 
@@ -62,9 +64,14 @@ def compare_light_motions(levels: Mapping[Motion, FitLevel], plan: FitPlan, prog
     return found
 
 
-def _with_other_kinds(choice: ChosenFit, level: FitLevel, plan: FitPlan, each: Callable[[int, int], None]) -> ChosenFit:
-    """The choice with those groups of texels turned into metal or dielectric that validation photos prefer as such."""
-    steps = FitSchedule(plan.steps(KIND_SHARE), plan.seed, (), emission=False, light_searches_at=(), sparsity=False, normals=False)
+def _with_better_metals(choice: ChosenFit, level: FitLevel, plan: FitPlan, each: Callable[[int, int], None]) -> ChosenFit:
+    """The choice after metals' base colours had their noise removed, to which the light adapted, with those groups of texels turned into
+    the other kind that validation photos prefer as such."""
+    quiet = FitSchedule(plan.steps(ADAPT_SHARE), plan.seed, (), emission=False, light_searches_at=(), sparsity=False, normals=False)
+    steps = replace(quiet, rate=ADAPT_RATE)
+    for turn in range(NOISE_ROUNDS):
+        choice.fit.remove_noise(level.fitted)
+        choice = replace(choice, fitted=choice.fit.run(level.fitted, level.held_out, replace(steps, seed=plan.seed + turn), each))
     found = try_kinds(choice.fit, choice.fitted, level, steps, each)
     return replace(choice, fitted=found.fitted, evidence=f"{choice.evidence}; {found}")
 
@@ -83,11 +90,11 @@ def fit_two_levels(coarse: FitLevel, fine: FitLevel, texture: CoarseTexture, pla
     schedule = FitSchedule(steps(COARSE_SHARE), plan.seed, diffuse=plan.diffuse, normals=False)
     choice = best_fit(trials, coarse, schedule, each("material fit, coarse level"))
     if not plan.diffuse:
-        choice = _with_other_kinds(choice, coarse, plan, each("trials of metal and dielectric"))
+        choice = _with_better_metals(choice, coarse, plan, each("trials of metal and dielectric"))
     refine = FitSchedule(steps(FINE_SHARE), plan.seed, FINE_METAL_SEARCHES_AT, emission=False, light_searches_at=(), diffuse=plan.diffuse)
     if choice.fit.mostly_dielectric and not choice.fit.moving_light:
         refine = replace(refine, fixed_light=True)
-        adapt = replace(refine, iterations=steps(ADAPT_SHARE), metal_searches_at=(), rate=ADAPT_RATE)
+        adapt = replace(refine, iterations=steps(SHADING_SHARE), metal_searches_at=(), rate=SHADING_RATE)
         for turn in range(SHADING_ROUNDS + 1):
             if turn:
                 choice.fit.run(coarse.fitted, [], adapt, each("material fit, coarse level"))
@@ -96,4 +103,7 @@ def fit_two_levels(coarse: FitLevel, fine: FitLevel, texture: CoarseTexture, pla
     if not choice.fit.mostly_dielectric:
         choice.fit.rescale_metallic()
     fit = choice.fit.continued_on(fine.surface, texture.up)
-    return replace(choice, fit=fit, fitted=fit.run(fine.fitted, fine.held_out, refine, each("material fit, fine level")))
+    fit.remove_noise(fine.fitted)
+    fit.run(fine.fitted, [], refine, each("material fit, fine level"))
+    fit.remove_noise(fine.fitted)
+    return replace(choice, fit=fit, fitted=fit.run(fine.fitted, fine.held_out, replace(refine, iterations=0)))

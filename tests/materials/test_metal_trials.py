@@ -15,7 +15,7 @@ from gsbake.materials.options import FitSchedule
 from tests.materials.test_fit import Scene
 
 QUIET = FitSchedule(120, metal_searches_at=(), emission=False, light_searches_at=(), sparsity=False, normals=False)
-TRIAL = replace(QUIET, iterations=40)
+TRIAL = replace(QUIET, iterations=40, rate=0.3)
 
 
 def nothing(done: int, total: int) -> None:

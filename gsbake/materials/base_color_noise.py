@@ -1,0 +1,71 @@
+"""Noise of metals' base colours, and the filter that takes it out: Lee's filter over similar neighbours on the surface.
+
+Normals are some degrees off and so is the light, texel by texel of it; both move reflections, and a metal's base colour, which only
+reflections show, varies with them from place to place. How much of a variation is noise two halves of the photos tell: base colours solved
+from each differ by noise alone, and what both share varies with the material. With a local mean m, a local variance V of the base colour b,
+and N that of the noise,
+
+    b' = m + max(0, 1 − N / V) (b − m)
+
+which keeps a print whose halves agree and smooths bare metal, whose halves do not (J.-S. Lee, *Digital image enhancement and noise
+filtering by use of local statistics*, PAMI 1980). Values are sRGB. Dielectrics have little of this noise: photos show their base colour
+itself.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gsbake.imaging.srgb import decode, encode
+from gsbake.materials.bilateral import EdgeAwareFilter
+from gsbake.materials.linear_shading import BaseColourSolver, LinearShading, PhotoSamples, observed_weight
+from gsbake.texturing.texels import Texels
+
+Floats = NDArray[np.float64]
+
+#: Change of base colour (sRGB, sum of channels) between adjacent texels over which a neighbourhood extends.
+SCALE = 0.5
+#: Weight of unclipped pixels in each half from which a texel's noise is measured; least share of metal for it to be filtered.
+MIN_WEIGHT, MIN_SHARE = 0.15, 0.01
+#: Weights and variances below are none.
+TINY = 1e-6
+
+
+def without_noise(
+    photos: Sequence[PhotoSamples], values: NDArray[Any], metal: NDArray[np.bool_], texels: Texels, pairs: NDArray[np.int64]
+) -> Floats:
+    """Linear base colours (n, 3): those of `metal` (n,) without the noise that two halves of the `photos` tell.
+
+    `values` (n, ≥ 4) are linear base colour and roughness of the `texels` with neighbouring `pairs` (m, 2).
+    """
+    base = np.asarray(values[:, :3], np.float64)
+    if metal.mean() < MIN_SHARE or len(photos) < 2:
+        return base
+    colour, weight = encode(np.clip(base, 0, 1)).astype(np.float64), observed_weight(photos, len(values)) * metal
+    noise, measured = _noise(photos, values[:, 3].astype(np.float32))
+    near = EdgeAwareFilter(texels, pairs, np.where(metal[:, None], colour, 0).astype(np.float32), SCALE)
+    mean = _mean(near, colour, weight)
+    variance = _mean(near, np.square(colour - mean), weight)
+    share = np.clip(1 - _mean(near, noise, weight * measured) / np.maximum(variance, TINY), 0, 1)
+    return np.where(metal[:, None], decode(np.clip(mean + share * (colour - mean), 0, 1)), base)
+
+
+def _noise(photos: Sequence[PhotoSamples], roughness: NDArray[np.float32]) -> tuple[Floats, NDArray[np.bool_]]:
+    """Variance (n, 3) of the noise of metals' base colours in sRGB from all photos, a quarter of the squared difference of those from every
+    second one, and where it is measured (n,)."""
+    solved, measured = [], np.ones(len(roughness), bool)
+    for half in (photos[::2], photos[1::2]):
+        shadings = [LinearShading.of(samples.shade, roughness, 1.0) for samples in half]
+        solved.append(encode(BaseColourSolver(half, len(roughness)).solve(shadings, robust=True)))
+        measured &= observed_weight(half, len(roughness)) > MIN_WEIGHT
+    return np.asarray(np.square(solved[0] - solved[1]) / 4, np.float64), measured
+
+
+def _mean(near: EdgeAwareFilter, values: Floats, weight: Floats) -> Floats:
+    """Weighted means (n, c) of `values` (n, c) over the neighbourhoods of `near`."""
+    total = near(weight)
+    return np.stack([near(weight * column) for column in values.T], 1) / np.maximum(total, TINY)[:, None]
