@@ -37,24 +37,37 @@ MIN_WEIGHT = 0.3
 LOG_OFFSET, LUMINANCE_FACTOR = 0.02, 0.3
 #: Mean log-likelihood ratio per pixel for the present kind up to which a group has a trial.
 MAX_EVIDENCE = 2.0
-#: A group becomes metal when that lowers the validation error by this share, and dielectric when it does not rise: most things are.
-MIN_DECREASE = 0.005
+#: A group becomes metal when that lowers the validation error by this multiple of its share of the texels, so by as much of its own error
+#: if that is as large as elsewhere, and dielectric when the error does not rise: most things are.
+MIN_DECREASE = 0.5
 
 #: Called after every step with the number of steps done and their total.
 Each = Callable[[int, int], None]
 
 
 @dataclass(frozen=True)
-class TrialResult:
-    """The fit's result `fitted` after trials, the number of `trials`, and of texels turned `to_metal` and `to_dielectric`."""
+class TurnedGroup:
+    """A group that became `metal` or dielectric, its `share` of observed texels, and the relative `decrease` of the validation error."""
 
-    fitted: Fitted
-    trials: int
-    to_metal: int
-    to_dielectric: int
+    metal: bool
+    texels: int
+    share: float
+    decrease: float
 
     def __str__(self) -> str:
-        return f"{self.trials} trials of groups of texels: {self.to_metal} texels became metal, {self.to_dielectric} dielectric"
+        return f"{self.share:.1%} of the texels {'metal' if self.metal else 'dielectric'} (error -{self.decrease:.1%})"
+
+
+@dataclass(frozen=True)
+class TrialResult:
+    """The fit's result `fitted` after trials, the number of `trials`, and the groups that were `turned`."""
+
+    fitted: Fitted
+    trials: int = 0
+    turned: tuple[TurnedGroup, ...] = ()
+
+    def __str__(self) -> str:
+        return f"{self.trials} trials of the other kind: {', '.join(map(str, self.turned)) or 'none kept'}"
 
 
 def try_kinds(fit: MaterialFit, fitted: Fitted, level: FitLevel, schedule: FitSchedule, each: Each) -> TrialResult:
@@ -64,10 +77,10 @@ def try_kinds(fit: MaterialFit, fitted: Fitted, level: FitLevel, schedule: FitSc
     photos nothing is tried. Under a light that moves, which is an approximation, to whose errors metals adapt, nothing becomes metal.
     """
     if not any(map(len, level.held_out)):
-        return TrialResult(fitted, 0, 0, 0)
+        return TrialResult(fitted)
     trial = _Trials(fit, level, schedule, each)
     trial.run((fitted.weight > MIN_WEIGHT) & (fitted.emission.sum(1) == 0))
-    return TrialResult(trial.fitted, trial.count, *trial.changed)
+    return TrialResult(trial.fitted, trial.count, tuple(trial.turned))
 
 
 class _Trials:
@@ -75,7 +88,7 @@ class _Trials:
 
     def __init__(self, fit: MaterialFit, level: FitLevel, schedule: FitSchedule, each: Each) -> None:
         self.fit, self.level, self.schedule, self.each = fit, level, schedule, each
-        self.count, self.changed = 0, [0, 0]
+        self.observed, self.count, self.turned = 0, 0, list[TurnedGroup]()
         self._adapt()
         self.state = fit.state()
         self.fitted = self._adapt()
@@ -85,6 +98,7 @@ class _Trials:
 
     def run(self, observed: NDArray[np.bool_]) -> None:
         """Try the groups of `observed` (n,) texels, those first whose evidence for the other kind is strongest."""
+        self.observed = int(observed.sum())
         self.fit.restore(self.state, self.level.fitted)
         models, tries = _Models(self.fit, self.level), []
         for group in _groups(self.state.values, np.asarray(self.level.surface.base_color), observed):
@@ -105,12 +119,12 @@ class _Trials:
         self.fit.restore(self.state, self.level.fitted)
         metallic = self.fit.kind(metal)
         self.fit.set_materials(texel, np.column_stack([base, np.full(len(texel), roughness), np.full(len(texel), metallic)]))
-        bound = _error(self.fitted) * (1 - MIN_DECREASE if metal else 1)
         self.count += 1
-        if _error(self._adapt()) < bound:
+        decrease, share = 1 - _error(self._adapt()) / max(_error(self.fitted), 1e-12), len(texel) / self.observed
+        if decrease > (MIN_DECREASE * share if metal else 0):
             self.state = self.fit.state()
             self.fitted = self._adapt()
-            self.changed[not metal] += len(texel)
+            self.turned.append(TurnedGroup(metal, len(texel), share, decrease))
 
 
 class _Models:
