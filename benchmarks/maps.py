@@ -48,16 +48,24 @@ def measure_maps(bake: Path, mesh: Path, poses: Path, capture: Path) -> MapError
     observed = np.flatnonzero(coverage.reshape(-1, 3)[texels.index, 1] > 0.5)
     chosen = observed[:: max(1, len(observed) // MAX_TEXELS)]
     baked = np.concatenate([base, orm[..., 1:]], 2).reshape(-1, 5)[texels.index[chosen]].astype(np.float64)
+    reference = true_values(texels.interpolate(unwrapped["position"], unwrapped["faces"])[chosen], mesh, poses, capture)
+    decibels = -10 * np.log10(np.mean([_min_error(baked[:, k], reference[:, k]) for k in range(3)]))
+    roughness, metallic = np.sqrt(((baked[:, 3:] - reference[:, 3:]) ** 2).mean(0))
+    return MapErrors(float(decibels), float(roughness), float(metallic))
+
+
+def true_values(points: NDArray[np.floating], mesh: Path, poses: Path, capture: Path) -> Floats:
+    """Linear base colour, roughness and metallic (n, 5) of the reference in `capture` nearest to `points` (n, 3) in the unit frame.
+
+    `mesh` and `poses` are the stage folders of the run.
+    """
     truth, cameras = read_truth(capture), CameraSet.load(poses / "cameras.json")
-    points = cameras.to_world.apply(texels.interpolate(unwrapped["position"], unwrapped["faces"])[chosen].astype(np.float64))
+    points = cameras.to_world.apply(np.asarray(points, np.float64))
     if cameras.poses != "given":
         points = align(read_mesh(mesh / "mesh.ply").moved(cameras.to_world), read_centres(poses / "cameras.json"), truth).apply(points)
     face = nearest(points, truth.surface, 3)[1]
     corners = truth.surface.corners[face]
-    reference = _true_values(capture / "gt" / "asset.glb", face, nearest_on_faces(points, corners), corners)
-    decibels = -10 * np.log10(np.mean([_min_error(baked[:, k], reference[:, k]) for k in range(3)]))
-    roughness, metallic = np.sqrt(((baked[:, 3:] - reference[:, 3:]) ** 2).mean(0))
-    return MapErrors(float(decibels), float(roughness), float(metallic))
+    return _true_values(capture / "gt" / "asset.glb", face, nearest_on_faces(points, corners), corners)
 
 
 def _true_values(asset: Path, face: NDArray[np.int64], points: Floats, corners: Floats) -> Floats:

@@ -37,9 +37,9 @@ MIN_WEIGHT = 0.3
 LOG_OFFSET, LUMINANCE_FACTOR = 0.02, 0.3
 #: Mean log-likelihood ratio per pixel for the present kind up to which a group has a trial.
 MAX_EVIDENCE = 2.0
-#: A group becomes metal when that lowers the validation error by this multiple of its share of the texels, so by as much of its own error
-#: if that is as large as elsewhere, and dielectric when the error does not rise: most things are.
-MIN_DECREASE = 0.5
+#: A group becomes metal when that lowers the validation error by the first share, and by the second multiple of its share of the texels, so
+#: by as much of its own error if that is as large as elsewhere; dielectric when the error does not rise: most things are.
+MIN_DECREASE, MIN_OWN_DECREASE = 0.005, 0.5
 
 #: Called after every step with the number of steps done and their total.
 Each = Callable[[int, int], None]
@@ -113,7 +113,7 @@ class _Trials:
     def _try(self, models: _Models, metal: bool, group: NDArray[np.int64]) -> None:
         """Turn the `group` (m,) of texels into `metal` or dielectric, and keep that where validation photos prefer it."""
         texel = group[(self.state.values[group, 4] > 0.5) != metal]
-        if not len(texel):
+        if len(texel) < MIN_SHARE * self.observed:
             return
         base, roughness = models.best(metal, group, texel)
         self.fit.restore(self.state, self.level.fitted)
@@ -121,7 +121,7 @@ class _Trials:
         self.fit.set_materials(texel, np.column_stack([base, np.full(len(texel), roughness), np.full(len(texel), metallic)]))
         self.count += 1
         decrease, share = 1 - _error(self._adapt()) / max(_error(self.fitted), 1e-12), len(texel) / self.observed
-        if decrease > (MIN_DECREASE * share if metal else 0):
+        if decrease > (max(MIN_DECREASE, MIN_OWN_DECREASE * share) if metal else 0):
             self.state = self.fit.state()
             self.fitted = self._adapt()
             self.turned.append(TurnedGroup(metal, len(texel), share, decrease))

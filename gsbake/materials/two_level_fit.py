@@ -68,11 +68,12 @@ def _with_better_metals(choice: ChosenFit, level: FitLevel, plan: FitPlan, each:
     """The choice after metals' base colours had their noise removed, to which the light adapted, with those groups of texels turned into
     the other kind that validation photos prefer as such."""
     quiet = FitSchedule(plan.steps(ADAPT_SHARE), plan.seed, (), emission=False, light_searches_at=(), sparsity=False, normals=False)
-    steps = replace(quiet, rate=ADAPT_RATE)
+    steps, intensity = replace(quiet, rate=ADAPT_RATE), choice.fit.light_intensity()
     for turn in range(NOISE_ROUNDS):
         choice.fit.remove_noise(level.fitted)
         choice = replace(choice, fitted=choice.fit.run(level.fitted, level.held_out, replace(steps, seed=plan.seed + turn), each))
     found = try_kinds(choice.fit, choice.fitted, level, steps, each)
+    choice.fit.set_light_intensity(intensity)  # gradient steps drift along the valley that the search had left
     return replace(choice, fitted=found.fitted, evidence=f"{choice.evidence}; {found}")
 
 
