@@ -23,6 +23,7 @@ together in this way; visibility per texel and weights per view are added by the
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -34,7 +35,6 @@ from gsbake.materials.bilateral import Neighbourhoods
 from gsbake.materials.emission import find_emission
 from gsbake.materials.fit_model import FitModel
 from gsbake.materials.fit_surface import FitSurface, Fitted
-from gsbake.materials.intensity_prior import IntensityPrior
 from gsbake.materials.light_intensity import LightAdjustment, adjust_radiance, search_light
 from gsbake.materials.linear_shading import PhotoSamples
 from gsbake.materials.metallic import find_metals
@@ -204,7 +204,7 @@ class MaterialFit(FitModel):
             lights, texels = PhotoLights(light.radiance()), TexelInputs.of(values, transport)
             return [b.samples(texels, lights.tables(b.to_light)) for b in subset]
 
-        prior = IntensityPrior(self.intensity_prior().dielectrics)  # reflections of dielectrics tell of the light
+        prior = replace(self.intensity_prior(), metals=None)  # reflections of dielectrics tell of the light
         found = search_light(samples_under, values[:, 3].copy(), tint, rough, prior)
         if found.improvement <= 0:
             return found
