@@ -74,7 +74,7 @@ def try_kinds(fit: MaterialFit, fitted: Fitted, level: FitLevel, schedule: FitSc
     """Try groups of texels as the other kind and keep what validation photos prefer.
 
     `fit` on the `level`, with the result `fitted`, changes in place; `schedule` has the steps of each trial. Without validation
-    photos nothing is tried. Under a light that moves, which is an approximation, to whose errors metals adapt, nothing becomes metal.
+    photos nothing is tried.
     """
     if not any(map(len, level.held_out)):
         return TrialResult(fitted)
@@ -104,7 +104,7 @@ class _Trials:
         for group in _groups(self.state.values, np.asarray(self.level.surface.base_color), observed):
             share, for_dielectric = (self.state.values[group, 4] > 0.5).mean(), models.evidence(group)
             for metal, for_present in ((True, for_dielectric), (False, -for_dielectric)):
-                if share != metal and for_present < MAX_EVIDENCE and not (metal and self.fit.moving_light):
+                if share != metal and for_present < MAX_EVIDENCE:
                     tries.append((for_present, metal, group))
         for _, metal, group in sorted(tries, key=lambda entry: entry[0]):
             self._try(models, metal, group)

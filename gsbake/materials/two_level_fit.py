@@ -90,7 +90,9 @@ def fit_two_levels(coarse: FitLevel, fine: FitLevel, texture: CoarseTexture, pla
     trials = trial_fits(make, coarse, steps(TRIAL_SHARE), plan.seed, plan.diffuse, each("trial fits"))
     schedule = FitSchedule(steps(COARSE_SHARE), plan.seed, diffuse=plan.diffuse, normals=False)
     choice = best_fit(trials, coarse, schedule, each("material fit, coarse level"))
-    if not plan.diffuse:
+    # Metals adapt to the errors of a moving light, which is an approximation, and changes of metals to theirs.
+    metals = not (plan.diffuse or choice.fit.moving_light)
+    if metals:
         choice = _with_better_metals(choice, coarse, plan, each("trials of metal and dielectric"))
     refine = FitSchedule(steps(FINE_SHARE), plan.seed, FINE_METAL_SEARCHES_AT, emission=False, light_searches_at=(), diffuse=plan.diffuse)
     if choice.fit.mostly_dielectric and not choice.fit.moving_light:
@@ -104,7 +106,10 @@ def fit_two_levels(coarse: FitLevel, fine: FitLevel, texture: CoarseTexture, pla
     if not choice.fit.mostly_dielectric:
         choice.fit.rescale_metallic()
     fit = choice.fit.continued_on(fine.surface, texture.up)
-    fit.remove_noise(fine.fitted)
-    fit.run(fine.fitted, [], refine, each("material fit, fine level"))
-    fit.remove_noise(fine.fitted)
-    return replace(choice, fit=fit, fitted=fit.run(fine.fitted, fine.held_out, replace(refine, iterations=0)))
+    if metals:
+        fit.remove_noise(fine.fitted)
+    fitted = fit.run(fine.fitted, fine.held_out, refine, each("material fit, fine level"))
+    if metals:
+        fit.remove_noise(fine.fitted)
+        fitted = fit.run(fine.fitted, fine.held_out, replace(refine, iterations=0))
+    return replace(choice, fit=fit, fitted=fitted)

@@ -62,12 +62,6 @@ def test_nothing_is_tried_without_validation_photos() -> None:
     assert found.trials == 0 and found.fitted is before
 
 
-def test_nothing_becomes_metal_under_a_light_that_moves() -> None:
-    scene = Scene(0.25, metallic=1.0)
-    scene.photos = [replace(photo, to_light=np.eye(3)) for photo in scene.photos]
-    assert not any(group.metal for group in tried(scene, 0.05)[2].turned)
-
-
 def test_texels_of_one_group_are_similar_and_small_groups_are_left_out() -> None:
     rng = np.random.default_rng(0)
     kind = rng.random(2000) < 0.3
