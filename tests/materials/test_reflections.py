@@ -127,7 +127,7 @@ def test_reflection_does_not_change_base_colour(corner: Corner) -> None:
         known = corner.floor & (fitted.weight > 0.3) & (corner.at[:, 1] < 0.8)
         return float(np.abs(encode(fitted.values[known, :3]) - encode(base_color[known])).mean())
 
-    assert error(True) < 0.95 * error(False)  # most of both is the level of the light, in which a prior has a part
+    assert error(True) < 0.95 * error(False)  # most of both is light intensity, in which a prior has a part
 
 
 def test_a_reflected_mirror_shows_the_light_behind_the_viewer() -> None:
