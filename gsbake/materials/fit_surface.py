@@ -36,6 +36,11 @@ class Fitted:
     light_adjustments: tuple[LightAdjustment, ...]
 
 
+def validation_error(fitted: Fitted) -> float:
+    """The mean robust error on validation photos; 0 without any."""
+    return fitted.held_out_loss or 0.0
+
+
 class Transport(Protocol):
     """Visibility and indirect light of the texels; see `gsbake.materials.visibility.Visibility`."""
 

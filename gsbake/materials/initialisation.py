@@ -19,7 +19,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from gsbake.materials.fit import MaterialFit
-from gsbake.materials.fit_surface import Fitted
+from gsbake.materials.fit_surface import Fitted, validation_error
 from gsbake.materials.levels import FitLevel
 from gsbake.materials.light_intensity import OBSERVATIONS
 from gsbake.materials.options import FitSchedule
@@ -95,10 +95,10 @@ def trial_fits(make: MakeFit, level: FitLevel, steps: int, seed: int, diffuse: b
 
 def best_fit(trials: Trials, level: FitLevel, plan: FitSchedule, each: Each) -> ChosenFit:
     """The fit with the least validation error on `level` of those that continue the best of the `trials` by `plan`."""
-    errors = {start: _error(fitted) for start, (_, fitted) in trials.items()}
+    errors = {start: validation_error(fitted) for start, (_, fitted) in trials.items()}
     evidence = _percent(errors) if len(errors) > 1 else ("diffuse object" if plan.diffuse else "no validation photos")
     found = {start: (trials[start][0], trials[start][0].run(level.fitted, level.held_out, plan, each)) for start in candidates(errors)}
-    continued = {start: _error(fitted) for start, (_, fitted) in found.items()}
+    continued = {start: validation_error(fitted) for start, (_, fitted) in found.items()}
     weighed = {start: error * _prior_factor(found[start][0]) for start, error in continued.items()}
     kinds = [[start for start in weighed if (start[0] < 0.5) == dielectric] for dielectric in (True, False)]
     finalists = [min(kind, key=lambda start: weighed[start]) for kind in kinds if kind]
@@ -107,10 +107,6 @@ def best_fit(trials: Trials, level: FitLevel, plan: FitSchedule, each: Each) -> 
     if len(continued) > 1:
         evidence += f"; continued: {_percent(continued)}; with the prior of the light: {_percent(weighed)}"
     return ChosenFit(*found[best], *best, len(continued), evidence)
-
-
-def _error(fitted: Fitted) -> float:
-    return fitted.held_out_loss or 0.0
 
 
 def _prior_factor(fit: MaterialFit) -> float:

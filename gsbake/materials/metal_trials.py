@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from scipy.cluster.vq import kmeans2
 
 from gsbake.materials.fit import MaterialFit
-from gsbake.materials.fit_surface import Fitted
+from gsbake.materials.fit_surface import Fitted, validation_error
 from gsbake.materials.levels import FitLevel
 from gsbake.materials.linear_shading import BaseColourSolver, observed_weight
 from gsbake.materials.metallic import TRIED_ROUGHNESS, candidate_models
@@ -50,7 +50,6 @@ class TurnedGroup:
     """A group that became `metal` or dielectric, its `share` of observed texels, and the relative `decrease` of the validation error."""
 
     metal: bool
-    texels: int
     share: float
     decrease: float
 
@@ -120,11 +119,11 @@ class _Trials:
         metallic = self.fit.kind(metal)
         self.fit.set_materials(texel, np.column_stack([base, np.full(len(texel), roughness), np.full(len(texel), metallic)]))
         self.count += 1
-        decrease, share = 1 - _error(self._adapt()) / max(_error(self.fitted), 1e-12), len(texel) / self.observed
+        decrease, share = 1 - validation_error(self._adapt()) / max(validation_error(self.fitted), 1e-12), len(texel) / self.observed
         if decrease > (max(MIN_DECREASE, MIN_OWN_DECREASE * share) if metal else 0):
             self.state = self.fit.state()
             self.fitted = self._adapt()
-            self.turned.append(TurnedGroup(metal, len(texel), share, decrease))
+            self.turned.append(TurnedGroup(metal, share, decrease))
 
 
 class _Models:
@@ -168,7 +167,3 @@ def _groups(values: NDArray[Any], photographed: NDArray[Any], observed: NDArray[
         label = kmeans2(points, count, minit="++", rng=np.random.default_rng(0))[1]
     groups = [texel[label == group] for group in range(count)]
     return [group for group in groups if len(group) >= max(1, MIN_SHARE * len(texel))]
-
-
-def _error(fitted: Fitted) -> float:
-    return fitted.held_out_loss or 0.0

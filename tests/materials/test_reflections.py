@@ -115,7 +115,8 @@ def test_reflection_does_not_change_base_colour(corner: Corner) -> None:
         specular = shade(normal, view, torch.zeros(m, 3), torch.full((m,), 0.1), torch.zeros(m), tables).detach()
         wall = torch.tensor([0.94, 0.44, 0.09]) * spread.mean()
         specular = torch.where(torch.as_tensor(blocked)[:, None], specular * wall, specular)
-        return replace(pixels, colour=encode((diffuse + specular).numpy()).astype(np.float32))
+        # A light that is said to move, here by nothing, has no prior of its radiance: the sky's is 1, and the prior expects .7.
+        return replace(pixels, colour=encode((diffuse + specular).numpy()).astype(np.float32), to_light=np.eye(3))
 
     def error(traced: bool) -> float:
         pairs = neighbours(corner.texels, corner.at, corner.normal)
@@ -127,7 +128,7 @@ def test_reflection_does_not_change_base_colour(corner: Corner) -> None:
         known = corner.floor & (fitted.weight > 0.3) & (corner.at[:, 1] < 0.8)
         return float(np.abs(encode(fitted.values[known, :3]) - encode(base_color[known])).mean())
 
-    assert error(True) < 0.95 * error(False)  # most of both is light intensity, in which a prior has a part
+    assert error(True) < 0.7 * error(False)
 
 
 def test_a_reflected_mirror_shows_the_light_behind_the_viewer() -> None:
