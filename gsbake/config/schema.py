@@ -197,6 +197,7 @@ class Loss(Section):
     normal: Weight = Field(0.2, description="Consistency of surfel normals with the normals of the depth map.")
     distortion: Weight = Field(100.0, description="Depth distortion: concentrates the blending weights along a ray.")
     mask: Weight = Field(0.3, description="Cross-entropy of rendered alpha and mask.")
+    silhouette: Weight = Field(0.0, description="Distance by which surfels, displaced by their SDF sample, project outside the masks; brings a sphere to the object.")
     smoothness: Weight = Field(0.02, description="Edge-aware smoothness of materials (surfels.shading = pbr).")
     neutral_light: Weight = Field(0.005, description="Regularisation of the environment map towards grey (surfels.shading = pbr).")
 

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from gsbake.imaging.distance import distance_to_zero
 from gsbake.meshing.imls import imls_field
 from gsbake.meshing.sparse_lattice import BlockLattice
 from gsbake.surfels.densification.policy import typical_spacing
@@ -42,6 +43,7 @@ class SamplesField(Field):
         """
         self.surfels, self.loss, self.train, self.fine_tuning = surfels, loss, train, fine_tuning
         self._index: tuple[cKDTree, Tensor, Tensor, Tensor] | None = None
+        self._distances: dict[tuple[str, int], Tensor] = {}
 
     def follow(self, surfels: Surfels) -> None:
         """Read the samples of these surfels."""
@@ -116,7 +118,7 @@ class SamplesField(Field):
             return centres[chosen], normals[chosen]
 
     def losses(self, step: TrainingStep, view: TrainView) -> Tensor | None:
-        """Median and projection loss."""
+        """Median, projection and silhouette loss."""
         w, s, out = self.loss, step.surfels, step.rendered
         total = None
         if step.late and w.median:
@@ -126,7 +128,20 @@ class SamplesField(Field):
                 s.position, out.normal, s.sdf, out.visible, out.depth, out.alpha, view.R, view.t, view.pinhole
             )
             total = projection if total is None else total + projection
+        if w.silhouette and view.mask is not None:
+            outside = losses.silhouette_distance(self.project_surfels(s), self._mask_distance(view), view.R, view.t, view.pinhole)
+            total = w.silhouette * outside if total is None else total + w.silhouette * outside
         return total
+
+    def _mask_distance(self, view: TrainView) -> Tensor:
+        """Distance (h, w) in pixels to the mask of a photo; 0 everywhere where the mask is empty."""
+        key = view.name, view.pinhole.width
+        if key not in self._distances:
+            assert view.mask is not None
+            outside = view.mask.cpu().numpy() < 128
+            image = np.zeros(outside.shape, np.float32) if outside.all() else distance_to_zero(outside)
+            self._distances[key] = torch.from_numpy(image).to(view.mask.device)
+        return self._distances[key]
 
     def _widths(self, step: TrainingStep) -> tuple[float, float] | None:
         """Least and largest distance (unit frame) at which opacity is half, in this step; None where the unit frame is the unit."""
