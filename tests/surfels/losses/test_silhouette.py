@@ -1,4 +1,4 @@
-"""The silhouette loss: its value against distances worked out by hand, its gradient by finite differences, and a sphere that finds a ball."""
+"""The silhouette loss: value and gradient against lengths worked out by hand, and surfels on a sphere that find a ball."""
 
 from __future__ import annotations
 
