@@ -103,8 +103,8 @@ def silhouette_distance(points: Tensor, distance: Tensor, R: Tensor, t: Tensor, 
     """Mean distance (unit frame) by which points (n, 3) in front of the camera project outside the mask.
 
     `distance` (h, w) is in pixels from each pixel to the mask, 0 inside. It is 0 in all views for points of the visual hull alone
-    (Laurentini, *The visual hull concept*, PAMI 1994). The gradient moves points across the view, towards the mask; the depth that turns pixels into
-    lengths, and the pose, get none. Points outside the frame are taken at its border.
+    (Laurentini, *The visual hull concept*, PAMI 1994). The gradient moves points across the view, towards the mask; the depth that turns
+    pixels into lengths, and the pose, get none. Points outside the frame are taken at its border.
     """
     cam = points @ R.detach().T + t.detach()
     z = cam[:, 2].clamp_min(1e-3)
