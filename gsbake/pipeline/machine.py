@@ -91,7 +91,7 @@ def missing_cuda_requirement() -> str | None:
 def resolve_device(requested: str) -> str:
     """The device, "cpu" or "cuda", for auto|cpu|cuda. Raises UsageError when CUDA is requested but not available.
 
-    auto is the CPU: the CUDA kernels have not been measured on a GPU yet (docs/concepts/surfels.md), so they must be requested.
+    auto is the CPU: a GPU hardly shortens a run (docs/concepts/surfels.md), so it must be requested.
     """
     if requested not in ("auto", "cpu", "cuda"):
         raise UsageError(f"--device is auto, cpu or cuda, not '{requested}'.")
