@@ -38,6 +38,8 @@ VOTE_SIGMA = 1.0
 MIN_FREE_SHARE, PRIOR_VOTES, PRIOR_VOTE_SHARE = 0.65, 0.3, 0.2
 #: Greatest carving depth below the hull's surface in cells.
 MAX_CARVING_DEPTH = 6.0
+#: The prior for cells that join a carved region (hysteresis thresholding: Canny, *A computational approach to edge detection*, PAMI 1986).
+GROWTH_PRIOR_VOTES, GROWTH_PRIOR_VOTE_SHARE = 0.2, 0.1
 #: Carved regions have at least this many cells (fewer are noise), and at least this mean share of surface votes on the exposed surface.
 MIN_REGION_CELLS, MIN_SURFACE_SHARE = 8, 0.12
 #: A cell violates silhouettes when carving leaves this many photos with an empty ray through it (single masks may be wrong). Regions
@@ -176,12 +178,17 @@ def carve_hull(hull: Hull, cameras: Sequence[Camera], depths: Sequence[Floats]) 
     likely_free = solid & (votes > MIN_FREE_SHARE * (votes + surface))
     if not likely_free.any():
         return CarvedHull(hull, 0.0, 0, 0, 0)
-    total = votes + surface + max(PRIOR_VOTES, PRIOR_VOTE_SHARE * float(np.median((votes + surface)[likely_free])))
-    free_share, surface_share = votes / total, surface / total
-    label, keep, unsupported = _carvable_regions(hull, free_share, surface_share)
-    violating = _violates_silhouettes(label, keep, hull, cameras)
+    typical = float(np.median((votes + surface)[likely_free]))
+    total = votes + surface + max(PRIOR_VOTES, PRIOR_VOTE_SHARE * typical)
+    free_share = votes / total
+    label, keep, unsupported = _carvable_regions(hull, free_share, surface / total)
+    violating = _violates_silhouettes(label, keep, solid, hull, cameras)
     keep &= ~violating
     carved = keep[label]
+    if carved.any():
+        weaker = votes / (votes + surface + max(GROWTH_PRIOR_VOTES, GROWTH_PRIOR_VOTE_SHARE * typical))
+        grown = _grow(carved, weaker, hull, cameras)
+        free_share, carved = np.where(grown, weaker, free_share), carved | grown
     if not carved.any() or carved[solid].all():  # nothing to carve, or nothing would be left
         return CarvedHull(hull, 0.0, 0, unsupported, int(violating.sum()))
     # The share of free-space votes falls by about a quarter per cell across a new surface.
@@ -214,11 +221,27 @@ def _carvable_regions(hull: Hull, free_share: Floats, surface_share: Floats) -> 
     return label, supported, unsupported
 
 
-def _violates_silhouettes(label: NDArray[np.int32], keep: NDArray[np.bool_], hull: Hull, cameras: Sequence[Camera]) -> NDArray[np.bool_]:
-    """Which regions (k,) of those in `keep` (k,) violate silhouettes when carved; `label` (n, n, n) is the region of each cell."""
+def _grow(carved: NDArray[np.bool_], free_share: Floats, hull: Hull, cameras: Sequence[Camera]) -> NDArray[np.bool_]:
+    """Cells (n, n, n) beside the carved ones that are free under the weaker prior; none of regions that violate silhouettes."""
+    solid = hull.field < 0
+    free = solid & ~carved & (free_share > MIN_FREE_SHARE)
+    free &= ndimage.binary_opening(free | carved | ~solid, ndimage.generate_binary_structure(3, 1))
+    label, count = ndimage.label(free)
+    keep = np.zeros(count + 1, bool)
+    keep[np.unique(label[ndimage.binary_dilation(carved) & free])] = True
+    keep[0] = False
+    keep &= ~_violates_silhouettes(label, keep, solid & ~carved, hull, cameras)
+    return np.asarray(keep[label])
+
+
+def _violates_silhouettes(
+    label: NDArray[np.int32], keep: NDArray[np.bool_], solid: NDArray[np.bool_], hull: Hull, cameras: Sequence[Camera]
+) -> NDArray[np.bool_]:
+    """Which regions (k,) of those in `keep` (k,) violate silhouettes when carved from `solid` (n, n, n); `label` (n, n, n) is the region of
+    each cell."""
     carved = keep[label]
     cells = np.argwhere(carved)
-    empty = count_empty_rays(cells, (hull.field < 0) & ~carved, hull, cameras) >= MIN_EMPTY_RAYS
+    empty = count_empty_rays(cells, solid & ~carved, hull, cameras) >= MIN_EMPTY_RAYS
     region = label[tuple(cells.T)]
     violating = np.bincount(region, empty, len(keep))
     return np.asarray(violating > MAX_EMPTY_SHARE * np.bincount(region, minlength=len(keep)))
