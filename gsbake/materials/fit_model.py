@@ -15,14 +15,13 @@ import torch
 from numpy.typing import NDArray
 
 from gsbake.imaging.metrics import decibels
-from gsbake.imaging.srgb import encode
 from gsbake.materials import fit_kernel
 from gsbake.materials.base_color_noise import without_noise
 from gsbake.materials.fit_surface import FitSurface
 from gsbake.materials.intensity_prior import IntensityPrior
 from gsbake.materials.light_intensity import LightAdjustment
 from gsbake.materials.light_optimiser import LightOptimiser
-from gsbake.materials.linear_shading import LinearShading, PhotoSamples
+from gsbake.materials.linear_shading import PhotoSamples
 from gsbake.materials.options import FitOptions, Priors
 from gsbake.materials.photo_batch import (
     DIFFUSE,
@@ -262,22 +261,3 @@ class FitModel:
             [self._step_buffers(b, materials, lights.tables(b.to_light), self._transport, 1.0, scale, 0.0) for b in batches], axis=0
         )
         return float(sums[0] / sums[2]), float(sums[1] / sums[2])
-
-    def block_error(self, photos: list[Pixels]) -> float | None:
-        """Mean absolute error of sRGB colours averaged over blocks of the photos (`Pixels.block`); None without any pixels.
-
-        A reflection that normals misplace by a few pixels stays in its block: what counts is how wide and how bright it is.
-        """
-        error, weight = 0.0, 0.0
-        for pixels, samples in zip([part for part in photos if len(part)], self._samples(self._batches(photos)), strict=True):
-            values, roughness = self._values[samples.texel], self._values[:, 3].copy()
-            base, metal = values[:, :3], values[:, 4:5]
-            kinds = [LinearShading.of(samples.shade, roughness, metallic) for metallic in (0.0, 1.0)]
-            dielectric, metallic = (kind.slope * base + kind.offset for kind in kinds)
-            shown = encode(np.clip(dielectric + metal * (metallic - dielectric), 0, 1))
-            total = np.bincount(pixels.block, pixels.weight)
-            for k in range(3):
-                sums = np.bincount(pixels.block, pixels.weight * (shown[:, k] - samples.encoded[:, k]))
-                error += float(np.abs(sums).sum())
-            weight += 3 * float(total.sum())
-        return error / weight if weight else None

@@ -7,10 +7,9 @@ not fitted to. On the way `MaterialFit` decides texel by texel between metal and
 close to the best are continued with all searches, on the coarse level, and compared again.
 
 They are compared by a robust error: a sharp reflection a few pixels off counts twice in the squared error, where it is and where it should
-be, so that the PSNR prefers materials that are too rough. Between starts of other roughness errors averaged over blocks of the photos
-decide, in which that reflection is where it should be. They often explain the photos as well, by a brighter or a dimmer light: the prior of
-the light (`intensity_prior`) counts there, but not between metal and dielectric. Where both kinds explain the photos, the object is
-dielectric, as most are.
+be, so that the PSNR prefers materials that are too rough. Fits that started with another roughness often explain the photos as well, by a
+brighter or a dimmer light: there its prior decides (`intensity_prior`), but not between metal and dielectric. Where both kinds explain the
+photos, the object is dielectric, as most are.
 """
 
 from __future__ import annotations
@@ -100,15 +99,13 @@ def best_fit(trials: Trials, level: FitLevel, plan: FitSchedule, each: Each) -> 
     evidence = _percent(errors) if len(errors) > 1 else ("diffuse object" if plan.diffuse else "no validation photos")
     found = {start: (trials[start][0], trials[start][0].run(level.fitted, level.held_out, plan, each)) for start in candidates(errors)}
     continued = {start: validation_error(fitted) for start, (_, fitted) in found.items()}
-    blocks = {start: fit.block_error(level.held_out) or 0.0 for start, (fit, _) in found.items()}
-    weighed = {start: error * _prior_factor(found[start][0]) for start, error in blocks.items()}
+    weighed = {start: error * _prior_factor(found[start][0]) for start, error in continued.items()}
     kinds = [[start for start in weighed if (start[0] < 0.5) == dielectric] for dielectric in (True, False)]
     finalists = [min(kind, key=lambda start: weighed[start]) for kind in kinds if kind]
     margin = MOVING_METAL_MARGIN if any(fit.moving_light for fit, _ in found.values()) else METAL_MARGIN
     best = min(finalists, key=lambda start: continued[start] * (1 - margin if start[0] < 0.5 else 1))
     if len(continued) > 1:
-        evidence += f"; continued: {_percent(continued)}; over blocks of photos: {_percent(blocks)}"
-        evidence += f"; with the prior of the light: {_percent(weighed)}"
+        evidence += f"; continued: {_percent(continued)}; with the prior of the light: {_percent(weighed)}"
     return ChosenFit(*found[best], *best, len(continued), evidence)
 
 

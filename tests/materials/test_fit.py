@@ -174,25 +174,6 @@ def test_base_colour_and_roughness_are_recovered(glossy: Scene) -> None:
     assert fitted.held_out_psnr is not None and fitted.held_out_psnr > 22
 
 
-def test_error_of_blocks(glossy: Scene) -> None:
-    """What is off in single pixels cancels in their block, what is off in all of them stays."""
-    fit = glossy.fit(0.25)
-    photos = []
-    for pixels, samples in zip(glossy.photos, fit._samples(fit._batches(glossy.photos)), strict=True):
-        linear = sum(w * samples.shade(0.0, np.full(len(glossy.texels), 0.25, np.float32), m) for m, w in ((0.0, 0.95), (1.0, 0.05)))
-        white = sum(w * samples.shade(1.0, np.full(len(glossy.texels), 0.25, np.float32), m) for m, w in ((0.0, 0.95), (1.0, 0.05)))
-        base = fit._values[samples.texel, :3]
-        photos.append(replace(pixels, colour=encode(np.clip(linear + (white - linear) * base, 0, 1)), weight=np.ones_like(pixels.weight)))
-    exact = fit.block_error(photos)
-    assert exact is not None and exact < 1e-5
-    sign = [np.where(np.arange(len(p)) % 2, 1, -1)[:, None] for p in photos]
-    noisy = fit.block_error([replace(p, colour=p.colour + np.float32(0.02) * s) for p, s in zip(photos, sign, strict=True)])
-    brighter = fit.block_error([replace(p, colour=p.colour + np.float32(0.02)) for p in photos])
-    assert noisy is not None and brighter is not None
-    assert brighter == pytest.approx(0.02, rel=0.02) and noisy < 0.25 * brighter
-    assert fit.block_error([]) is None
-
-
 def test_all_metal_object_has_no_light_adjustment(glossy: Scene) -> None:
     fitted = glossy.fit(0.2, metallic=0.9).run(glossy.photos, [], FitSchedule(4, metal_searches_at=(), emission=False))
     assert len(fitted.light_adjustments) > 0 and all(adjustment.improvement == 0 for adjustment in fitted.light_adjustments)

@@ -27,18 +27,15 @@ from gsbake.materials.options import FitSchedule
 
 class Fit:
     """A fit with the validation error `error` under a light of mean `radiance` that records its schedules, and whether shading was removed
-    before the first; averaged over blocks the error is `blocks` times as large."""
+    before the first."""
 
     def __init__(
-        self, error: float, runs: list[FitSchedule], mostly_dielectric: bool = True, radiance: float = RADIANCE[0], blocks: float = 1.0
+        self, error: float, runs: list[FitSchedule], mostly_dielectric: bool = True, radiance: float = RADIANCE[0]
     ) -> None:  # fmt: skip
         self._error, self._runs, self.mostly_dielectric, self.without_shading = error, runs, mostly_dielectric, False
-        self._radiance, self._blocks = radiance, blocks
+        self._radiance = radiance
 
     moving_light = False
-
-    def block_error(self, photos: Any) -> float | None:
-        return self._error * self._blocks if photos else None
 
     def intensity_prior(self) -> IntensityPrior:
         return IntensityPrior(radiance=self._radiance)
@@ -63,15 +60,12 @@ def nothing(done: int, total: int) -> None:
 
 
 def chosen(
-    trial_errors: dict[Start, float],
-    full_errors: dict[Start, float],
-    radiance: dict[Start, float] | None = None,
-    blocks: dict[Start, float] | None = None,
+    trial_errors: dict[Start, float], full_errors: dict[Start, float], radiance: dict[Start, float] | None = None
 ) -> tuple[ChosenFit, list[FitSchedule]]:
     runs: list[FitSchedule] = []
     trials: Any = {
         start: (
-            Fit(full_errors.get(start, 1.0), runs, True, (radiance or {}).get(start, RADIANCE[0]), (blocks or {}).get(start, 1.0)),
+            Fit(full_errors.get(start, 1.0), runs, radiance=(radiance or {}).get(start, RADIANCE[0])),
             SimpleNamespace(held_out_loss=error),
         )
         for start, error in trial_errors.items()
@@ -132,14 +126,6 @@ def test_the_prior_of_the_light_decides_between_equal_fits() -> None:
     assert chosen(trials, {STARTS[0]: 0.014, STARTS[1]: 0.0202}, bright)[0].roughness == STARTS[0][1]
     kinds = {STARTS[0]: 0.02, STARTS[3]: 0.02}
     assert chosen(kinds, {STARTS[0]: 0.02, STARTS[3]: 0.0202}, bright)[0].metallic < 0.5  # not between metal and dielectric
-
-
-def test_blocks_of_photos_decide_about_roughness_alone() -> None:
-    """A sharp reflection a few pixels off has more error than a blurred one by pixels, and less by blocks."""
-    errors = {STARTS[0]: 0.02, STARTS[1]: 0.019, STARTS[3]: 0.0199}
-    assert chosen(errors, errors)[0].roughness == STARTS[1][1]
-    assert chosen(errors, errors, blocks={STARTS[0]: 0.5})[0].roughness == STARTS[0][1]
-    assert chosen(errors, errors, blocks={STARTS[3]: 0.1})[0].metallic < 0.5  # not about metal and dielectric
 
 
 def test_the_number_of_candidates_is_bounded() -> None:
