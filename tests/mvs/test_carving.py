@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from gsbake.capture.hull.visual_hull import Hull
 from gsbake.geometry.cameras import Camera
-from gsbake.mvs.carving import carve_hull, count_empty_rays, count_votes
+from gsbake.mvs.carving import _grow, carve_hull, count_empty_rays, count_votes
 from gsbake.mvs.depth_maps import z_depth
 from tests.mvs.scenes import RADIUS, camera_at, sphere_depth
 
@@ -87,6 +87,22 @@ def test_only_the_bowl_is_carved() -> None:
     assert -hull.cell < off.mean() < 0
     towards = (BOWL - points[floor]) / np.linalg.norm(BOWL - points[floor], axis=1, keepdims=True)
     assert (normals[floor] * towards).sum(1).mean() > 0.9
+
+
+def test_free_cells_join_the_region_beside_them() -> None:
+    """The lower half of the bowl joins the upper one; a pocket elsewhere does not, nor what would take a side of the ball away."""
+    hull, cameras = ball(), views()
+    axis = hull.lower[0] + (np.arange(CELLS) + 0.5) * hull.cell
+    cells = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1)
+    solid, in_bowl = hull.field < 0, np.linalg.norm(cells - BOWL, axis=-1) < HOLLOW
+    bowl, upper = solid & in_bowl, cells[..., 0] > BOWL[0] - 0.85 * HOLLOW
+    carved, lower = bowl & upper, bowl & ~upper
+    assert carved.sum() > 100 and lower.sum() > 20
+    share = np.where(lower | (np.linalg.norm(cells - np.array([-0.1, 0.2, 0.0]), axis=-1) < 0.1), 0.9, 0.1).astype(np.float32)
+    grown = _grow(carved, share, hull, cameras)
+    assert grown[lower].mean() > 0.8 and not grown[~lower].any()
+    share = np.where(solid & (cells[..., 2] > 0.1), 0.9, 0.1).astype(np.float32)
+    assert not _grow(carved, share, hull, cameras).any()
 
 
 def test_mirror_images_are_not_carved() -> None:
