@@ -38,8 +38,8 @@ VOTE_SIGMA = 1.0
 MIN_FREE_SHARE, PRIOR_VOTES, PRIOR_VOTE_SHARE = 0.65, 0.3, 0.2
 #: Greatest carving depth below the hull's surface in cells.
 MAX_CARVING_DEPTH = 6.0
-#: The prior for cells that join a carved region (hysteresis thresholding: Canny, *A computational approach to edge detection*, PAMI 1986).
-GROWTH_PRIOR_VOTES, GROWTH_PRIOR_VOTE_SHARE = 0.2, 0.1
+#: The same share for cells that join a carved region (hysteresis: Canny, *A computational approach to edge detection*, PAMI 1986).
+GROWTH_PRIOR_VOTE_SHARE = 0.1
 #: Carved regions have at least this many cells (fewer are noise), and at least this mean share of surface votes on the exposed surface.
 MIN_REGION_CELLS, MIN_SURFACE_SHARE = 8, 0.12
 #: A cell violates silhouettes when carving leaves this many photos with an empty ray through it (single masks may be wrong). Regions
@@ -186,7 +186,7 @@ def carve_hull(hull: Hull, cameras: Sequence[Camera], depths: Sequence[Floats]) 
     keep &= ~violating
     carved = keep[label]
     if carved.any():
-        weaker = votes / (votes + surface + max(GROWTH_PRIOR_VOTES, GROWTH_PRIOR_VOTE_SHARE * typical))
+        weaker = votes / (votes + surface + max(PRIOR_VOTES, GROWTH_PRIOR_VOTE_SHARE * typical))
         grown = _grow(carved, weaker, hull, cameras)
         free_share, carved = np.where(grown, weaker, free_share), carved | grown
     if not carved.any() or carved[solid].all():  # nothing to carve, or nothing would be left
