@@ -15,8 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
-from benchmarks.truth import align, nearest, nearest_on_faces, read_centres, read_mesh, read_truth
-from gsbake.geometry.cameras import CameraSet
+from benchmarks.truth import Z_UP, align, nearest, nearest_on_faces, read_centres, read_mesh, read_truth
+from gsbake.geometry.cameras import CameraSet, Similarity
+from gsbake.geometry.vectors import unit
 from gsbake.imaging.exr import read_exr
 from gsbake.imaging.srgb import decode, encode
 from gsbake.texturing.texels import rasterise
@@ -59,13 +60,42 @@ def true_values(points: NDArray[np.floating], mesh: Path, poses: Path, capture: 
 
     `mesh` and `poses` are the stage folders of the run.
     """
-    truth, cameras = read_truth(capture), CameraSet.load(poses / "cameras.json")
-    points = cameras.to_world.apply(np.asarray(points, np.float64))
-    if cameras.poses != "given":
-        points = align(read_mesh(mesh / "mesh.ply").moved(cameras.to_world), read_centres(poses / "cameras.json"), truth).apply(points)
+    to_truth, truth = _to_truth(mesh, poses, capture), read_truth(capture)
+    points = to_truth.apply(np.asarray(points, np.float64))
     face = nearest(points, truth.surface, 3)[1]
     corners = truth.surface.corners[face]
     return _true_values(capture / "gt" / "asset.glb", face, nearest_on_faces(points, corners), corners)
+
+
+def true_normals(points: NDArray[np.floating], mesh: Path, poses: Path, capture: Path) -> Floats:
+    """Unit shading normals (n, 3) in the unit frame of the reference nearest to `points` (n, 3), without its normal map."""
+    import trimesh
+
+    to_truth, truth = _to_truth(mesh, poses, capture), read_truth(capture)
+    at = to_truth.apply(np.asarray(points, np.float64))
+    face = nearest(at, truth.surface, 3)[1]
+    corners = truth.surface.corners[face]
+    share = _barycentric(corners, nearest_on_faces(at, corners))
+    asset: Any = trimesh.load(capture / "gt" / "asset.glb", force="mesh", process=False)
+    normals = np.asarray(asset.vertex_normals) @ Z_UP.T @ to_truth.rotation
+    return unit(np.einsum("nk,nkd->nd", share, normals[np.asarray(asset.faces)[face]]))
+
+
+def _to_truth(mesh: Path, poses: Path, capture: Path) -> Similarity:
+    """From the unit frame of a run to the Z-up world of the truth."""
+    cameras = CameraSet.load(poses / "cameras.json")
+    if cameras.poses == "given":
+        return cameras.to_world
+    moved = read_mesh(mesh / "mesh.ply").moved(cameras.to_world)
+    return cameras.to_world.then(align(moved, read_centres(poses / "cameras.json"), read_truth(capture)))
+
+
+def _barycentric(corners: Floats, points: Floats) -> Floats:
+    """Barycentric coordinates (n, 3) of `points` (n, 3) on triangles with `corners` (n, 3, 3)."""
+    import trimesh
+
+    share = np.clip(np.nan_to_num(trimesh.triangles.points_to_barycentric(corners, points, method="cramer"), nan=1 / 3), 0, 1)
+    return np.asarray(share / share.sum(1, keepdims=True))
 
 
 def _true_values(asset: Path, face: NDArray[np.int64], points: Floats, corners: Floats) -> Floats:
@@ -73,8 +103,7 @@ def _true_values(asset: Path, face: NDArray[np.int64], points: Floats, corners: 
     import trimesh
 
     mesh: Any = trimesh.load(asset, force="mesh", process=False)
-    share = np.clip(np.nan_to_num(trimesh.triangles.points_to_barycentric(corners, points, method="cramer"), nan=1 / 3), 0, 1)
-    share /= share.sum(1, keepdims=True)
+    share = _barycentric(corners, points)
     uv = np.einsum("nk,nkd->nd", share, np.asarray(mesh.visual.uv)[np.asarray(mesh.faces)[face]])
     material = mesh.visual.material
 
