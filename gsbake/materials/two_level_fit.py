@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 from gsbake.materials.fit import MaterialFit
+from gsbake.materials.fit_surface import validation_error
 from gsbake.materials.initialisation import DEFAULT_START, ChosenFit, best_fit, trial_fits, trial_schedule
 from gsbake.materials.levels import FitLevel
 from gsbake.materials.metal_trials import try_kinds
@@ -52,15 +53,14 @@ class FitPlan:
 
 
 def compare_light_motions(levels: Mapping[Motion, FitLevel], plan: FitPlan, progress: Progress) -> dict[Motion, float]:
-    """PSNR in dB on validation photos of short fits from the default start on the coarse `levels`, whose photos differ in how the light
-    moves."""
+    """Validation error of short fits from the default start on the coarse `levels`, whose photos differ in how the light moves."""
     steps, (metallic, roughness) = plan.steps(TRIAL_SHARE), DEFAULT_START
     schedule = trial_schedule(steps, plan.seed, plan.diffuse)
     found: dict[Motion, float] = {}
     for motion, level in levels.items():
         fit = MaterialFit(level.surface, plan.light_size, plan.priors, roughness, metallic)
         each: Callable[[int, int], None] = partial(progress, "trial fits of moving lights")
-        found[motion] = fit.run(level.fitted, level.held_out, schedule, each).held_out_psnr or 0.0
+        found[motion] = validation_error(fit.run(level.fitted, level.held_out, schedule, each))
     return found
 
 

@@ -78,4 +78,4 @@ def best_motion(scene: Scene) -> Motion:
     motions: tuple[Motion, ...] = ("static", "turntable", "camera")
     levels = {m: FitLevel(scene.surface(), photos[2:], photos[:2]) for m in motions for photos in [under(scene, m)]}
     found = compare_light_motions(levels, FitPlan(400, 16, WEAK_PRIORS), lambda *_: None)
-    return max(found, key=lambda motion: found[motion])
+    return min(found, key=lambda motion: found[motion])
