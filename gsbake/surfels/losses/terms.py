@@ -100,19 +100,21 @@ def projection_loss(
 
 
 def silhouette_distance(points: Tensor, distance: Tensor, R: Tensor, t: Tensor, view: Pinhole) -> Tensor:
-    """Mean distance (unit frame) by which points (n, 3) in front of the camera project outside the mask.
+    """Mean distance (unit frame) by which points (n, 3) project outside the mask; 0 for those behind the camera or not finite.
 
     `distance` (h, w) is in pixels from each pixel to the mask, 0 inside. It is 0 in all views for points of the visual hull alone
     (Laurentini, *The visual hull concept*, PAMI 1994). The gradient moves points across the view, towards the mask; the depth that turns
     pixels into lengths, and the pose, get none. Points outside the frame are taken at its border.
     """
     cam = points @ R.detach().T + t.detach()
-    z = cam[:, 2].clamp_min(1e-3)
+    known = torch.isfinite(cam).all(1) & (cam[:, 2] > 1e-3) & (cam[:, :2].abs() < 1e4 * cam[:, 2:]).all(1)
+    cam = torch.where(known[:, None], cam, 1.0)
+    z = cam[:, 2]
     x = (view.fx * cam[:, 0] / z + view.cx) / view.width * 2 - 1
     y = (view.fy * cam[:, 1] / z + view.cy) / view.height * 2 - 1
     grid = torch.stack([x, y], 1)[None, None]
     pixels = F.grid_sample(distance[None, None], grid, mode="bilinear", padding_mode="border", align_corners=False)[0, 0, 0]
-    return (pixels * (z.detach() / view.fx) * (cam[:, 2] > 1e-3)).sum() / max(1, len(points))
+    return torch.where(known, pixels * (z.detach() / view.fx), 0.0).sum() / max(1, len(points))
 
 
 def expected_depth(depth: Tensor, alpha: Tensor) -> Tensor:

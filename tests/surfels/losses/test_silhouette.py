@@ -38,6 +38,15 @@ def test_lengths_across_the_view() -> None:
     assert float(silhouette_distance(behind, half_plane(), torch.eye(3), torch.zeros(3), VIEW)) == 0
 
 
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, 1e38])
+def test_a_point_that_is_not_finite_is_left_out(value: float) -> None:
+    points = torch.tensor([[0.3, 0.1, 2.0], [value, 0.1, 2.0], [0.1, 0.1, value]], requires_grad=True)
+    loss = silhouette_distance(points, half_plane(), torch.eye(3), torch.zeros(3), VIEW)
+    loss.backward()
+    assert torch.isfinite(loss) and points.grad is not None
+    assert torch.isfinite(points.grad).all() and float(points.grad[0].abs().sum()) > 0
+
+
 def test_gradient_is_one_across_the_view_and_none_along_it() -> None:
     points = torch.tensor([[0.3, 0.1, 2.0], [0.55, -0.2, 1.5]], requires_grad=True)
     silhouette_distance(points, half_plane(), torch.eye(3), torch.zeros(3), VIEW).backward()
