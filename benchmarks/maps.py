@@ -60,34 +60,34 @@ def true_values(points: NDArray[np.floating], mesh: Path, poses: Path, capture: 
 
     `mesh` and `poses` are the stage folders of the run.
     """
-    to_truth, truth = _to_truth(mesh, poses, capture), read_truth(capture)
-    points = to_truth.apply(np.asarray(points, np.float64))
-    face = nearest(points, truth.surface, 3)[1]
-    corners = truth.surface.corners[face]
-    return _true_values(capture / "gt" / "asset.glb", face, nearest_on_faces(points, corners), corners)
+    _, face, at, corners = _nearest_reference(points, mesh, poses, capture)
+    return _true_values(capture / "gt" / "asset.glb", face, at, corners)
 
 
 def true_normals(points: NDArray[np.floating], mesh: Path, poses: Path, capture: Path) -> Floats:
     """Unit shading normals (n, 3) in the unit frame of the reference nearest to `points` (n, 3), without its normal map."""
     import trimesh
 
-    to_truth, truth = _to_truth(mesh, poses, capture), read_truth(capture)
-    at = to_truth.apply(np.asarray(points, np.float64))
-    face = nearest(at, truth.surface, 3)[1]
-    corners = truth.surface.corners[face]
-    share = _barycentric(corners, nearest_on_faces(at, corners))
+    to_truth, face, at, corners = _nearest_reference(points, mesh, poses, capture)
+    share = _barycentric(corners, at)
     asset: Any = trimesh.load(capture / "gt" / "asset.glb", force="mesh", process=False)
     normals = np.asarray(asset.vertex_normals) @ Z_UP.T @ to_truth.rotation
     return unit(np.einsum("nk,nkd->nd", share, normals[np.asarray(asset.faces)[face]]))
 
 
-def _to_truth(mesh: Path, poses: Path, capture: Path) -> Similarity:
-    """From the unit frame of a run to the Z-up world of the truth."""
-    cameras = CameraSet.load(poses / "cameras.json")
-    if cameras.poses == "given":
-        return cameras.to_world
-    moved = read_mesh(mesh / "mesh.ply").moved(cameras.to_world)
-    return cameras.to_world.then(align(moved, read_centres(poses / "cameras.json"), read_truth(capture)))
+def _nearest_reference(
+    points: NDArray[np.floating], mesh: Path, poses: Path, capture: Path
+) -> tuple[Similarity, NDArray[np.int64], Floats, Floats]:
+    """From the unit frame to the truth's Z-up world; there the face (n,) of the reference nearest to each of `points`, the nearest point
+    (n, 3) on it and its corners (n, 3, 3)."""
+    truth, cameras = read_truth(capture), CameraSet.load(poses / "cameras.json")
+    to_truth = cameras.to_world
+    if cameras.poses != "given":
+        to_truth = to_truth.then(align(read_mesh(mesh / "mesh.ply").moved(to_truth), read_centres(poses / "cameras.json"), truth))
+    at = to_truth.apply(np.asarray(points, np.float64))
+    face = nearest(at, truth.surface, 3)[1]
+    corners = truth.surface.corners[face]
+    return to_truth, face, nearest_on_faces(at, corners), corners
 
 
 def _barycentric(corners: Floats, points: Floats) -> Floats:

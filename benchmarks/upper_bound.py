@@ -50,8 +50,8 @@ def lay_true_maps(run: Path, capture: Path, out: Path, normals: bool = False) ->
     maps[texels.index, :5] = true_values(points, folder["mesh"], folder["poses"], capture)
     if normals:
         smooth, tangent = (texels.interpolate(unwrapped[name], unwrapped["faces"]) for name in ("normal", "tangent"))
-        known = true_normals(points, folder["mesh"], folder["poses"], capture)
-        samples = DenseSamples(np.ones(len(known), bool), points, known, 0.0)
+        reference = true_normals(points, folder["mesh"], folder["poses"], capture)
+        samples = DenseSamples(np.ones(len(reference), bool), points.astype(np.float64), reference, 0.0)
         maps[texels.index, 5:] = normal_map(samples, smooth, tangent)
     empty = np.ones(orm.shape[:2], bool)
     empty.reshape(-1)[texels.index] = False
