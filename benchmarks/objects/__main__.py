@@ -118,7 +118,7 @@ def render(entry: Entry, out: Path, shared: Path) -> Path:
     capture.mkdir(parents=True, exist_ok=True)
     model = out / "captures" / f"{entry.name}.glb"
     model.write_bytes(entry.model_bytes(shared))
-    command = [str(PYTHON), str(shared / "score" / "make_capture.py"), str(model), str(capture), *entry.render_arguments(lights())]
+    command = entry.render_command(PYTHON, model, capture, shared / "score", lights())
     with (out / "captures" / f"{entry.name}.log").open("w") as log:
         subprocess.run(command, check=True, stdout=log, stderr=subprocess.STDOUT)
     done.write_text(entry.key)
@@ -184,7 +184,7 @@ def main() -> None:
         try:
             capture = render(entry, arguments.out, arguments.scorer.parent)
             seconds = bake(capture, run, arguments)
-            found = score(capture, run / "asset.glb", run / "cameras.json" if entry.mode == "photos" else None, arguments.scorer)
+            found = score(capture, run / "asset.glb", None if entry.mode == "posed" else run / "cameras.json", arguments.scorer)
         except (GsbakeError, subprocess.CalledProcessError) as error:
             print(f"{name}: {error}", file=sys.stderr)
             continue

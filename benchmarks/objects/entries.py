@@ -13,14 +13,15 @@ from benchmarks.objects.models import MODELS, model_glb
 from gsbake.errors import BadInputError
 
 LIST = Path(__file__).parent / "objects.toml"
+TURNTABLE = Path(__file__).parent / "turntable_render.py"
 
 
 @dataclass(frozen=True)
 class Entry:
     """One object: its `model`, the `light` of the photos and those of `relight`, cameras and the `seed` of their positions.
 
-    `mode`, `views`, `resolution`, `samples`, `test_views`, `test_resolution` are options of the scorer's `make_capture.py`. `sha256` is
-    that of a model file.
+    `mode`, `views`, `resolution`, `samples`, `test_views`, `test_resolution` are options of the scorer's `make_capture.py`; captures on a
+    turntable are rendered by `turntable_render.py`. `sha256` is that of a model file.
     """
 
     name: str
@@ -28,7 +29,7 @@ class Entry:
     light: str
     relight: tuple[str, ...]
     metal: Literal["none", "neutral", "coloured", "mixed"]
-    mode: Literal["posed", "photos"]
+    mode: Literal["posed", "photos", "turntable"]
     views: int
     resolution: tuple[int, int]
     samples: int
@@ -54,11 +55,14 @@ class Entry:
             raise BadInputError(f"{shared / self.model} is not the file that objects.toml names (other SHA-256); get that one.")
         return data
 
-    def render_arguments(self, lights: Path) -> list[str]:
-        """Options of `make_capture.py`; `lights` is the folder of the environments."""
+    def render_command(self, python: Path, model: Path, capture: Path, scorer: Path, lights: Path) -> list[str]:
+        """The command that renders `capture`: `scorer` is the folder of `make_capture.py`, `lights` that of the environments."""
+        turntable = [str(TURNTABLE), "--scorer", str(scorer)]
+        script = turntable if self.mode == "turntable" else [str(scorer / "make_capture.py"), "--mode", self.mode]
         width, height = self.resolution
         return [
-            "--mode", self.mode, "--views", str(self.views), "--res", str(width), str(height), "--samples", str(self.samples),
+            str(python), *script, str(model), str(capture),
+            "--views", str(self.views), "--res", str(width), str(height), "--samples", str(self.samples),
             "--test-views", str(self.test_views), "--test-res", str(self.test_resolution), "--seed", str(self.seed),
             "--hdri", str(lights / f"{self.light}.exr"), "--relight", *(str(lights / f"{light}.exr") for light in self.relight),
         ]  # fmt: skip

@@ -190,8 +190,9 @@ def _cameras(work: Path, entries: list[dict[str, Any]], threads: int, monitor: M
         error_px = solved.figures["reprojection_px"]
         text = f"{total - len(missing)} of {total} photos registered, reprojection error {error_px:.2f} px"
         findings.append(Finding("good", "cameras", text))
-    if solved.figures.get("masked_features"):
-        text = "the object moves against its surroundings; features inside its masks place the cameras"
+    if solved.figures.get("masked_features") or solved.figures.get("moving_features"):
+        where = "inside its masks" if solved.figures["masked_features"] else "on what moves"
+        text = f"the object moves against its surroundings; features {where} place the cameras"
         findings.append(Finding("good", "background", text))
     if share >= FAILED_SHARE:  # a few cameras say nothing about the others
         findings += coverage(solved.cameras)

@@ -77,7 +77,7 @@ class Poses(Section):
     mapper: Literal["incremental", "global"] = Field("incremental", description="COLMAP mapper.")
     min_registered: Fraction = Field(0.5, description="Minimum share of registered photos; a smaller one is an error.")
     masked_features: bool | Literal["auto"] = Field(
-        "auto", description="Detect features inside the masks only. auto: where the background is static (turntables), or cameras from whole photos contradict the masks."
+        "auto", description="Detect features inside the masks only. auto: where cameras from whole photos contradict the masks. Unless false, a background that stands while the object turns is left out."
     )
     max_size: int = Field(1600, ge=64, le=16_384, description="Longer side in pixels of the photos in which features are detected.")
     fine_features: bool | Literal["auto"] = Field(

@@ -15,7 +15,6 @@ import cv2
 import numpy as np
 
 from gsbake.capture.sfm.mask_agreement import MIN_AGREEMENT, MIN_GUESS_AGREEMENT, guess_agreement, mask_agreement
-from gsbake.capture.sfm.static_background import is_background_static
 from gsbake.geometry.cameras import Camera
 from gsbake.imaging.png import write_png
 
@@ -57,23 +56,26 @@ class FeatureMasks:
             return 0.0
         return (guess_agreement if self.guessed else mask_agreement)(cameras, self.files)
 
-    def background_is_static(self) -> tuple[bool, str]:
-        """Whether the background is the same in all photos, and the evidence."""
-        files = self.files
-        return is_background_static([(self.ingest / e["file"], files[e["name"]]) for e in self.entries])
-
-    def write(self) -> Path:
-        """Write the masks under COLMAP's file names at the size of the photos; their folder."""
+    def write(self, moving: Path | None = None) -> Path:
+        """Write the masks under COLMAP's file names at the size of the photos, limited to those in the folder `moving`; their folder."""
         self.folder.mkdir(parents=True, exist_ok=True)
         files = self.files
         for entry in (e for e in self.entries if e["name"] in files):
-            mask: Any = cv2.imread(str(files[entry["name"]]), cv2.IMREAD_GRAYSCALE)
-            if mask is None:
-                raise FileNotFoundError(files[entry["name"]])
+            mask: Any = _read(files[entry["name"]])
             if not entry["mask"]:
                 radius = max(1, round(GUESS_MARGIN * max(mask.shape)))
                 disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
                 mask = cv2.dilate(255 * (mask > 127).astype(np.uint8), np.asarray(disc, np.uint8))
                 mask = cv2.resize(mask, (entry["width"], entry["height"]), interpolation=cv2.INTER_NEAREST)
+            if moving is not None:
+                mask = np.minimum(mask, _read(moving / f"{entry['name']}.png.png"))
             write_png(self.folder / f"{entry['name']}.png.png", np.asarray(mask, np.uint8))
         return self.folder
+
+
+def _read(path: Path) -> Any:
+    """A mask (h, w); raises FileNotFoundError."""
+    mask: Any = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+    if mask is None:
+        raise FileNotFoundError(path)
+    return mask

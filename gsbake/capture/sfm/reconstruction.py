@@ -11,7 +11,7 @@ from __future__ import annotations
 import shutil
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence, Set
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
 from functools import lru_cache
@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from gsbake.capture.sfm import pairs as pairing
 from gsbake.capture.sfm.colmap import pycolmap, repeatable_mapping
 from gsbake.capture.sfm.feature_cache import Descriptors, FeatureCache, Keypoints, photo_key
-from gsbake.capture.sfm.matching import match_pairs
+from gsbake.capture.sfm.matching import Matches, match_pairs
 from gsbake.capture.sfm.merging import merge_all, new_photos
 from gsbake.capture.sfm.verification import verify
 
@@ -36,6 +36,8 @@ RELAXED_MIN_INLIERS, RELAXED_MIN_INLIER_RATIO = 15, 0.15
 RANKING_FEATURES = 256
 #: Median features per photo from which the finest octave is skipped, and the share of unregistered photos above which it is added again.
 ENOUGH_FEATURES, MAX_UNREGISTERED_SHARE = 1500, 0.05
+#: Pixels by which the features of a match must differ in photos of a camera that stood.
+MIN_MOTION = 1.5
 #: Photos whose descriptors are kept in memory while pairs are matched, about 1 MB each.
 CACHED_PHOTOS = 128
 
@@ -65,7 +67,8 @@ class FeatureOptions:
 class SfmPipeline:
     """One SfM run: photos `folder/<name>.png`, masks `mask_folder/<name>.png.png`, database and models in `work`.
 
-    `cache` keeps features and matches beyond the run. `seconds` holds the time of each part, `upsampled` whether the features include the
+    `cache` keeps features and matches beyond the run. `one_camera` are pairs of photos of a camera that stood while the object turned: what
+    stands in them is not the object. `seconds` holds the time of each part, `upsampled` whether the features include the
     finest octave, `detected` the photos whose features, `matched` and `verified` the number of pairs whose matches and geometry were
     computed, `steps` what was tried in turn and how many photos the best model had after it.
     """
@@ -79,6 +82,7 @@ class SfmPipeline:
     seed: int
     tick: Tick
     cache: FeatureCache = field(default_factory=lambda: FeatureCache(None))
+    one_camera: Set[frozenset[str]] = frozenset()
     seconds: dict[str, float] = field(default_factory=dict)
     upsampled: bool = False
     detected: set[str] = field(default_factory=set)
@@ -238,13 +242,21 @@ class SfmPipeline:
             ids = {image.name.rsplit(".", 1)[0]: image.image_id for image in base.read_all_images()}
             key = {ids[name]: key for name, key in self._keys(names).items()}
             numbered, missing = [(ids[names[i]], ids[names[j]]) for i, j in pairs], []
+            standing = {pair for pair, (i, j) in zip(numbered, pairs, strict=True) if frozenset((names[i], names[j])) in self.one_camera}
+
+            def moved(pair: pairing.Pair, matches: Matches) -> Matches:
+                if pair not in standing:
+                    return matches
+                first, second = (np.asarray(base.read_keypoints(image))[:, :2] for image in pair)
+                return matches[np.linalg.norm(first[matches[:, 0]] - second[matches[:, 1]], axis=1) >= MIN_MOTION]
+
             for pair in numbered:
                 if base.exists_matches(*pair):
                     continue
                 if (kept := self.cache.matches((key[pair[0]], key[pair[1]]))) is None:
                     missing.append(pair)
                 else:
-                    base.write_matches(*pair, kept)
+                    base.write_matches(*pair, moved(pair, kept))
             self.matched += len(missing)
 
             @lru_cache(maxsize=CACHED_PHOTOS)
@@ -252,11 +264,11 @@ class SfmPipeline:
                 return np.asarray(base.read_descriptors(image).data)
 
             for done, (pair, matches) in enumerate(match_pairs(missing, descriptors, self.threads), len(pairs) - len(missing) + 1):
-                base.write_matches(*pair, matches)
+                base.write_matches(*pair, moved(pair, matches))
                 self.cache.keep_matches((key[pair[0]], key[pair[1]]), matches)
                 self.tick("matching", done, len(pairs))
         with self._timed("verification", 1):
-            self.verified += verify(self.database, numbered, key, self.cache, self.seed)
+            self.verified += verify(self.database, numbered, standing, key, self.cache, self.seed)
 
     def _mapper(self, relaxed: bool) -> Any:
         options = repeatable_mapping(self.seed)

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 from urllib.parse import quote
 
 import numpy as np
@@ -17,6 +17,7 @@ from gsbake.capture.photos.undistortion import distort, intrinsics_key, pinhole_
 from gsbake.capture.sfm.feature_masks import FeatureMasks
 from gsbake.capture.sfm.pairs import choose_matching
 from gsbake.capture.sfm.process import JobCallbacks, run_job
+from gsbake.capture.sfm.standing_background import StandingBackground, find_standing_background
 from gsbake.config.schema import Poses
 from gsbake.errors import BadInputError, InterruptedRun
 from gsbake.geometry.cameras import Camera, CameraSet
@@ -26,17 +27,14 @@ from gsbake.text import shortlist
 #: Time limit of triangulation with given poses in seconds, per photo and at least. Far above any measured time: it ends a process that
 #: hangs, and the run with it.
 SECONDS_PER_PHOTO, MIN_SECONDS = 60.0, 1800.0
-#: A trial on small photos decides which features are tried first in captures of more photos than this; smaller ones are solved quickly.
-MAX_UNTRIED_PHOTOS = 24
-#: Longer side of the trial's photos in pixels, its features per photo, and the share of photos it must register to tell anything.
-TRIAL_SIZE, TRIAL_FEATURES, MIN_TRIAL_SHARE = 600, 2048, 0.5
 #: Share of registered photos below which the other kind of features is tried too.
 MIN_PLACED_SHARE = 0.85
 #: Largest shift that a lens's distortion plausibly causes at the corner of a photo, as a share of the corner's distance from the centre;
 #: wide-angle lenses reach a quarter.
 MAX_DISTORTION = 0.35
-#: Where features are detected: whether inside the masks.
-_FEATURES = {False: "in whole photos", True: "inside the masks"}
+#: Where features are detected.
+Region = Literal["whole photos", "moving parts", "masks"]
+_FEATURES: dict[Region, str] = {"whole photos": "in whole photos", "moving parts": "on what moves", "masks": "inside the masks"}
 
 
 @dataclass(frozen=True)
@@ -50,12 +48,19 @@ class Solved:
 
 @dataclass(frozen=True)
 class _Attempt:
-    """A solution: the COLMAP process's `result`, the `cameras`, the `folder` of its files, and whether features are `masked`."""
+    """A solution: the COLMAP process's `result`, the `cameras`, the `folder` of its files, the `region` of the features, and whether the
+    object was `turned` before a background that stands."""
 
     result: dict[str, Any]
     cameras: list[Camera]
     folder: Path
-    masked: bool
+    region: Region
+    turned: bool
+
+    @property
+    def masked(self) -> bool:
+        """Whether features are limited to the masks."""
+        return self.region == "masks"
 
 
 @dataclass(frozen=True)
@@ -86,10 +91,15 @@ class PoseSolver:
         result = found.result
         count, missing = int(result["registered"]), list(result["missing"])
         if count < max(3, self.options.min_registered * len(names)):
+            lost = f"Structure from motion registered only {count} of {len(names)} photos (not {shortlist(missing)})"
+            if found.turned:
+                raise BadInputError(
+                    f"{lost}: the background stands while the object turns, and on what turns there is too little texture; put something "
+                    "with an irregular pattern, such as a newspaper, below the object, or turn it by less between photos."
+                )
             raise BadInputError(
-                f"Structure from motion registered only {count} of {len(names)} photos (not {shortlist(missing)}); take sharp photos "
-                "that overlap by two thirds, with texture in view, remove those of other places, or try poses.matching=exhaustive and more "
-                "poses.max_features."
+                f"{lost}; take sharp photos that overlap by two thirds, with texture in view, remove those of other places, or try "
+                "poses.matching=exhaustive and more poses.max_features."
             )
         if not all(map(is_plausible_lens, found.cameras)):
             raise BadInputError(_tied_together(found.masked, any(e["mask"] or e.get("guess") for e in self.entries)))
@@ -112,6 +122,7 @@ class PoseSolver:
             "cameras": len(_lenses(self.entries)),
             "matching": kind,
             "masked_features": found.masked,
+            "moving_features": found.region == "moving parts",
             "fine_features": result["fine_features"],
             "photos_detected": result["detected"],
             "pairs_matched": result["matched"],
@@ -123,56 +134,59 @@ class PoseSolver:
             found.folder.rename(self.folder)
         return Solved(found.cameras, self.folder / "points.ply", figures)
 
-    def _attempt(self, matching: str, masks: Path | None, trial: bool = False) -> _Attempt:
-        """Structure from motion with features in whole photos, or inside `masks`; each has a database of its own. A `trial` is coarse."""
-        suffix = "_trial" if trial else "" if masks is None else "_masked"
+    def _attempt(
+        self, matching: str, region: Region = "whole photos", files: Path | None = None, background: StandingBackground | None = None
+    ) -> _Attempt:
+        """Structure from motion with features in a `region` of the photos, whose mask `files` are in a folder; each region has a database
+        of its own. What stands in photos of one round before a `background` is not matched."""
+        suffix = {"whole photos": "", "moving parts": "_moving", "masks": "_masked"}[region]
         folder = self.scratch / f"solve{suffix}"
-        job = self._job("solve", self.entries, masks) | {"matching": matching, "mapper": self.options.mapper}
-        if trial:
-            size, features = min(TRIAL_SIZE, job["max_size"]), min(TRIAL_FEATURES, job["max_features"])
-            job |= {"max_size": size, "max_features": features, "fine": False}
-        job["work"] = str(self.scratch / f"colmap{suffix}")
+        job = self._job("solve", self.entries, files, [] if background is None else background.pairs)
+        job |= {"matching": matching, "mapper": self.options.mapper, "work": str(self.scratch / f"colmap{suffix}")}
         result = self._run(job, folder)
         cameras = list(CameraSet.load(folder / "cameras.json").cameras) if result["registered"] else []
-        return _Attempt(result, cameras, folder, masks is not None)
+        return _Attempt(result, cameras, folder, region, background is not None)
 
     def _best_attempt(self, matching: str) -> _Attempt:
-        """The solution with features in whole photos or inside the masks, as set, or the one that the masks support better.
+        """The solution with features in whole photos or inside the masks, as set, or the one that the masks support better. Features of a
+        background that stands while the object turns are left out.
 
-        Registration that looks complete is no evidence: a background that stays while the object turns registers just as well.
+        Registration that looks complete is no evidence: a background that stands registers just as well.
         """
         masks, setting = FeatureMasks(self.ingest, self.entries, self.scratch / "feature_masks"), self.options.masked_features
-        if setting != "auto" or not masks.complete:
-            return self._attempt(matching, masks.write() if setting is True and masks.files else None)
-        static, evidence = masks.background_is_static()
-        first = static
-        if not static and len(self.entries) > MAX_UNTRIED_PHOTOS:
-            first, evidence = self._try_small_photos(matching, masks)
-        self.monitor.decide("features", _FEATURES[first], evidence)
-        attempts = [self._attempt(matching, masks.write() if first else None)]
-        agreement = [self._agreement(attempts[0], masks)]
-        if (agreement[0] >= masks.min_agreement and not self._lost(attempts[0])) or (static and not masks.guessed):
+        if setting is False:
+            return self._attempt(matching)
+        compared = find_standing_background({e["name"]: self.ingest / e["file"] for e in self.entries})
+        background = compared if compared.stands else None
+        moving = None if background is None else background.write_moving_parts(self.scratch / "moving_parts")
+
+        def attempt(masked: bool) -> _Attempt:
+            if masked:
+                return self._attempt(matching, "masks", masks.write(moving), background)
+            return self._attempt(matching, "whole photos" if moving is None else "moving parts", moving, background)
+
+        if setting is True and masks.files:
+            return attempt(True)
+        self.monitor.decide("features", _FEATURES["whole photos" if background is None else "moving parts"], compared.evidence)
+        attempts = [attempt(False)]
+        if not masks.complete:
             return attempts[0]
-        attempts.append(self._attempt(matching, None if first else masks.write()))
+        agreement = [self._agreement(attempts[0], masks)]
+        if agreement[0] >= masks.min_agreement and not self._lost(attempts[0]):
+            return attempts[0]
+        attempts.append(attempt(True))
         agreement.append(self._agreement(attempts[1], masks))
         # A right model of one position of the object is worth more than a wrong one of both.
         score = [(a >= masks.min_agreement, a * len(found.cameras)) for a, found in zip(agreement, attempts, strict=True)]
         chosen = attempts[int(score[1] > score[0])]
         results = [
-            f"to {a:.2f} with {len(found.cameras)} of {len(self.entries)} photos registered by features {_FEATURES[found.masked]}"
+            f"to {a:.2f} with {len(found.cameras)} of {len(self.entries)} photos registered by features {_FEATURES[found.region]}"
             for a, found in zip(agreement, attempts, strict=True)
         ]
-        self.monitor.decide("features", _FEATURES[chosen.masked], f"masks agree with the cameras {results[0]}, {results[1]}")
+        self.monitor.decide("features", _FEATURES[chosen.region], f"masks agree with the cameras {results[0]}, {results[1]}")
+        if max(agreement) < masks.min_agreement and not masks.guessed:
+            self.monitor.warn(f"The masks agree with the cameras to {max(agreement):.2f} only: one of the two is wrong; look at the masks.")
         return chosen
-
-    def _try_small_photos(self, matching: str, masks: FeatureMasks) -> tuple[bool, str]:
-        """Whether features inside the masks are tried first, because a coarse solution of whole photos contradicts the masks."""
-        trial = self._attempt(matching, None, trial=True)
-        share = len(trial.cameras) / len(self.entries)
-        if share < MIN_TRIAL_SHARE:
-            return False, f"a trial on small photos registered only {len(trial.cameras)} of {len(self.entries)}"
-        agreement = self._agreement(trial, masks)
-        return agreement < masks.min_agreement, f"masks agree with the cameras of a trial on small photos to {agreement:.2f}"
 
     def _lost(self, attempt: _Attempt) -> bool:
         """Whether so many photos are missing that other features may place more of them."""
@@ -202,7 +216,9 @@ class PoseSolver:
         self.monitor.decide("tie points", f"{solved['points']} triangulated", "with the given poses")
         return Solved(cameras, cloud, figures)
 
-    def _job(self, task: str, entries: Sequence[dict[str, Any]], masks: Path | None) -> dict[str, Any]:
+    def _job(
+        self, task: str, entries: Sequence[dict[str, Any]], masks: Path | None, one_camera: Sequence[tuple[str, str]] = ()
+    ) -> dict[str, Any]:
         """Description of a job for the COLMAP process."""
         options = self.options
         return {
@@ -212,6 +228,7 @@ class PoseSolver:
             "work": str(self.scratch / "colmap"),
             "cache": None if self.cache is None else str(self.cache),
             "lenses": _lenses(entries),
+            "one_camera": list(one_camera),
             "max_features": options.max_features,
             "peak_threshold": options.peak_threshold,
             "max_size": options.max_size,

@@ -7,7 +7,7 @@ is kept beyond the run (`feature_cache`): it depends on the features of both pho
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -18,25 +18,30 @@ from numpy.typing import NDArray
 
 from gsbake.capture.sfm.colmap import pycolmap
 from gsbake.capture.sfm.feature_cache import FeatureCache
+from gsbake.capture.sfm.pairs import Pair
 
 #: Matrices of a two-view geometry, each of which may be absent.
 _MATRICES = ("E", "F", "H")
 
 
-def verify(database: Path, pairs: Sequence[tuple[int, int]], keys: Mapping[int, str], cache: FeatureCache, seed: int) -> int:
+def verify(
+    database: Path, pairs: Sequence[Pair], reduced: Set[Pair], keys: Mapping[int, str], cache: FeatureCache, seed: int
+) -> int:
     """Write the two-view geometry of `pairs` of photo identifiers that have matches and no geometry yet; returns how many were computed.
 
-    `keys` are those of the photos' features. Runs with all processor cores; results do not depend on their number.
+    `keys` are those of the photos' features; of `reduced` pairs matches were left out. Runs with all processor cores; results do not depend
+    on their number.
     """
     with closing(pycolmap.Database.open(str(database))) as base:
         images = {image.image_id: image for image in base.read_all_images()}
         lenses = {number: _lens(base.read_camera(image.camera_id)) for number, image in images.items()}
         pending: dict[tuple[int, int], tuple[str, str, str]] = {}
-        for pair in ((min(p), max(p)) for p in pairs):  # the other way round COLMAP inverts what it writes and reads
+        for given in pairs:
+            pair = min(given), max(given)  # the other way round COLMAP inverts what it writes and reads
             if base.exists_two_view_geometry(*pair) or not base.exists_matches(*pair):
                 continue
             i, j = pair
-            name = keys[i], keys[j], _digest([lenses[i], lenses[j], seed, pycolmap.__version__])
+            name = keys[i], keys[j], _digest([lenses[i], lenses[j], seed, pycolmap.__version__, given in reduced])
             if (kept := cache.geometry(name)) is None:
                 pending[pair] = name
             else:

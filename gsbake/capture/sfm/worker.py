@@ -55,6 +55,7 @@ def _pipeline(job: Mapping[str, Any]) -> SfmPipeline:
         seed=job["seed"],
         tick=_report_progress,
         cache=FeatureCache(Path(job["cache"]) if job["cache"] else None),
+        one_camera={frozenset(pair) for pair in job["one_camera"]},
     )
 
 

@@ -103,30 +103,6 @@ def test_contradicted_solution_is_tried_again(
     assert len(kept) == COUNT and kept[5].centre == pytest.approx(expected[5].centre)
 
 
-@pytest.mark.parametrize(("turn", "attempts"), [(0.3, ["_trial", "_masked"]), (1.0, ["_trial", ""])])
-def test_a_trial_on_small_photos_spares_the_wrong_attempt(
-    turn: float, attempts: list[str], tmp_path: Path, answers: Callable[..., Jobs], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(solve, "MAX_UNTRIED_PHOTOS", COUNT - 1)
-    entries = write_capture(tmp_path / "ingest", ring(), "guess")
-    jobs = answers(lambda job: ring() if job["masks"] else ring(turn))
-    solver(tmp_path, entries).solve()
-    assert [Path(job["work"]).name for job in jobs] == [f"colmap{suffix}" for suffix in attempts]
-    assert jobs[0]["max_size"] == solve.TRIAL_SIZE and not jobs[0]["fine"] and jobs[1]["max_size"] > solve.TRIAL_SIZE
-
-
-def test_a_trial_that_registers_little_decides_nothing(
-    tmp_path: Path, answers: Callable[..., Jobs], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(solve, "MAX_UNTRIED_PHOTOS", COUNT - 1)
-    entries = write_capture(tmp_path / "ingest", ring(), "guess")
-    jobs = answers(lambda job: ring()[:3] if job["work"].endswith("_trial") else ring())
-    run = solver(tmp_path, entries)
-    run.solve()
-    assert [bool(job["masks"]) for job in jobs] == [False, False]
-    assert "registered only 3 of 16" in run.monitor.line("features")  # type: ignore[attr-defined]
-
-
 @pytest.mark.parametrize(("kind", "advice"), [("mask", "correct masks of the object"), (None, "give masks of the object")])
 def test_an_impossible_lens_is_explained_by_movement(
     kind: str | None, advice: str, tmp_path: Path, answers: Callable[..., Jobs]

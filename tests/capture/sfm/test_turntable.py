@@ -1,4 +1,4 @@
-"""An object on a turntable in a cluttered room, from two heights: only features inside the masks find the cameras."""
+"""An object on a turntable in a cluttered room, from two heights: features of the room are left out."""
 
 from __future__ import annotations
 
@@ -67,8 +67,8 @@ def test_a_turntable_in_a_room_is_solved_from_the_object(tmp_path: Path) -> None
     (tmp_path / "scratch").mkdir()
     monitor = Recorder()
     solved = PoseSolver(tmp_path / "ingest", entries, tmp_path / "scratch", Poses(), 0, 2, monitor).solve()
-    assert solved.figures["masked_features"] is True and solved.figures["registered"] == len(true)
-    assert monitor.decisions["features"][0] == "inside the masks"
+    assert solved.figures["moving_features"] is True and solved.figures["registered"] == len(true)
+    assert monitor.decisions["features"][0] == "on what moves"
     found = {camera.name: camera for camera in solved.cameras}
     angles = []
     for first, second in zip(true, true[1:], strict=False):
