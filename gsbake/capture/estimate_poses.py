@@ -17,6 +17,7 @@ import numpy as np
 from gsbake.capture.hull.visual_hull import visual_hull
 from gsbake.capture.masks.completion import complete_masks
 from gsbake.capture.masks.consensus import MIN_CERTAIN_OVERLAP, MIN_OVERLAP, MIN_USED_AGREEMENT, correct_mask, distorted, find_consensus
+from gsbake.capture.masks.support_plane import plane_masks
 from gsbake.capture.photos.redundancy import find_redundant_photos
 from gsbake.capture.photos.undistortion import intrinsics_key, pinhole_camera, remap_tables, resample
 from gsbake.capture.posed_photos import PosedPhotos
@@ -31,6 +32,8 @@ from gsbake.imaging.png import write_png
 from gsbake.monitor import SILENT, Monitor, Rule, decide_skip
 from gsbake.text import shortlist
 
+#: Agreement of the network's guesses from which no others are tried.
+CERTAIN_AGREEMENT = 0.95
 #: Smallest number of tie points that is written: fewer do not describe the shape.
 MIN_POINTS = 30
 #: Surface points at which the coverage of photos is measured.
@@ -97,7 +100,7 @@ class _Estimation:
         CameraSet(tuple(solved.cameras), poses="given" if given else "solved").save(self.out / "photo_cameras.json")
         points, colours = read_cloud(solved.cloud) if solved.cloud.exists() else (None, None)
         with monitor.part("automatic masks"):
-            automatic = self._write_automatic_masks(entries, solved.cameras)
+            automatic = self._write_automatic_masks(entries, solved.cameras, points)
         with monitor.part("undistortion"):
             pinholes = self._undistort(solved.cameras)
         with monitor.part("normalisation"):
@@ -132,10 +135,11 @@ class _Estimation:
         self.monitor.decide("pose source", "given" if use else "structure from motion", evidence)
         return use
 
-    def _write_automatic_masks(self, entries: Sequence[dict[str, Any]], cameras: Sequence[Camera]) -> dict[str, Any]:
+    def _write_automatic_masks(self, entries: Sequence[dict[str, Any]], cameras: Sequence[Camera], points: Any) -> dict[str, Any]:
         """Write `photo_masks/`: guesses corrected by agreement between photos, as the photos show them; returns the figures.
 
-        Nothing is written where no mask was guessed, or the guesses do not agree with the cameras.
+        Guesses are those of the network, or of what stands on a plane among the tie `points` where these agree better. Nothing is written
+        where no mask was guessed, or the guesses do not agree with the cameras.
         """
         by_name = {e["name"]: e for e in entries}
         files = FeatureMasks(self.ingest, [by_name[c.name] for c in cameras], self.scratch).files
@@ -144,8 +148,17 @@ class _Estimation:
             return {}
         found = find_consensus(cameras, files)
         agreement = 0.0 if found is None else found.agreement
+        evidence = f"the guesses of the network agree with the cameras to {agreement:.2f}"
+        if agreement < CERTAIN_AGREEMENT and len(guessed) == len(cameras) and points is not None:
+            photos = {c.name: self.ingest / by_name[c.name]["file"] for c in cameras}
+            on_plane = plane_masks(cameras, photos, files, points, self.scratch / "plane_masks", self.seed, self.threads)
+            other = None if on_plane is None else find_consensus(cameras, on_plane)
+            if on_plane is not None and other is not None:
+                evidence += f", masks of what stands on the support plane to {other.agreement:.2f}"
+                if other.agreement > agreement:
+                    found, files, agreement = other, on_plane, other.agreement
         if found is None or agreement < MIN_USED_AGREEMENT:
-            evidence = f"the guesses of the network agree with the cameras to {agreement:.2f}, which is below {MIN_USED_AGREEMENT:g}"
+            evidence += f", which is below {MIN_USED_AGREEMENT:g}"
             self.monitor.decide("automatic masks", "not used", evidence)
             return {"automatic_masks": 0, "mask_agreement": agreement}
         (self.out / "photo_masks").mkdir()
@@ -163,8 +176,7 @@ class _Estimation:
         doubtful = sorted((name for name in overlaps if overlaps[name] < MIN_CERTAIN_OVERLAP), key=lambda name: overlaps[name])
         corrected = sum(overlap < MIN_OVERLAP for overlap in overlaps.values())
         counts = f"{corrected} of {len(guessed)} were corrected, {len(doubtful)} are doubtful"
-        evidence = f"the guesses of the network agree with the cameras to {agreement:.2f}; {counts}"
-        self.monitor.decide("automatic masks", "used", evidence)
+        self.monitor.decide("automatic masks", "used", f"{evidence}; {counts}")
         if doubtful:
             self.monitor.warn(
                 f"{len(doubtful)} of {len(guessed)} automatic masks are doubtful ({shortlist(doubtful)}); edit them (`gsbake masks`)."

@@ -66,7 +66,7 @@ def render_silhouette(hull: Hull, camera: Camera) -> NDArray[np.bool_]:
     column, row = np.floor(pixel[visible]).astype(np.int64).T
     image[row, column] = 1
     radius = max(1, round(0.6 * hull.cell * camera.fx / float(np.median(z[visible])))) if visible.any() else 1
-    return np.asarray(cv2.morphologyEx(image, cv2.MORPH_CLOSE, _disc(radius)) > 0)
+    return np.asarray(cv2.morphologyEx(image, cv2.MORPH_CLOSE, disc(radius)) > 0)
 
 
 def complete_masks(cameras: Sequence[Camera], masks: Sequence[Bytes], points: Array) -> list[MaskCompletion]:
@@ -87,7 +87,7 @@ def complete_masks(cameras: Sequence[Camera], masks: Sequence[Bytes], points: Ar
         mask = masks[index]
         missing = render_silhouette(hull, cameras[index]) & (mask <= 127)
         # The hull is slightly larger than the object all around: opening removes this boundary.
-        boundary = _disc(max(1, round(OUTSIDE_MARGIN * max(mask.shape))))
+        boundary = disc(max(1, round(OUTSIDE_MARGIN * max(mask.shape))))
         regions = cv2.morphologyEx(missing.astype(np.uint8), cv2.MORPH_OPEN, boundary)
         _, label = cv2.connectedComponents(regions)
         column, row = np.floor(pixels[index]).astype(np.int64).T
@@ -99,5 +99,6 @@ def complete_masks(cameras: Sequence[Camera], masks: Sequence[Bytes], points: Ar
     return completions
 
 
-def _disc(radius: int) -> Bytes:
+def disc(radius: int) -> Bytes:
+    """Structuring element of a disc of this radius in pixels."""
     return np.asarray(cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1)), np.uint8)

@@ -55,7 +55,7 @@ def nearest_point_to_axes(cameras: Sequence[Camera]) -> Array:
     return np.asarray(point)
 
 
-def _frame_radius(camera: Camera, point: Array) -> float:
+def frame_radius(camera: Camera, point: Array) -> float:
     """Radius of the sphere around `point` that fits the camera's shorter side; inf when the point is behind the camera."""
     depth = float((camera.R @ point + camera.t)[2])
     return depth * 0.5 * min(camera.width / camera.fx, camera.height / camera.fy) if depth > 0 else np.inf
@@ -65,7 +65,7 @@ def bounding_sphere_from_views(cameras: Sequence[Camera], points: Array | None) 
     """Bounding sphere from the optical axes and the tie points (n, 3) that most cameras show."""
     point = nearest_point_to_axes(cameras)
     distances = np.array([np.linalg.norm(c.centre - point) for c in cameras])
-    fits = np.array([_frame_radius(c, point) for c in cameras])
+    fits = np.array([frame_radius(c, point) for c in cameras])
     fits = fits[np.isfinite(fits)]
     if not fits.size:  # the axes diverge: fall back to the camera positions
         centres = np.stack([c.centre for c in cameras])
@@ -101,7 +101,7 @@ def bounding_sphere_from_masks(
     common field of view, then repeatedly in its own bounding sphere until that converges.
     """
     centre = nearest_point_to_axes(cameras)
-    fits = [_frame_radius(c, centre) for c in cameras]
+    fits = [frame_radius(c, centre) for c in cameras]
     finite = [f for f in fits if np.isfinite(f)]
     if not finite:
         return None
