@@ -30,8 +30,9 @@ from gsbake.imaging.png import write_png
 Floats = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
-#: RANSAC's hypotheses, tolerance of an inlier as a share of the cameras' distance, and share of the tie points that lie on a support plane.
-HYPOTHESES, PLANE_TOLERANCE, MIN_PLANE_SHARE = 500, 0.006, 0.15
+#: RANSAC's hypotheses, tolerance of an inlier as a share of the cameras' distance, and share of the tie points that lie on the plane. With
+#: fewer there, stereo sees the object (fox), which masks with a ragged border do not improve.
+HYPOTHESES, PLANE_TOLERANCE, MIN_PLANE_SHARE = 500, 0.006, 0.6
 #: Share of the tie points that may lie below it, and most points that are tried.
 MAX_BELOW_SHARE, MAX_POINTS = 0.05, 4000
 #: Photos that confirm a pixel: their number, and the angles in degrees between the directions from which they look.
@@ -45,6 +46,8 @@ MIN_COMPARED, MIN_CONFIRMED_SHARE = 3, 0.4
 MAX_FREE_SHARE, MIN_DECIDED_SHARE, MIN_VISIBLE_SHARE = 0.1, 0.25, 0.5
 #: Cells along an edge in the first and the second pass, and half edge of the first cube in radii of the frame.
 CELLS, FIRST_RADIUS = (40, 72), 1.3
+#: Share of a photo's border that the object covers at most, in the median: masks of everything agree with each other too.
+MAX_BORDER_SHARE = 0.4
 #: Longer side in pixels of the photos that are segmented, GrabCut's iterations, and guess that is taken as certain inside the hull.
 SEGMENT_SIZE, ITERATIONS, CERTAIN = 384, 4, 200
 #: Band around the silhouette that may be the object's too, as a share of the root of its area; holes of less than this share are filled.
@@ -160,7 +163,8 @@ def confirmed_pixels(cameras: Sequence[Camera], images: Sequence[Floats], plane:
 
 
 def hull_silhouettes(cameras: Sequence[Camera], pixels: Sequence[tuple[Mask, Mask]], plane: Plane) -> list[Mask] | None:
-    """Silhouettes (h, w) of the largest part of space above the plane behind which photos do not see it; None where nothing is left."""
+    """Silhouettes (h, w) of the largest part of space above the plane behind which photos do not see it; None where nothing is left, or
+    nothing stands alone there."""
     low = nearest_point_to_axes(cameras)
     half = FIRST_RADIUS * float(np.median([min(frame_radius(c, low), np.linalg.norm(c.centre - low)) for c in cameras]))
     low, edge = low - half, np.full(3, 2 * half)
@@ -178,7 +182,9 @@ def hull_silhouettes(cameras: Sequence[Camera], pixels: Sequence[tuple[Mask, Mas
         cells = grid[solid]
         low, high = cells.min(0) - 2 * cell, cells.max(0) + 2 * cell
         edge = high - low
-    return [_silhouette(cells, cell, camera) for camera in cameras]
+    silhouettes = [_silhouette(cells, cell, camera) for camera in cameras]
+    border = [np.concatenate([s[0], s[-1], s[:, 0], s[:, -1]]).mean() for s in silhouettes]
+    return silhouettes if np.median(border) <= MAX_BORDER_SHARE else None
 
 
 def segment(photo: NDArray[np.uint8], silhouette: Mask, certain: Mask) -> Mask:

@@ -132,3 +132,13 @@ def test_small_holes_are_filled_and_large_ones_stay() -> None:
     found = segment(photo, silhouette, np.zeros_like(silhouette))
     assert found[50:52, 60:62].all() and not found[50:65, 85:100].any()
     assert found[32:44, 42:118].all() and not found[:24].any()
+
+
+def test_what_fills_the_photos_is_not_an_object(capture: Any) -> None:
+    """Pixels that the plane explains nowhere, as of a room that turns against it, would be a mask of everything."""
+    cameras, plane = capture[0], find_plane(ground_points(), capture[0], 0)
+    assert plane is not None
+    everything = np.ones((SIZE, SIZE), bool), np.zeros((SIZE, SIZE), bool)
+    assert hull_silhouettes(cameras, [everything] * COUNT, plane) is None
+    nothing = np.ones((SIZE, SIZE), bool), np.ones((SIZE, SIZE), bool)
+    assert hull_silhouettes(cameras, [nothing] * COUNT, plane) is None
