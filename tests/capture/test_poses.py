@@ -209,8 +209,8 @@ def test_a_stop_kills_the_process(tmp_path: Path) -> None:
     (tmp_path / "work").mkdir()
     job = {
         "task": "solve", "photos": str(tmp_path / "images"), "masks": None, "work": str(tmp_path / "work"), "lenses": [lens], "cache": None,
-        "max_features": 8192, "peak_threshold": 0.001, "max_size": 1600, "one_camera": [], "fine": True, "threads": 1, "seed": 0, "matching": "exhaustive",
-        "mapper": "incremental",
+        "max_features": 8192, "peak_threshold": 0.001, "max_size": 1600, "fine": True, "threads": 1, "seed": 0, "matching": "exhaustive",
+        "mapper": "incremental", "one_camera": [],
     }  # fmt: skip
     parts: list[str] = []
     asked: list[float] = []
