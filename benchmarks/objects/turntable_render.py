@@ -19,7 +19,7 @@ import bpy
 import numpy as np
 from mathutils import Matrix, Vector
 
-#: Half the side of the room, in sizes of the object; boxes, balls and pictures that stand in it.
+#: Half the side of the room, in sizes of the object; boxes, balls and cylinders in it.
 ROOM, CLUTTER = 3.2, 90
 
 

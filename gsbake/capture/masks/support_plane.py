@@ -25,9 +25,9 @@ from gsbake.capture.masks.consensus import MIN_TRUSTED_OVERLAP, distorted, inter
 from gsbake.capture.poses.normalisation import frame_radius, nearest_point_to_axes
 from gsbake.errors import BadInputError
 from gsbake.geometry.cameras import Array, Camera
+from gsbake.imaging.correlation import Floats, Windows, window_mean
 from gsbake.imaging.png import write_png
 
-Floats = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
 #: RANSAC's hypotheses, tolerance of an inlier as a share of the cameras' distance, and share of the tie points that lie on the plane. With
@@ -135,28 +135,25 @@ def plane_masks(
 
 def confirmed_pixels(cameras: Sequence[Camera], images: Sequence[Floats], plane: Plane) -> list[tuple[Mask, Mask]]:
     """For each photo the pixels (h, w) that others could confirm as the plane, and those that they do; `images` are grey levels."""
-    seen = [_on_plane(camera, plane) for camera in cameras]
-    target = np.mean([points[hit].mean(0) for points, hit in seen if hit.any()] or [np.zeros(3)], axis=0)
-    directions = np.stack([target - camera.centre for camera in cameras])
+    focus = nearest_point_to_axes(cameras)
+    directions = np.stack([focus - camera.centre for camera in cameras])
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     angles = np.degrees(np.arccos(np.clip(directions @ directions.T, -1, 1)))
     found = []
     for i, image in enumerate(images):
-        points, hit = seen[i]
+        points, hit = _on_plane(cameras[i], plane)
         partners = [j for j in np.argsort(angles[i], kind="stable") if MIN_ANGLE < angles[i, j] < MAX_ANGLE][:PARTNERS]
-        mean, deviation = _statistics(image)
+        photo = Windows.of(image, WINDOW)
         compared, confirmed = np.zeros(image.shape, np.float32), np.zeros(image.shape, np.float32)
         for j in partners:
             pixel, depth = cameras[j].project(points.reshape(-1, 3))
             inside = hit & cameras[j].in_view(pixel, depth).reshape(image.shape)
             columns, rows = (np.ascontiguousarray(pixel[:, k].reshape(image.shape) - 0.5, np.float32) for k in (0, 1))
-            other = np.asarray(cv2.remap(images[j], columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.float32)
-            other_mean, other_deviation = _statistics(other)
-            whole = _mean(inside.astype(np.float32)) > 0.999
-            contrast = np.maximum(deviation, other_deviation) >= MIN_CONTRAST
-            same = _mean(image * other) - mean * other_mean > SAME_WINDOW * deviation * other_deviation
-            compared += whole & contrast
-            confirmed += whole & contrast & same
+            warped = np.asarray(cv2.remap(images[j], columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.float32)
+            other = Windows.of(warped, WINDOW)
+            comparable = (window_mean(inside.astype(np.float32), WINDOW) > 0.999) & (photo.contrast(other) >= MIN_CONTRAST)
+            compared += comparable
+            confirmed += comparable & photo.correlate(other, SAME_WINDOW)
         decided = compared >= MIN_COMPARED
         found.append((decided, decided & (confirmed >= MIN_CONFIRMED_SHARE * compared)))
     return found
@@ -242,13 +239,3 @@ def _silhouette(cells: Array, cell: float, camera: Camera) -> Mask:
     image[row, column] = 1
     radius = max(1, round(0.7 * cell * camera.fx / float(np.median(depth[visible])))) if visible.any() else 1
     return np.asarray(cv2.morphologyEx(image, cv2.MORPH_CLOSE, disc(radius)) > 0)
-
-
-def _mean(values: Floats) -> Floats:
-    return np.asarray(cv2.blur(values, (WINDOW, WINDOW)), np.float32)
-
-
-def _statistics(grey: Floats) -> tuple[Floats, Floats]:
-    """Mean and standard deviation (h, w) in the window around each pixel."""
-    mean = _mean(grey)
-    return mean, np.sqrt(np.maximum(_mean(grey * grey) - mean * mean, 0))

@@ -156,9 +156,10 @@ class PoseSolver:
         masks, setting = FeatureMasks(self.ingest, self.entries, self.scratch / "feature_masks"), self.options.masked_features
         if setting is False:
             return self._attempt(matching)
-        compared = find_standing_background({e["name"]: self.ingest / e["file"] for e in self.entries})
-        background = compared if compared.stands else None
-        moving = None if background is None else background.write_moving_parts(self.scratch / "moving_parts")
+        with self.monitor.part("background"):
+            compared = find_standing_background({e["name"]: self.ingest / e["file"] for e in self.entries})
+            background = compared if compared.stands else None
+            moving = None if background is None else background.write_moving_parts(self.scratch / "moving_parts")
 
         def attempt(masked: bool) -> _Attempt:
             if masked:

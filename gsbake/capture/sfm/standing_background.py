@@ -17,9 +17,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from gsbake.imaging.correlation import Floats, Windows
 from gsbake.imaging.png import write_png
-
-Floats = NDArray[np.float32]
 
 #: Longer side in pixels of the photos that are compared, and side of a block. Blocks of less contrast (grey levels) say nothing.
 SIZE, BLOCK, MIN_CONTRAST = 192, 16, 5.0
@@ -37,20 +36,6 @@ MASK_SIZE, WINDOW = 480, 9
 COMPARED, MIN_SAME_PHOTOS = 12, 0.5
 #: Correlation from which a pixel's window is the same. Plain windows, of less contrast, are the same up to this difference (grey levels).
 SAME_WINDOW, PLAIN_CONTRAST, PLAIN_DIFFERENCE = 0.85, 4.0, 6.0
-
-
-@dataclass(frozen=True)
-class _Windows:
-    """Grey levels (h, w) of a photo, and their mean and standard deviation in the window around each pixel."""
-
-    grey: Floats
-    mean: Floats
-    deviation: Floats
-
-    @staticmethod
-    def of(grey: Floats) -> _Windows:
-        mean = _mean(grey)
-        return _Windows(grey, mean, np.sqrt(np.maximum(_mean(grey * grey) - mean * mean, 0)))
 
 
 @dataclass(frozen=True)
@@ -86,10 +71,10 @@ class StandingBackground:
         255 moves or may move: all of a photo with too few partners.
         """
         folder.mkdir(parents=True, exist_ok=True)
-        small = {name: _Windows.of(_grey(path, MASK_SIZE)) for name, path in self.files.items()}
+        small = {name: _grey(path, MASK_SIZE) for name, path in self.files.items()}
         for name, path in self.files.items():
             others = [small[partner] for partner in _spread(self.partners[name])]
-            moves = _moving(small[name], others) if len(self.partners[name]) >= MIN_PARTNERS else np.ones(small[name].grey.shape, bool)
+            moves = _moving(small[name], others) if len(self.partners[name]) >= MIN_PARTNERS else np.ones(small[name].shape, bool)
             height, width = _read(path).shape
             mask = cv2.resize(255 * moves.astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST)
             write_png(folder / f"{name}.png.png", np.asarray(mask, np.uint8))
@@ -156,19 +141,12 @@ def _spread(partners: Sequence[str]) -> list[str]:
     return [partners[k] for k in chosen]
 
 
-def _moving(photo: _Windows, others: Sequence[_Windows]) -> NDArray[np.bool_]:
+def _moving(grey: Floats, others: Sequence[Floats]) -> NDArray[np.bool_]:
     """Pixels (h, w) of a photo that differ from most of the `others` of its round."""
-    same = np.zeros(photo.grey.shape, np.float32)
-    for other in others:
-        covariance = _mean(photo.grey * other.grey) - photo.mean * other.mean
-        correlated = covariance > SAME_WINDOW * photo.deviation * other.deviation
-        plain = np.maximum(photo.deviation, other.deviation) < PLAIN_CONTRAST
-        same += np.where(plain, np.abs(photo.mean - other.mean) < PLAIN_DIFFERENCE, correlated)
+    photo, same = Windows.of(grey, WINDOW), np.zeros(grey.shape, np.float32)
+    for other in (Windows.of(image, WINDOW) for image in others):
+        plain = photo.contrast(other) < PLAIN_CONTRAST
+        same += np.where(plain, np.abs(photo.mean - other.mean) < PLAIN_DIFFERENCE, photo.correlate(other, SAME_WINDOW))
     moves = (same < MIN_SAME_PHOTOS * len(others)).astype(np.uint8)
     moves = np.asarray(cv2.morphologyEx(moves, cv2.MORPH_OPEN, np.ones((WINDOW, WINDOW), np.uint8)), np.uint8)
     return np.asarray(moves > 0)
-
-
-def _mean(values: Floats) -> Floats:
-    """Mean in the window around each pixel."""
-    return np.asarray(cv2.blur(values, (WINDOW, WINDOW)), np.float32)
