@@ -51,7 +51,6 @@ def patterned(name: str, rng: np.random.Generator, kind: str = "") -> bpy.types.
     texture.inputs["Scale"].default_value = float(rng.uniform(3, 14))
     if kind == "Noise":
         texture.inputs["Detail"].default_value = 8.0
-    socket = "Color"
     if kind in ("Noise", "Wave", "Voronoi"):
         ramp = nodes.new("ShaderNodeValToRGB")
         for element in ramp.color_ramp.elements:
@@ -59,12 +58,12 @@ def patterned(name: str, rng: np.random.Generator, kind: str = "") -> bpy.types.
         links.new(texture.outputs["Color"], ramp.inputs["Fac"])
         texture = ramp
     elif kind != "Cells":
-        for name in ("Color1", "Color2"):
-            texture.inputs[name].default_value = (*rng.uniform(0.03, 0.8, 3), 1.0)
+        for colour in ("Color1", "Color2"):
+            texture.inputs[colour].default_value = (*rng.uniform(0.03, 0.8, 3), 1.0)
     coordinates = nodes.new("ShaderNodeTexCoord")
     source = texture.inputs.get("Vector") or next(node for node in nodes if node.type.startswith("TEX_")).inputs["Vector"]
     links.new(coordinates.outputs["Object"], source)
-    links.new(texture.outputs[socket], surface.inputs["Base Color"])
+    links.new(texture.outputs["Color"], surface.inputs["Base Color"])
     surface.inputs["Roughness"].default_value = float(rng.uniform(0.4, 0.9))
     return material
 

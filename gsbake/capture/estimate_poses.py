@@ -28,7 +28,7 @@ from gsbake.config.schema import Poses
 from gsbake.errors import BadInputError
 from gsbake.geometry.cameras import Camera, CameraSet
 from gsbake.geometry.ply import read_cloud, write_cloud
-from gsbake.imaging.png import write_png
+from gsbake.imaging.png import read_grey, write_png
 from gsbake.monitor import SILENT, Monitor, Rule, decide_skip
 from gsbake.text import shortlist
 
@@ -167,10 +167,7 @@ class _Estimation:
             if camera.name not in guessed:
                 continue
             overlaps[camera.name] = overlap
-            guess: Any = cv2.imread(str(files[camera.name]), cv2.IMREAD_GRAYSCALE)
-            if guess is None:
-                raise FileNotFoundError(files[camera.name])
-            full = cv2.resize(guess, (camera.width, camera.height), interpolation=cv2.INTER_CUBIC)
+            full = cv2.resize(read_grey(files[camera.name]), (camera.width, camera.height), interpolation=cv2.INTER_CUBIC)
             mask = correct_mask(np.asarray(full, np.uint8), distorted(silhouette, camera), overlap)
             write_png(self.out / "photo_masks" / f"{camera.name}.png", np.where(mask > 127, 255, 0).astype(np.uint8))
         doubtful = sorted((name for name in overlaps if overlaps[name] < MIN_CERTAIN_OVERLAP), key=lambda name: overlaps[name])

@@ -1,4 +1,6 @@
-"""8-bit PNG encoding through Pillow. The bytes depend on the pixels only; no gAMA, iCCP or other ancillary chunks.
+"""8-bit PNG: grey levels of files, and encoding through Pillow.
+
+Encoded bytes depend on the pixels only; there are no gAMA, iCCP or other ancillary chunks.
 
 A photographic texture of 1024² texels takes 1.7 s at deflate level 9, 1 s at level 8 (1 % more bytes) and 0.2 s at level 6 (4 % more).
 """
@@ -7,6 +9,7 @@ from __future__ import annotations
 
 import io
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +25,16 @@ def encode_png(pixels: NDArray[np.uint8], level: int = 8) -> bytes:
     content = io.BytesIO()
     Image.fromarray(image[..., 0] if image.ndim == 3 and image.shape[2] == 1 else image).save(content, "PNG", compress_level=level)
     return content.getvalue()
+
+
+def read_grey(path: Path) -> NDArray[np.uint8]:
+    """Grey levels (h, w) of an image file. Raises FileNotFoundError when it is missing or cannot be decoded."""
+    import cv2
+
+    grey: Any = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+    if grey is None:
+        raise FileNotFoundError(path)
+    return np.asarray(grey, np.uint8)
 
 
 def write_png(path: Path, pixels: NDArray[np.uint8], level: int = FAST_COMPRESSION) -> None:

@@ -60,12 +60,20 @@ def excluded_points(cameras: Sequence[Camera], masks: Sequence[Bytes], points: A
 
 def render_silhouette(hull: Hull, camera: Camera) -> NDArray[np.bool_]:
     """Pixels (h, w) of the camera that the hull covers, accurate to about a cell."""
-    pixel, z = camera.project(hull.centres())
+    return render_cells(hull.centres(), hull.cell, camera)
+
+
+def render_cells(centres: Array, cell: float, camera: Camera, closing: float = 0.6) -> NDArray[np.bool_]:
+    """Pixels (h, w) of the camera that cells of edge `cell` around `centres` (n, 3) cover, accurate to about a cell.
+
+    Gaps between them are closed by a disc whose radius is `closing` cells.
+    """
+    pixel, z = camera.project(centres)
     visible = camera.in_view(pixel, z)
     image = np.zeros((camera.height, camera.width), np.uint8)
     column, row = np.floor(pixel[visible]).astype(np.int64).T
     image[row, column] = 1
-    radius = max(1, round(0.6 * hull.cell * camera.fx / float(np.median(z[visible])))) if visible.any() else 1
+    radius = max(1, round(closing * cell * camera.fx / float(np.median(z[visible])))) if visible.any() else 1
     return np.asarray(cv2.morphologyEx(image, cv2.MORPH_CLOSE, disc(radius)) > 0)
 
 

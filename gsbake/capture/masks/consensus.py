@@ -27,6 +27,7 @@ from gsbake.capture.photos.undistortion import pinhole_camera, remap_tables, res
 from gsbake.capture.poses.normalisation import bounding_sphere_from_masks
 from gsbake.errors import BadInputError
 from gsbake.geometry.cameras import Camera
+from gsbake.imaging.png import read_grey
 
 #: Shares of a point's views that may call it background, tried in turn: a stricter vote is finer, a more lenient one finds the object where
 #: many photos err as a whole. Photos that err do not vote in the next pass, which is no more lenient than MAX_OUTVOTED_SHARE.
@@ -142,11 +143,8 @@ def small_views(cameras: Sequence[Camera], masks: Mapping[str, Path]) -> tuple[l
 
 def _small_view(camera: Camera, file: Path) -> tuple[Camera, Bytes]:
     """The pinhole camera reduced to VOTE_SIZE and its undistorted mask (h, w). Raises BadInputError as `pinhole_camera` does."""
-    mask: Any = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
-    if mask is None:
-        raise FileNotFoundError(file)
     small = camera.downscaled_to(VOTE_SIZE)
-    mask = cv2.resize(mask, (small.width, small.height), interpolation=cv2.INTER_AREA)
+    mask: Any = cv2.resize(read_grey(file), (small.width, small.height), interpolation=cv2.INTER_AREA)
     pinhole = pinhole_camera(small)
     if any(camera.distortion):
         mask = resample(np.asarray(mask, np.uint8), remap_tables(small, pinhole), mask=True)

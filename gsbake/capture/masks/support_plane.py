@@ -20,13 +20,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from gsbake.capture.masks.completion import disc
+from gsbake.capture.masks.completion import disc, render_cells
 from gsbake.capture.masks.consensus import MIN_TRUSTED_OVERLAP, distorted, intersection_over_union, small_views
 from gsbake.capture.poses.normalisation import frame_radius, nearest_point_to_axes
 from gsbake.errors import BadInputError
 from gsbake.geometry.cameras import Array, Camera
 from gsbake.imaging.correlation import Floats, Windows, window_mean
-from gsbake.imaging.png import write_png
+from gsbake.imaging.png import read_grey, write_png
 
 Mask = NDArray[np.bool_]
 
@@ -46,6 +46,8 @@ MIN_COMPARED, MIN_CONFIRMED_SHARE = 3, 0.4
 MAX_FREE_SHARE, MIN_DECIDED_SHARE, MIN_VISIBLE_SHARE = 0.1, 0.25, 0.5
 #: Cells along an edge in the first and the second pass, and half edge of the first cube in radii of the frame.
 CELLS, FIRST_RADIUS = (40, 72), 1.3
+#: Radius in cells that closes gaps in silhouettes.
+CLOSING = 0.7
 #: Share of a photo's border that the object covers at most, in the median: masks of everything agree with each other too.
 MAX_BORDER_SHARE = 0.4
 #: Longer side in pixels of the photos that are segmented, GrabCut's iterations, and guess that is taken as certain inside the hull.
@@ -115,12 +117,11 @@ def plane_masks(
     def write(item: tuple[Camera, Mask]) -> tuple[str, Path]:
         camera, silhouette = item
         photo: Any = cv2.imread(str(photos[camera.name]), cv2.IMREAD_COLOR)
-        guess: Any = cv2.imread(str(guesses[camera.name]), cv2.IMREAD_GRAYSCALE)
-        if photo is None or guess is None:
+        if photo is None:
             raise FileNotFoundError(photos[camera.name])
         small = camera.downscaled_to(SEGMENT_SIZE)
         size = small.width, small.height
-        photo, guess = (cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in (photo, guess))
+        photo, guess = (cv2.resize(i, size, interpolation=cv2.INTER_AREA) for i in (photo, read_grey(guesses[camera.name])))
         shape = cv2.resize(distorted(silhouette, camera).astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
         found = segment(photo, shape > 0, guess > CERTAIN)
         if intersection_over_union(found, guess > 127) >= MIN_TRUSTED_OVERLAP:
@@ -179,7 +180,7 @@ def hull_silhouettes(cameras: Sequence[Camera], pixels: Sequence[tuple[Mask, Mas
         cells = grid[solid]
         low, high = cells.min(0) - 2 * cell, cells.max(0) + 2 * cell
         edge = high - low
-    silhouettes = [_silhouette(cells, cell, camera) for camera in cameras]
+    silhouettes = [render_cells(cells, cell, camera, CLOSING) for camera in cameras]
     border = [np.concatenate([s[0], s[-1], s[:, 0], s[:, -1]]).mean() for s in silhouettes]
     return silhouettes if np.median(border) <= MAX_BORDER_SHARE else None
 
@@ -204,8 +205,7 @@ def segment(photo: NDArray[np.uint8], silhouette: Mask, certain: Mask) -> Mask:
 
 def _on_plane(camera: Camera, plane: Plane) -> tuple[Array, Mask]:
     """Points (h, w, 3) of the plane that pixels show, and where they do."""
-    u, v = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
-    rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], -1) @ camera.R
+    rays = camera.rays()
     towards = rays @ plane.normal
     depth = (plane.offset - plane.normal @ camera.centre) / np.where(np.abs(towards) < 1e-9, 1e-9, towards)
     hit = (towards < -1e-3) & (depth > 0)
@@ -228,14 +228,3 @@ def _is_object(
     solid = np.zeros(len(points), bool)
     solid[above] = (shown >= MIN_VISIBLE_SHARE * len(cameras)) & (free <= MAX_FREE_SHARE * decided) & (decided >= MIN_DECIDED_SHARE * shown)
     return solid
-
-
-def _silhouette(cells: Array, cell: float, camera: Camera) -> Mask:
-    """Pixels (h, w) that the cells (n, 3) cover."""
-    pixel, depth = camera.project(cells)
-    visible = camera.in_view(pixel, depth)
-    image = np.zeros((camera.height, camera.width), np.uint8)
-    column, row = np.floor(pixel[visible]).astype(np.int64).T
-    image[row, column] = 1
-    radius = max(1, round(0.7 * cell * camera.fx / float(np.median(depth[visible])))) if visible.any() else 1
-    return np.asarray(cv2.morphologyEx(image, cv2.MORPH_CLOSE, disc(radius)) > 0)

@@ -16,7 +16,7 @@ import numpy as np
 
 from gsbake.capture.sfm.mask_agreement import MIN_AGREEMENT, MIN_GUESS_AGREEMENT, guess_agreement, mask_agreement
 from gsbake.geometry.cameras import Camera
-from gsbake.imaging.png import write_png
+from gsbake.imaging.png import read_grey, write_png
 
 #: Dilation of guessed masks before features are limited to them, as a share of the photo's longer side.
 GUESS_MARGIN = 0.02
@@ -61,21 +61,13 @@ class FeatureMasks:
         self.folder.mkdir(parents=True, exist_ok=True)
         files = self.files
         for entry in (e for e in self.entries if e["name"] in files):
-            mask: Any = _read(files[entry["name"]])
+            mask: Any = read_grey(files[entry["name"]])
             if not entry["mask"]:
                 radius = max(1, round(GUESS_MARGIN * max(mask.shape)))
                 disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
                 mask = cv2.dilate(255 * (mask > 127).astype(np.uint8), np.asarray(disc, np.uint8))
                 mask = cv2.resize(mask, (entry["width"], entry["height"]), interpolation=cv2.INTER_NEAREST)
             if moving is not None:
-                mask = np.minimum(mask, _read(moving / f"{entry['name']}.png.png"))
+                mask = np.minimum(mask, read_grey(moving / f"{entry['name']}.png.png"))
             write_png(self.folder / f"{entry['name']}.png.png", np.asarray(mask, np.uint8))
         return self.folder
-
-
-def _read(path: Path) -> Any:
-    """A mask (h, w); raises FileNotFoundError."""
-    mask: Any = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
-    if mask is None:
-        raise FileNotFoundError(path)
-    return mask

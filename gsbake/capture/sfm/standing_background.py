@@ -11,14 +11,13 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from gsbake.imaging.correlation import Floats, Windows
-from gsbake.imaging.png import write_png
+from gsbake.imaging.png import read_grey, write_png
 
 #: Longer side in pixels of the photos that are compared, and side of a block. Blocks of less contrast (grey levels) say nothing.
 SIZE, BLOCK, MIN_CONTRAST = 192, 16, 5.0
@@ -71,12 +70,14 @@ class StandingBackground:
         255 moves or may move: all of a photo with too few partners.
         """
         folder.mkdir(parents=True, exist_ok=True)
-        small = {name: _grey(path, MASK_SIZE) for name, path in self.files.items()}
+        small, sizes = {}, {}
         for name, path in self.files.items():
+            photo = read_grey(path)
+            small[name], sizes[name] = _shrunk(photo, MASK_SIZE), photo.shape[::-1]
+        for name in self.files:
             others = [small[partner] for partner in _spread(self.partners[name])]
             moves = _moving(small[name], others) if len(self.partners[name]) >= MIN_PARTNERS else np.ones(small[name].shape, bool)
-            height, width = _read(path).shape
-            mask = cv2.resize(255 * moves.astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST)
+            mask = cv2.resize(255 * moves.astype(np.uint8), sizes[name], interpolation=cv2.INTER_NEAREST)
             write_png(folder / f"{name}.png.png", np.asarray(mask, np.uint8))
         return folder
 
@@ -85,7 +86,7 @@ def find_standing_background(files: Mapping[str, Path]) -> StandingBackground:
     """Compare all photos, files by name; those of other sizes are of other rounds."""
     names = list(files)
     shapes: dict[tuple[int, int], list[int]] = {}
-    blocks = [_blocks(_grey(path, SIZE)) for path in files.values()]
+    blocks = [_blocks(_shrunk(read_grey(path), SIZE)) for path in files.values()]
     for index, block in enumerate(blocks):
         shapes.setdefault(block.shape, []).append(index)
     partners: dict[str, list[str]] = {name: [] for name in names}
@@ -98,17 +99,8 @@ def find_standing_background(files: Mapping[str, Path]) -> StandingBackground:
     return StandingBackground(files, partners)
 
 
-def _read(path: Path) -> NDArray[np.uint8]:
-    """A photo's grey levels (h, w); raises FileNotFoundError."""
-    grey: Any = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
-    if grey is None:
-        raise FileNotFoundError(path)
-    return np.asarray(grey, np.uint8)
-
-
-def _grey(path: Path, size: int) -> Floats:
-    """A photo's grey levels with the longer side `size`."""
-    grey = _read(path)
+def _shrunk(grey: NDArray[np.uint8], size: int) -> Floats:
+    """A photo's grey levels (h, w), resampled so that the longer side has `size` pixels."""
     scale = size / max(grey.shape)
     shape = max(1, round(grey.shape[1] * scale)), max(1, round(grey.shape[0] * scale))
     return np.asarray(cv2.resize(grey, shape, interpolation=cv2.INTER_AREA), np.float32)
