@@ -7,9 +7,10 @@ Vogiatzis & Cipolla, *Probabilistic visibility for multi-view stereo*, CVPR 2007
 the outside is carved, but only where the exposed surface has votes of its own: mirror images lie behind a specular surface too, but mostly
 at a different location in every photo.
 
-Mirror images that do agree (a smooth black handle reflects the same light to many photos) are detected by silhouettes: every ray through
-the hull must still meet the object after carving (Laurentini, *The visual hull concept*, PAMI 1994: the hull is the largest such
-shape). Carving a concavity keeps this property; carving a convex part leaves empty rays in photos from the side.
+Mirror images that do agree (a smooth black handle reflects the same light to many photos) are detected by silhouettes, in two ways. A
+region must open through a soft part of the hull's surface, where silhouettes leave room for air (`gsbake.capture.hull.softness`). And every
+ray through the hull must still meet the object after carving (Laurentini, *The visual hull concept*, PAMI 1994: the hull is the largest
+such shape). Carving a concavity keeps this property; carving a convex part leaves empty rays in photos from the side.
 """
 
 from __future__ import annotations
@@ -23,8 +24,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from gsbake.capture.hull.rays import camera_arrays, half_steps_inside, project_point
+from gsbake.capture.hull.softness import SOFT
 from gsbake.capture.hull.visual_hull import Hull
 from gsbake.geometry.cameras import Camera
+from gsbake.mvs.mirror_images import behind_hard_parts
 from gsbake.mvs.ncc import FASTMATH
 
 Floats = NDArray[np.float32]
@@ -36,12 +40,15 @@ VOTE_SIGMA = 1.0
 #: Free space has this share of the votes. The prior adds votes for surface: at least the second, or the third as a share of the median
 #: number of votes per free cell, whichever is more.
 MIN_FREE_SHARE, PRIOR_VOTES, PRIOR_VOTE_SHARE = 0.65, 0.3, 0.2
-#: Greatest carving depth below the hull's surface in cells.
-MAX_CARVING_DEPTH = 6.0
-#: The same share for cells that join a carved region (hysteresis: Canny, *A computational approach to edge detection*, PAMI 1986).
-GROWTH_PRIOR_VOTE_SHARE = 0.1
-#: Carved regions have at least this many cells (fewer are noise), and at least this mean share of surface votes on the exposed surface.
-MIN_REGION_CELLS, MIN_SURFACE_SHARE = 8, 0.12
+#: The same for cells that join a carved region (hysteresis: Canny, *A computational approach to edge detection*, PAMI 1986), from votes
+#: without mirror images; hard cells at most this far below the hull's surface do not join.
+MIN_JOINING_FREE_SHARE, JOINING_PRIOR_VOTES, JOINING_PRIOR_VOTE_SHARE, HARD_DEPTH = 0.75, 0.03, 0.03, 1.5
+#: Carved regions have at least this many cells (fewer are noise), at least this mean share of surface votes on the exposed surface, and are
+#: soft in at least this share of their cells on the hull's surface.
+MIN_REGION_CELLS, MIN_SURFACE_SHARE, MIN_SOFT_SHARE = 8, 0.05, 0.15
+#: The last for what is left of a region that violates silhouettes without its hard cells, and the least number of its cells on the hull's
+#: surface as a multiple of its size to the power of 2/3: a bowl has 1.9, what spread below the surface from a leak .7 and less.
+MIN_REMAINING_SOFT_SHARE, MIN_OPENING = 0.6, 1.0
 #: A cell violates silhouettes when carving leaves this many photos with an empty ray through it (single masks may be wrong). Regions
 #: with more than this share of such cells are rejected: true concavities have up to .03 of them, false ones .1 to .67.
 MIN_EMPTY_RAYS, MAX_EMPTY_SHARE = 2, 0.1
@@ -49,27 +56,14 @@ MIN_EMPTY_RAYS, MAX_EMPTY_SHARE = 2, 0.1
 
 @dataclass(frozen=True)
 class CarvedHull:
-    """The carved `hull`, the `share` of cells carved, and the numbers of regions carved, rejected for lack of surface votes, and rejected
-    because they violate silhouettes."""
+    """The carved `hull`, the `share` of cells carved, and the numbers of regions carved, rejected for lack of surface votes or because they
+    open through a hard part, and rejected because they violate silhouettes."""
 
     hull: Hull
     share: float
     carved_regions: int
     unsupported_regions: int
     silhouette_violations: int
-
-
-@nb.njit(fastmath=FASTMATH, error_model="numpy", nogil=True, cache=True)
-def _project(x: float, y: float, z: float, p: Any, intrinsics: Any, size: Any) -> tuple[int, int, float]:
-    """Column, row and z-depth of a point in a photo (see `_camera_arrays`); depth 0 behind the camera or outside the frame."""
-    here = p[2, 0] * x + p[2, 1] * y + p[2, 2] * z + p[2, 3]
-    if not here > 1e-6:
-        return 0, 0, 0.0
-    across = intrinsics[0] * (p[0, 0] * x + p[0, 1] * y + p[0, 2] * z + p[0, 3]) / here + intrinsics[2]
-    down = intrinsics[1] * (p[1, 0] * x + p[1, 1] * y + p[1, 2] * z + p[1, 3]) / here + intrinsics[3]
-    if not (across >= 0 and down >= 0 and across < size[0] and down < size[1]):
-        return 0, 0, 0.0
-    return int(across), int(down), here
 
 
 @nb.njit(fastmath=FASTMATH, error_model="numpy", nogil=True, cache=True)
@@ -88,7 +82,7 @@ def _count_votes(
                     continue
                 z = lower[2] + (k + 0.5) * cell
                 for v in range(starts.shape[0]):
-                    column, row, here = _project(x, y, z, poses[v], intrinsics[v], sizes[v])
+                    column, row, here = project_point(x, y, z, poses[v], intrinsics[v], sizes[v])
                     if not here > 0:
                         continue
                     there = depth[np.uint64(starts[v] + row * sizes[v, 0] + column)]
@@ -104,42 +98,22 @@ def _count_votes(
 def _count_empty_rays(
     cells: Any, left: Any, lower: Any, cell: float, sizes: Any, intrinsics: Any, poses: Any, centres: Any, out: Any
 ) -> None:
-    """Kernel of `count_empty_rays`; rays are marched from the cell in both directions in steps of half a cell."""
-    n0, n1, n2 = left.shape
+    """Kernel of `count_empty_rays`."""
     for m in range(cells.shape[0]):
         i, j, k = cells[m, 0] + 0.5, cells[m, 1] + 0.5, cells[m, 2] + 0.5
         x, y, z = lower[0] + i * cell, lower[1] + j * cell, lower[2] + k * cell
         for v in range(poses.shape[0]):
-            if not _project(x, y, z, poses[v], intrinsics[v], sizes[v])[2] > 0:
+            if not project_point(x, y, z, poses[v], intrinsics[v], sizes[v])[2] > 0:
                 continue
-            dx, dy, dz = x - centres[v, 0], y - centres[v, 1], z - centres[v, 2]
-            step = 0.5 / np.sqrt(dx * dx + dy * dy + dz * dz)
-            dx, dy, dz = dx * step, dy * step, dz * step
-            met = False
-            for _ in range(2):
-                a, b, c = i + dx, j + dy, k + dz
-                while not met and a >= 0 and b >= 0 and c >= 0 and a < n0 and b < n1 and c < n2:
-                    met = left[np.int64(a), np.int64(b), np.int64(c)]
-                    a, b, c = a + dx, b + dy, c + dz
-                dx, dy, dz = -dx, -dy, -dz
-            if not met:
-                out[m] += 1
+            out[m] += half_steps_inside(left, i, j, k, x - centres[v, 0], y - centres[v, 1], z - centres[v, 2], 1) == 0
 
 
 def count_empty_rays(cells: NDArray[np.int64], left: NDArray[np.bool_], hull: Hull, cameras: Sequence[Camera]) -> NDArray[np.int64]:
     """Number of photos (m,) whose ray through a cell of the hull, `cells` (m, 3), meets none of the cells `left` (n, n, n)."""
     out = np.zeros(len(cells), np.int64)
     if len(cells) and cameras:
-        centres = np.array([c.centre for c in cameras], float)
-        _count_empty_rays(cells, left, np.asarray(hull.lower, float), float(hull.cell), *_camera_arrays(cameras), centres, out)
+        _count_empty_rays(cells, left, np.asarray(hull.lower, float), float(hull.cell), *camera_arrays(cameras), out)
     return out
-
-
-def _camera_arrays(cameras: Sequence[Camera]) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
-    """Sizes (v, 2) as width, height, intrinsics (v, 4) as fx, fy, cx, cy and poses (v, 3, 4), world → camera, for the kernels."""
-    sizes = np.array([(c.width, c.height) for c in cameras], np.int64)
-    intrinsics = np.array([(c.fx, c.fy, c.cx, c.cy) for c in cameras], float)
-    return sizes, intrinsics, np.array([np.concatenate([c.R, c.t[:, None]], 1) for c in cameras], float)
 
 
 def count_votes(hull: Hull, cameras: Sequence[Camera], depths: Sequence[Floats]) -> tuple[Floats, Floats]:
@@ -150,7 +124,7 @@ def count_votes(hull: Hull, cameras: Sequence[Camera], depths: Sequence[Floats])
     free, surface = np.zeros(hull.field.shape, np.float32), np.zeros(hull.field.shape, np.float32)
     if not cameras:
         return free, surface
-    sizes, intrinsics, poses = _camera_arrays(cameras)
+    sizes, intrinsics, poses, _ = camera_arrays(cameras)
     _count_votes(
         hull.field,
         np.asarray(hull.lower, float),
@@ -167,27 +141,40 @@ def count_votes(hull: Hull, cameras: Sequence[Camera], depths: Sequence[Floats])
     return free, surface
 
 
-def carve_hull(hull: Hull, cameras: Sequence[Camera], depths: Sequence[Floats]) -> CarvedHull:
-    """Carve from the hull what the `depths` (h, w; 0 = none) of the `cameras` see through.
+def carve_hull(hull: Hull, cameras: Sequence[Camera], depths: Sequence[Floats], softness: Floats) -> CarvedHull:
+    """Carve from the hull what the `depths` (h, w; 0 = none) of the `cameras` see through; `softness` as from `surface_softness`.
 
     The signed distance of cells at the new surface follows from the share of free-space votes: the surface lies where that share is
     MIN_FREE_SHARE, up to a cell before the true one. This is the safe side: surfels behind the true surface are occluded.
     """
-    votes, surface = (ndimage.gaussian_filter(v, VOTE_SIGMA) for v in count_votes(hull, cameras, depths))
+    votes, surface = _smooth_votes(hull, cameras, depths)
     solid = hull.field < 0
     likely_free = solid & (votes > MIN_FREE_SHARE * (votes + surface))
     if not likely_free.any():
         return CarvedHull(hull, 0.0, 0, 0, 0)
     typical = float(np.median((votes + surface)[likely_free]))
-    total = votes + surface + max(PRIOR_VOTES, PRIOR_VOTE_SHARE * typical)
-    free_share = votes / total
-    label, keep, unsupported = _carvable_regions(hull, free_share, surface / total)
+    prior = max(PRIOR_VOTES, PRIOR_VOTE_SHARE * typical)
+    free_share = votes / (votes + surface + prior)
+    label, count = _open_regions(solid & (free_share > MIN_FREE_SHARE), solid)
+    keep = _supported_regions(label, count, surface / (votes + surface + prior), softness, solid, MIN_SURFACE_SHARE, MIN_SOFT_SHARE, 0.0)
+    unsupported = int(np.count_nonzero(np.bincount(label.ravel())[1:] >= MIN_REGION_CELLS) - keep.sum())
     violating = _violates_silhouettes(label, keep, solid, hull, cameras)
     keep &= ~violating
     carved = keep[label]
+    behind = behind_hard_parts(hull, softness, cameras, depths)
+    seen = [np.where(mirrored, 0, depth).astype(np.float32) for depth, mirrored in zip(depths, behind, strict=True)]
+    votes, surface = _smooth_votes(hull, cameras, seen)
+    hard = _hard_cells(solid, softness)
+    if violating.any():
+        share = votes / (votes + surface + prior)
+        label, count = _open_regions(violating[label] & (share > MIN_FREE_SHARE) & ~hard, solid)
+        again = _supported_regions(label, count, surface, softness, solid, 0.0, MIN_REMAINING_SOFT_SHARE, MIN_OPENING)
+        again &= ~_violates_silhouettes(label, again, solid, hull, cameras)
+        keep, free_share, carved = np.concatenate([keep, again]), np.where(again[label], share, free_share), carved | again[label]
     if carved.any():
-        weaker = votes / (votes + surface + max(PRIOR_VOTES, GROWTH_PRIOR_VOTE_SHARE * typical))
-        grown = _grow(carved, weaker, hull, cameras)
+        typical = float(np.median((votes + surface)[carved]))
+        weaker = votes / (votes + surface + max(JOINING_PRIOR_VOTES, JOINING_PRIOR_VOTE_SHARE * typical))
+        grown = _grow(carved, np.where(hard, 0, weaker), hull, cameras)
         free_share, carved = np.where(grown, weaker, free_share), carved | grown
     if not carved.any() or carved[solid].all():  # nothing to carve, or nothing would be left
         return CarvedHull(hull, 0.0, 0, unsupported, int(violating.sum()))
@@ -199,32 +186,49 @@ def carve_hull(hull: Hull, cameras: Sequence[Camera], depths: Sequence[Floats]) 
     return CarvedHull(remaining, float(carved.sum() / solid.sum()), int(keep.sum()), unsupported, int(violating.sum()))
 
 
-def _carvable_regions(hull: Hull, free_share: Floats, surface_share: Floats) -> tuple[NDArray[np.int32], NDArray[np.bool_], int]:
-    """Free regions connected to the outside: labels (n, n, n), which labels (k,) have a supported surface, and how many have none."""
-    solid = hull.field < 0
-    outside = ~solid
-    free = solid & (free_share > MIN_FREE_SHARE) & (hull.field > -MAX_CARVING_DEPTH * hull.cell)
+def _smooth_votes(hull: Hull, cameras: Sequence[Camera], depths: Sequence[Floats]) -> tuple[Floats, Floats]:
+    """`count_votes`, smoothed."""
+    free, surface = (ndimage.gaussian_filter(votes, VOTE_SIGMA) for votes in count_votes(hull, cameras, depths))
+    return free, surface
+
+
+def _hard_cells(solid: NDArray[np.bool_], softness: Floats) -> NDArray[np.bool_]:
+    """Cells (n, n, n) at most HARD_DEPTH below a hard part of the hull's surface."""
+    return np.asarray((softness < SOFT) & (ndimage.distance_transform_edt(ndimage.binary_erosion(solid)) < HARD_DEPTH))
+
+
+def _open_regions(free: NDArray[np.bool_], solid: NDArray[np.bool_]) -> tuple[NDArray[np.int32], int]:
+    """Labels (n, n, n) of the regions of `free` cells of the hull that are connected to the outside, and their number."""
     # A tunnel one cell wide is a leak, not a concavity.
-    free &= ndimage.binary_opening(free | outside, ndimage.generate_binary_structure(3, 1))
-    label, _ = ndimage.label(free | outside)
-    reached = free & np.isin(label, np.unique(label[outside]))
-    label, count = ndimage.label(reached)
-    supported, unsupported = np.zeros(count + 1, bool), 0
+    free = free & ndimage.binary_opening(free | ~solid, ndimage.generate_binary_structure(3, 1))
+    label, _ = ndimage.label(free | ~solid)
+    return ndimage.label(free & np.isin(label, np.unique(label[~solid])))
+
+
+def _supported_regions(
+    label: NDArray[np.int32], count: int, surface_share: Floats, softness: Floats, solid: NDArray[np.bool_], min_surface: float,
+    min_soft: float, min_opening: float,
+) -> NDArray[np.bool_]:  # fmt: skip
+    """Which regions (count + 1,) have a surface with votes behind them and open through a soft part of the hull's surface; the first is
+    none. `min_surface` is the least share of surface votes, `min_soft` that of the opening that is soft, `min_opening` as MIN_OPENING."""
+    shell = solid & ~ndimage.binary_erosion(solid)
+    supported = np.zeros(count + 1, bool)
     for number, box in enumerate(ndimage.find_objects(label), 1):
         wider = tuple(slice(max(0, s.start - 1), s.stop + 1) for s in box)
         region = label[wider] == number
-        if region.sum() < MIN_REGION_CELLS:
+        size, opening = np.count_nonzero(region), region & shell[wider]
+        exposed = ndimage.binary_dilation(region) & solid[wider] & (label[wider] == 0)
+        if size < MIN_REGION_CELLS or not exposed.any() or np.count_nonzero(opening) <= min_opening * size ** (2 / 3):
             continue
-        exposed = ndimage.binary_dilation(region) & solid[wider] & ~reached[wider]
-        supported[number] = exposed.any() and surface_share[wider][exposed].mean() >= MIN_SURFACE_SHARE
-        unsupported += not supported[number]
-    return label, supported, unsupported
+        soft = (softness[wider][opening] > SOFT).mean()
+        supported[number] = soft >= min_soft and surface_share[wider][exposed].mean() >= min_surface
+    return supported
 
 
 def _grow(carved: NDArray[np.bool_], free_share: Floats, hull: Hull, cameras: Sequence[Camera]) -> NDArray[np.bool_]:
     """Cells (n, n, n) beside the carved ones that are free under the weaker prior; none of regions that violate silhouettes."""
     solid = hull.field < 0
-    free = solid & ~carved & (free_share > MIN_FREE_SHARE)
+    free = solid & ~carved & (free_share > MIN_JOINING_FREE_SHARE)
     free &= ndimage.binary_opening(free | carved | ~solid, ndimage.generate_binary_structure(3, 1))
     label, count = ndimage.label(free)
     keep = np.zeros(count + 1, bool)

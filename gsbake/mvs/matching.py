@@ -153,11 +153,14 @@ class StereoRun:
 
         return self.parallel(final_check, "consistency", MAX_CONSISTENCY_THREADS)
 
-    def carved_hull(self) -> CarvedHull | None:
-        """The hull carved by `consistent_depths`; None without a hull. Call after `filter_depths`."""
+    def carved_hull(self, softness: NDArray[np.float32]) -> CarvedHull:
+        """The hull carved by `consistent_depths`; `softness` as from `surface_softness`. Call after `filter_depths`.
+
+        Raises ValueError without a hull.
+        """
         if self.hull is None:
-            return None
-        return carve_hull(self.hull, [sizes[-1].camera for sizes in self.pyramids], self.consistent_depths)
+            raise ValueError("there is no hull")
+        return carve_hull(self.hull, [sizes[-1].camera for sizes in self.pyramids], self.consistent_depths, softness)
 
     def fuse(self, maps: Sequence[DepthMap]) -> StereoCloud:
         """Fuse the depth maps."""

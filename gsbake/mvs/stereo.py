@@ -7,14 +7,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from gsbake.capture.hull.softness import SOFT, surface_softness
 from gsbake.capture.hull.thin_parts import find_thin_parts
-from gsbake.capture.hull.visual_hull import Hull, visual_hull
+from gsbake.capture.hull.visual_hull import Hull, read_masks, visual_hull
 from gsbake.capture.posed_photos import PosedPhotos
 from gsbake.config.schema import Stereo
 from gsbake.monitor import SILENT, Monitor
 from gsbake.mvs.depth_maps import DepthMap
 from gsbake.mvs.matching import StereoRun
+from gsbake.mvs.mirror_images import without_mirror_images
 from gsbake.mvs.outliers import find_outliers, remove_outliers
 from gsbake.mvs.point_cloud import StereoCloud
 from gsbake.mvs.pyramids import single_threaded_opencv
@@ -63,9 +66,15 @@ def run_stereo(
             run.match()
         with monitor.part("consistency"):
             maps = run.filter_depths()
+        softness = None
+        if hull is not None:
+            with monitor.part("mirror images"):
+                softness = surface_softness(hull, *read_masks(posed))
+                maps = _without_mirror_images(maps, hull, softness, monitor)
         with monitor.part("fusion"):
             cloud, maps = _fuse(run, maps, hull, monitor)
-        _carve(run, out, monitor)
+        if softness is not None:
+            _carve(run, softness, out, monitor)
     if hull is not None:
         _thin_parts(posed, hull, out, seed, monitor)
     (out / "depth").mkdir()
@@ -97,6 +106,15 @@ def _hull(posed: PosedPhotos, monitor: Monitor) -> Hull | None:
     return hull
 
 
+def _without_mirror_images(maps: list[DepthMap], hull: Hull, softness: NDArray[np.float32], monitor: Monitor) -> list[DepthMap]:
+    """The depth maps without depths behind parts of the hull that are the object's surface by the silhouettes."""
+    kept, share = without_mirror_images(maps, hull, softness)
+    hard = float((softness[hull.occupancy] < SOFT).mean())
+    evidence = f"they lie behind the object's surface by the silhouettes, which determine it for {100 * hard:.0f} % of the hull"
+    monitor.decide("mirror images", f"{100 * share:.1f} % of the depths removed", evidence)
+    return kept
+
+
 def _fuse(run: StereoRun, maps: list[DepthMap], hull: Hull | None, monitor: Monitor) -> tuple[StereoCloud, list[DepthMap]]:
     """The fused cloud and the depth maps, without outlier components."""
     cloud = run.fuse(maps)
@@ -108,18 +126,17 @@ def _fuse(run: StereoRun, maps: list[DepthMap], hull: Hull | None, monitor: Moni
     return cloud.select(~outliers.contains(cloud.points)), [remove_outliers(one, outliers) for one in maps]
 
 
-def _carve(run: StereoRun, out: Path, monitor: Monitor) -> None:
+def _carve(run: StereoRun, softness: NDArray[np.float32], out: Path, monitor: Monitor) -> None:
     """Carve the hull where photos see through it, and write it."""
     with monitor.part("carving"):
-        carved = run.carved_hull()
-    if carved is None:
-        return
+        carved = run.carved_hull(softness)
     carved.hull.save(out / "hull.npz")
     monitor.decide(
         "visual hull carving",
         f"{carved.carved_regions} regions carved",
         f"{100 * carved.share:.1f} % of the cells are free space before a surface; rejected: {carved.unsupported_regions} regions "
-        f"without a surface behind, {carved.silhouette_violations} that violate silhouettes",
+        f"without a surface behind or through a surface that silhouettes determine, {carved.silhouette_violations} that violate "
+        f"silhouettes",
     )
 
 

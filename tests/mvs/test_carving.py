@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from gsbake.capture.hull.softness import SOFT, surface_softness
 from gsbake.capture.hull.visual_hull import Hull
 from gsbake.geometry.cameras import Camera
 from gsbake.mvs.carving import _grow, carve_hull, count_empty_rays, count_votes
@@ -34,6 +35,17 @@ def ball() -> Hull:
     axis = (np.arange(CELLS) + 0.5) * cell - 1
     field = np.linalg.norm(np.stack(np.meshgrid(axis, axis, axis, indexing="ij")), axis=0) - RADIUS
     return Hull(field < 0, np.full(3, -1.0), cell, field.astype(np.float32))
+
+
+def ball_softness(hull: Hull) -> NDArray[np.float32]:
+    """Softness of the ball's hull from 60 photos around it, with the opening of the bowl soft, as long chords make it."""
+    z, turn = np.linspace(-0.97, 0.97, 60), np.pi * (3 - np.sqrt(5)) * np.arange(60)
+    eyes = 3.0 * np.stack([np.sqrt(1 - z * z) * np.cos(turn), np.sqrt(1 - z * z) * np.sin(turn), z], 1)
+    cameras = [camera_at(eye, f"{i:02d}", 110, 95) for i, eye in enumerate(eyes)]
+    softness = surface_softness(hull, cameras, [255 * (sphere_depth(c) > 0).astype(np.uint8) for c in cameras])
+    axis = hull.lower[0] + (np.arange(CELLS) + 0.5) * hull.cell
+    cells = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1)
+    return np.where(np.linalg.norm(cells - BOWL, axis=-1) < HOLLOW, 2 * SOFT, softness).astype(np.float32)
 
 
 def bowl_depth(camera: Camera) -> Array:
@@ -70,7 +82,7 @@ def test_votes_match_projected_cells() -> None:
 
 def test_only_the_bowl_is_carved() -> None:
     hull, cameras = ball(), views()
-    opened = carve_hull(hull, cameras, [bowl_depth(c).astype(np.float32) for c in cameras])
+    opened = carve_hull(hull, cameras, [bowl_depth(c).astype(np.float32) for c in cameras], ball_softness(hull))
     axis = hull.lower[0] + (np.arange(CELLS) + 0.5) * hull.cell
     cells = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1)
     solid, in_bowl = hull.field < 0, HOLLOW - np.linalg.norm(cells - BOWL, axis=-1)
@@ -110,7 +122,7 @@ def test_mirror_images_are_not_carved() -> None:
     rng = np.random.default_rng(5)
     hull, cameras = ball(), views()
     depths = [np.where(d > 0, d + rng.uniform(0.1, 0.6), 0).astype(np.float32) for d in map(sphere_depth, cameras)]
-    opened = carve_hull(hull, cameras, depths)
+    opened = carve_hull(hull, cameras, depths, ball_softness(hull))
     assert opened.carved_regions == 0 and opened.unsupported_regions >= 1 and opened.share == 0
     assert opened.hull is hull
 
@@ -120,8 +132,29 @@ def test_silhouette_violations_are_not_carved() -> None:
     hull, cameras = ball(), views()
     smaller = [Camera(**{**vars(c), "t": c.t / 0.8}) for c in cameras]
     depths = [(0.8 * sphere_depth(c)).astype(np.float32) for c in smaller]
-    opened = carve_hull(hull, cameras, depths)
+    opened = carve_hull(hull, cameras, depths, np.full(hull.field.shape, 2 * SOFT, np.float32))
     assert opened.carved_regions == 0 and opened.silhouette_violations >= 1 and opened.hull is hull
+    # The ball's surface is hard, so that nothing opens through it.
+    opened = carve_hull(hull, cameras, depths, ball_softness(hull))
+    assert opened.carved_regions == 0 and opened.unsupported_regions >= 1 and opened.hull is hull
+
+
+def test_a_region_that_violates_silhouettes_keeps_its_soft_part() -> None:
+    # Around the bowl all depths lie behind the surface, as in the mirror image of a smaller ball: one region, of which only the bowl opens.
+    hull, cameras = ball(), views()
+    depths = []
+    for camera in cameras:
+        whole, mirrored = sphere_depth(camera), 0.8 * sphere_depth(Camera(**{**vars(camera), "t": camera.t / 0.8}))
+        entry = camera.centre + whole[..., None] * camera.rays()
+        around = (whole > 0) & (np.linalg.norm(entry - BOWL, axis=-1) < 0.75)
+        depths.append(np.where(around, np.maximum(bowl_depth(camera), mirrored), whole).astype(np.float32))
+    opened = carve_hull(hull, cameras, depths, ball_softness(hull))
+    axis = hull.lower[0] + (np.arange(CELLS) + 0.5) * hull.cell
+    cells = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1)
+    solid, in_bowl = hull.field < 0, HOLLOW - np.linalg.norm(cells - BOWL, axis=-1)
+    assert opened.silhouette_violations == 1 and opened.carved_regions == 1
+    assert not opened.hull.occupancy[solid & (in_bowl > 2 * hull.cell)].any()
+    assert opened.hull.occupancy[solid & (in_bowl < -3 * hull.cell)].all()
 
 
 def test_rays_are_empty_without_remaining_cells() -> None:
@@ -143,9 +176,10 @@ def test_rays_are_empty_without_remaining_cells() -> None:
 
 def test_hull_is_unchanged_without_depths() -> None:
     hull = ball()
-    assert carve_hull(hull, [], []).hull is hull
+    soft = np.full(hull.field.shape, 9.0, np.float32)
+    assert carve_hull(hull, [], [], soft).hull is hull
     cameras = views()
-    assert carve_hull(hull, cameras, [np.zeros((c.height, c.width), np.float32) for c in cameras]).share == 0
+    assert carve_hull(hull, cameras, [np.zeros((c.height, c.width), np.float32) for c in cameras], soft).share == 0
 
 
 def test_depths_of_selected_planes() -> None:

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from gsbake.capture.hull.softness import surface_softness
 from gsbake.capture.hull.visual_hull import Hull
 from gsbake.capture.posed_photos import PosedPhotos
 from gsbake.config.schema import Stereo
@@ -78,7 +79,9 @@ def ball(cells: int = 24) -> Hull:
 @pytest.mark.parametrize("cameras", CAMERAS)
 def test_carving_with_hostile_depths(cameras: str, depth: float) -> None:
     hull, views = ball(), CAMERAS[cameras]()
-    carved = carve_hull(hull, views, [np.full((SIZE, SIZE), depth, np.float32)] * len(views))
+    softness = surface_softness(hull, views, [np.full((SIZE, SIZE), 255, np.uint8)] * len(views))
+    assert np.isfinite(softness).all() and softness.min() > 0
+    carved = carve_hull(hull, views, [np.full((SIZE, SIZE), depth, np.float32)] * len(views), softness)
     assert np.isfinite(carved.hull.field).all() and 0 <= carved.share <= 1
     assert carved.hull.occupancy.any() and not (carved.hull.occupancy & ~hull.occupancy).any()
 
@@ -88,7 +91,8 @@ def test_carving_of_an_empty_and_of_a_full_grid(inside: bool) -> None:
     field = np.full((16, 16, 16), -0.1 if inside else 0.1, np.float32)
     hull = Hull(field < 0, np.full(3, -1.0), 0.125, field)
     views = around()
-    carved = carve_hull(hull, views, [np.full((SIZE, SIZE), 10.0, np.float32)] * len(views))
+    softness = np.full(field.shape, 2.0, np.float32)
+    carved = carve_hull(hull, views, [np.full((SIZE, SIZE), 10.0, np.float32)] * len(views), softness)
     assert carved.hull.occupancy.any() == inside and np.isfinite(carved.hull.field).all()
 
 

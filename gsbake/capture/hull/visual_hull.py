@@ -242,11 +242,8 @@ class Hull:
         return points, self.gradient(points)
 
 
-def visual_hull(posed: PosedPhotos, resolution: int = 128, max_size: int = 512) -> Hull:
-    """Visual hull of a masked capture in the unit frame, on the cube [-1, 1]³. Masks are read at `max_size`.
-
-    Raises ValueError when a photo has no mask.
-    """
+def read_masks(posed: PosedPhotos, max_size: int = 512) -> tuple[list[Camera], list[Bytes]]:
+    """Masks (h, w) of a capture, the longer side at most `max_size` pixels, and their cameras. Raises ValueError when a photo has none."""
     cameras, masks = [], []
     for index in range(len(posed)):
         camera, mask = posed.mask(index, max_size)
@@ -254,4 +251,13 @@ def visual_hull(posed: PosedPhotos, resolution: int = 128, max_size: int = 512) 
             raise ValueError(f"photo {camera.name} has no mask")
         cameras.append(camera)
         masks.append(mask)
+    return cameras, masks
+
+
+def visual_hull(posed: PosedPhotos, resolution: int = 128, max_size: int = 512) -> Hull:
+    """Visual hull of a masked capture in the unit frame, on the cube [-1, 1]³. Masks are read at `max_size`.
+
+    Raises ValueError when a photo has no mask.
+    """
+    cameras, masks = read_masks(posed, max_size)
     return Hull.from_masks(cameras, masks, np.zeros(3), 1.0, resolution)

@@ -1,0 +1,50 @@
+"""Rays of photos through the hull's grid: projection of points inside compiled kernels, and cameras as the arrays that these take."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numba as nb
+import numpy as np
+from numpy.typing import NDArray
+
+from gsbake.geometry.cameras import Camera
+
+
+@nb.njit(error_model="numpy", nogil=True, cache=True)
+def project_point(x: float, y: float, z: float, p: Any, intrinsics: Any, size: Any) -> tuple[int, int, float]:
+    """Column, row and z-depth of a point in a photo (arrays of `camera_arrays`); depth 0 behind the camera or outside the frame."""
+    here = p[2, 0] * x + p[2, 1] * y + p[2, 2] * z + p[2, 3]
+    if not here > 1e-6:
+        return 0, 0, 0.0
+    across = intrinsics[0] * (p[0, 0] * x + p[0, 1] * y + p[0, 2] * z + p[0, 3]) / here + intrinsics[2]
+    down = intrinsics[1] * (p[1, 0] * x + p[1, 1] * y + p[1, 2] * z + p[1, 3]) / here + intrinsics[3]
+    if not (across >= 0 and down >= 0 and across < size[0] and down < size[1]):
+        return 0, 0, 0.0
+    return int(across), int(down), here
+
+
+@nb.njit(error_model="numpy", nogil=True, cache=True)
+def half_steps_inside(solid: Any, i: float, j: float, k: float, dx: float, dy: float, dz: float, most: int) -> int:
+    """Half-cell steps of a ray inside the cells `solid` (n, n, n), counted from the point (i, j, k), in cells, in both directions of the
+    vector (dx, dy, dz); stops at `most`. The point itself does not count."""
+    n0, n1, n2 = solid.shape
+    length = 0.5 / np.sqrt(dx * dx + dy * dy + dz * dz)
+    dx, dy, dz = dx * length, dy * length, dz * length
+    count = 0
+    for _ in range(2):
+        a, b, c = i + dx, j + dy, k + dz
+        while count < most and a >= 0 and b >= 0 and c >= 0 and a < n0 and b < n1 and c < n2:
+            count += solid[np.int64(a), np.int64(b), np.int64(c)]
+            a, b, c = a + dx, b + dy, c + dz
+        dx, dy, dz = -dx, -dy, -dz
+    return count
+
+
+def camera_arrays(cameras: Sequence[Camera]) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Sizes (v, 2) as width, height, intrinsics (v, 4) as fx, fy, cx, cy, poses (v, 3, 4), world → camera, and centres (v, 3)."""
+    sizes = np.array([(c.width, c.height) for c in cameras], np.int64)
+    intrinsics = np.array([(c.fx, c.fy, c.cx, c.cy) for c in cameras], float)
+    poses = np.array([np.concatenate([c.R, c.t[:, None]], 1) for c in cameras], float)
+    return sizes, intrinsics, poses, np.array([c.centre for c in cameras], float)

@@ -1,0 +1,100 @@
+"""Depths of mirror images: they lie behind a part of the visual hull where silhouettes say that the surface is.
+
+A specular surface shows its surroundings at a place behind itself, and stereo matches them there. Where the hull's surface is hard
+(`gsbake.capture.hull.softness`) the object is at it, and a depth farther behind cannot be the object's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numba as nb
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from gsbake.capture.hull.rays import camera_arrays
+from gsbake.capture.hull.softness import SOFT
+from gsbake.capture.hull.visual_hull import Hull
+from gsbake.geometry.cameras import Camera
+from gsbake.mvs.depth_maps import DepthMap
+
+Floats = NDArray[np.float32]
+
+#: Cells below the hull's surface from which a depth is a mirror image, and cells around a soft part that count as soft: a ray may enter a
+#: hollow beside the edge of its opening.
+MIN_DEPTH, SOFT_BORDER = 2.0, 4
+
+
+@nb.njit(error_model="numpy", cache=True)
+def _cell_at(origin: Any, ray: Any, depth: float, cell: float) -> Any:
+    """Cell (i, j, k) of a ray from `origin`, relative to the grid's corner, at a depth."""
+    return (
+        np.int64(np.floor((origin[0] + depth * ray[0]) / cell)),
+        np.int64(np.floor((origin[1] + depth * ray[1]) / cell)),
+        np.int64(np.floor((origin[2] + depth * ray[2]) / cell)),
+    )
+
+
+@nb.njit(parallel=True, error_model="numpy", cache=True)
+def _behind_hard(
+    depth: Any, starts: Any, sizes: Any, intrinsics: Any, poses: Any, centres: Any, field: Any, hard: Any, lower: Any, cell: float,
+    deepest: float, out: Any,
+) -> None:  # fmt: skip
+    """Kernel of `behind_hard_parts`: all depth maps concatenated in `depth`, and the result in `out`."""
+    n = field.shape[0]
+    upper = n * cell
+    for v in nb.prange(starts.shape[0]):
+        p, origin = poses[v], centres[v] - lower
+        ray = np.empty(3)
+        for pixel in range(sizes[v, 0] * sizes[v, 1]):
+            there = depth[starts[v] + pixel]
+            if not there > 0:
+                continue
+            a = (pixel % sizes[v, 0] + 0.5 - intrinsics[v, 2]) / intrinsics[v, 0]
+            b = (pixel // sizes[v, 0] + 0.5 - intrinsics[v, 3]) / intrinsics[v, 1]
+            first = 0.0
+            for axis in range(3):  # the ray per unit of depth, and its depth where it enters the grid
+                ray[axis] = p[0, axis] * a + p[1, axis] * b + p[2, axis]
+                if abs(ray[axis]) > 1e-9:
+                    first = max(first, min(-origin[axis] / ray[axis], (upper - origin[axis]) / ray[axis]))
+            i, j, k = _cell_at(origin, ray, there, cell)
+            if not (0 <= i < n and 0 <= j < n and 0 <= k < n and field[i, j, k] < deepest):
+                continue
+            step, here = 0.5 * cell / np.sqrt(a * a + b * b + 1.0), first + 1e-6
+            while here < there:
+                i, j, k = _cell_at(origin, ray, here, cell)
+                if 0 <= i < n and 0 <= j < n and 0 <= k < n and field[i, j, k] < 0:
+                    out[starts[v] + pixel] = hard[i, j, k]
+                    break
+                here += step
+
+
+def behind_hard_parts(hull: Hull, softness: Floats, cameras: Sequence[Camera], depths: Sequence[Floats]) -> list[NDArray[np.bool_]]:
+    """Which z-depths (h, w; 0 = none) of the `cameras` lie MIN_DEPTH cells or more below the hull's surface, on rays that enter the hull
+    through a hard part.
+
+    `softness` (n, n, n) as from `surface_softness`.
+    """
+    if not cameras:
+        return []
+    starts = np.concatenate([[0], np.cumsum([d.size for d in depths])[:-1]]).astype(np.int64)
+    flat = np.concatenate([np.asarray(d, np.float32).ravel() for d in depths])
+    hard = ndimage.maximum_filter(softness, 2 * SOFT_BORDER + 1) < SOFT
+    out = np.zeros(len(flat), bool)
+    lower, cell = np.asarray(hull.lower, float), float(hull.cell)
+    _behind_hard(flat, starts, *camera_arrays(cameras), hull.field, hard, lower, cell, -MIN_DEPTH * cell, out)
+    return [out[start : start + d.size].reshape(d.shape) for start, d in zip(starts, depths, strict=True)]
+
+
+def without_mirror_images(maps: Sequence[DepthMap], hull: Hull, softness: Floats) -> tuple[list[DepthMap], float]:
+    """The depth maps without depths behind hard parts, and the share of the depths that these were."""
+    behind = behind_hard_parts(hull, softness, [one.camera for one in maps], [one.depth() for one in maps])
+    kept = [
+        replace(one, confidence=np.where(mirrored, 0, one.confidence), views=np.where(mirrored, 0, one.views))
+        for one, mirrored in zip(maps, behind, strict=True)
+    ]
+    depths = sum(int((one.confidence > 0).sum()) for one in maps)
+    return kept, sum(int(mirrored.sum()) for mirrored in behind) / max(depths, 1)
