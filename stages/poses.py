@@ -20,7 +20,7 @@ def run(ctx: Context) -> dict[str, Any]:
 
 STAGE = Stage(
     name="poses",
-    version=11,
+    version=12,
     title="Camera poses",
     run=run,
     summary="{registered} photos registered, {points} tie points, {reprojection_px:px} reprojection error",

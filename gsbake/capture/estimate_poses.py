@@ -151,12 +151,12 @@ class _Estimation:
         evidence = f"the guesses of the network agree with the cameras to {agreement:.2f}"
         if agreement < CERTAIN_AGREEMENT and len(guessed) == len(cameras) and points is not None:
             photos = {c.name: self.ingest / by_name[c.name]["file"] for c in cameras}
-            on_plane = plane_masks(cameras, photos, files, points, self.scratch / "plane_masks", self.seed, self.threads)
-            other = None if on_plane is None else find_consensus(cameras, on_plane)
-            if on_plane is not None and other is not None:
-                evidence += f", masks of what stands on the support plane to {other.agreement:.2f}"
-                if other.agreement > agreement:
-                    found, files, agreement = other, on_plane, other.agreement
+            sets = plane_masks(cameras, photos, files, points, self.scratch / "plane_masks", self.seed, self.threads)
+            for masks, kind in zip(sets, ("", ", with the plane below it in question,"), strict=False):
+                if (other := find_consensus(cameras, masks)) is not None:
+                    evidence += f", masks of what stands on the support plane{kind} to {other.agreement:.2f}"
+                    if other.agreement > agreement:
+                        found, files, agreement = other, masks, other.agreement
         if found is None or agreement < MIN_USED_AGREEMENT:
             evidence += f", which is below {MIN_USED_AGREEMENT:g}"
             self.monitor.decide("automatic masks", "not used", evidence)

@@ -5,6 +5,8 @@ stands on it is displaced (plane and parallax: Irani & Anandan, *A unified appro
 1998). A point in space is free where photos see the plane behind it, so these pixels carve the object's hull, whatever its colour, gloss
 or shape. The hull is some pixels too large; colour finds the border (GrabCut: Rother et al., SIGGRAPH 2004). Networks that guess masks from
 single photos fail where this does not, and the other way round: mirror-like metal shows its surroundings, a plain table confirms nothing.
+A flat foot hardly rises above the plane, so that the plane explains it too. A second set of masks lets colour decide straight below the
+object as well; there a shadow may join it, so the set is used that agrees better between photos.
 """
 
 from __future__ import annotations
@@ -93,45 +95,61 @@ def find_plane(points: Array, cameras: Sequence[Camera], seed: int) -> Plane | N
     return Plane(normal, offset) if below <= MAX_BELOW_SHARE else None
 
 
+@dataclass(frozen=True)
+class StandingObject:
+    """Per photo the pixels (h, w) of an object on a plane, and of the plane straight below it."""
+
+    silhouettes: list[Mask]
+    below: list[Mask]
+
+
 def plane_masks(
     cameras: Sequence[Camera], photos: Mapping[str, Path], guesses: Mapping[str, Path], points: Array, out: Path, seed: int, threads: int
-) -> dict[str, Path] | None:
-    """Write masks of what stands on the support plane into `out`; files by photo name. None where no plane or no object is found.
+) -> list[dict[str, Path]]:
+    """Write masks of what stands on the support plane into folders in `out`; files by photo name. Empty where there is no plane or object.
 
-    `cameras` (world frame) may be distorted; `photos` and `guesses` are files by name, `points` (n, 3) are tie points. Guesses that overlap
-    what is found complete it. Masks have SEGMENT_SIZE and show what the photos show.
+    There are two sets of masks: in the second one colour decides on the plane straight below the object too. `cameras` (world frame) may
+    be distorted; `photos` and `guesses` are files by name, `points` (n, 3) are tie points. Guesses that overlap what is found complete it.
+    Masks have SEGMENT_SIZE and show what the photos show.
     """
     plane = find_plane(points, cameras, seed)
     if plane is None:
-        return None
+        return []
     try:
         pinholes, images = small_views(cameras, photos)
     except BadInputError:
-        return None
+        return []
     decided = confirmed_pixels(pinholes, [image.astype(np.float32) for image in images], plane)
-    silhouettes = hull_silhouettes(pinholes, decided, plane)
-    if silhouettes is None:
-        return None
-    out.mkdir(parents=True, exist_ok=True)
+    found = find_object(pinholes, decided, plane)
+    if found is None:
+        return []
+    folders = [out / "above", out / "below"]
+    for folder in folders:
+        folder.mkdir(parents=True, exist_ok=True)
 
-    def write(item: tuple[Camera, Mask]) -> tuple[str, Path]:
-        camera, silhouette = item
+    def write(item: tuple[Camera, Mask, Mask]) -> list[Path]:
+        camera, silhouette, below = item
         photo: Any = cv2.imread(str(photos[camera.name]), cv2.IMREAD_COLOR)
         if photo is None:
             raise FileNotFoundError(photos[camera.name])
         small = camera.downscaled_to(SEGMENT_SIZE)
         size = small.width, small.height
         photo, guess = (cv2.resize(i, size, interpolation=cv2.INTER_AREA) for i in (photo, read_grey(guesses[camera.name])))
-        shape = cv2.resize(distorted(silhouette, camera).astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
-        found = segment(photo, shape > 0, guess > CERTAIN)
-        if intersection_over_union(found, guess > 127) >= MIN_TRUSTED_OVERLAP:
-            found = found | (guess > 127)  # the foot, which hardly rises above the plane
-        path = out / f"{camera.name}.png"
-        write_png(path, 255 * found.astype(np.uint8))
-        return camera.name, path
+        shape, under = (
+            cv2.resize(distorted(i, camera).astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0 for i in (silhouette, below)
+        )
+        paths = []
+        for folder, possible in zip(folders, (np.zeros_like(under), under), strict=True):
+            mask = segment(photo, shape, guess > CERTAIN, possible)
+            if intersection_over_union(mask, guess > 127) >= MIN_TRUSTED_OVERLAP:
+                mask = mask | (guess > 127)
+            paths.append(folder / f"{camera.name}.png")
+            write_png(paths[-1], 255 * mask.astype(np.uint8))
+        return paths
 
     with ThreadPoolExecutor(max(1, threads)) as pool:
-        return dict(pool.map(write, zip(cameras, silhouettes, strict=True)))
+        paths = list(pool.map(write, zip(cameras, found.silhouettes, found.below, strict=True)))
+    return [dict(zip([c.name for c in cameras], files, strict=True)) for files in zip(*paths, strict=True)]
 
 
 def confirmed_pixels(cameras: Sequence[Camera], images: Sequence[Floats], plane: Plane) -> list[tuple[Mask, Mask]]:
@@ -160,9 +178,9 @@ def confirmed_pixels(cameras: Sequence[Camera], images: Sequence[Floats], plane:
     return found
 
 
-def hull_silhouettes(cameras: Sequence[Camera], pixels: Sequence[tuple[Mask, Mask]], plane: Plane) -> list[Mask] | None:
-    """Silhouettes (h, w) of the largest part of space above the plane behind which photos do not see it; None where nothing is left, or
-    nothing stands alone there."""
+def find_object(cameras: Sequence[Camera], pixels: Sequence[tuple[Mask, Mask]], plane: Plane) -> StandingObject | None:
+    """The largest part of space above the plane behind which photos do not see it; None where nothing is left, or nothing stands alone
+    there. `pixels` as from `confirmed_pixels`."""
     low = nearest_point_to_axes(cameras)
     half = FIRST_RADIUS * float(np.median([min(frame_radius(c, low), np.linalg.norm(c.centre - low)) for c in cameras]))
     low, edge = low - half, np.full(3, 2 * half)
@@ -182,17 +200,22 @@ def hull_silhouettes(cameras: Sequence[Camera], pixels: Sequence[tuple[Mask, Mas
         edge = high - low
     silhouettes = [render_cells(cells, cell, camera, CLOSING) for camera in cameras]
     border = [np.concatenate([s[0], s[-1], s[:, 0], s[:, -1]]).mean() for s in silhouettes]
-    return silhouettes if np.median(border) <= MAX_BORDER_SHARE else None
+    if np.median(border) > MAX_BORDER_SHARE:
+        return None
+    projection = cells - (cells @ plane.normal - plane.offset)[:, None] * plane.normal
+    below = [cv2.dilate(render_cells(projection, cell, camera, CLOSING).astype(np.uint8), disc(1)) > 0 for camera in cameras]
+    return StandingObject(silhouettes, below)
 
 
-def segment(photo: NDArray[np.uint8], silhouette: Mask, certain: Mask) -> Mask:
-    """The object (h, w) in a photo (h, w, 3) by colour: in and around the `silhouette`, and including what is `certain` there."""
+def segment(photo: NDArray[np.uint8], silhouette: Mask, certain: Mask, possible: Mask) -> Mask:
+    """The object (h, w) in a photo (h, w, 3) by colour: in and around the `silhouette`, including what is `certain` there, and where it is
+    `possible`."""
     if not silhouette.any() or silhouette.all():
         return silhouette
     radius = max(2, round(BAND * float(np.sqrt(np.count_nonzero(silhouette)))))
     outer = cv2.dilate(silhouette.astype(np.uint8), disc(radius)) > 0
     labels = np.full(silhouette.shape, cv2.GC_BGD, np.uint8)
-    labels[outer] = cv2.GC_PR_BGD
+    labels[outer | possible] = cv2.GC_PR_BGD
     labels[silhouette | (outer & certain)] = cv2.GC_PR_FGD
     labels[silhouette & certain] = cv2.GC_FGD
     cv2.setRNGSeed(0)  # of its k-means

@@ -12,7 +12,7 @@ import pytest
 from numpy.typing import NDArray
 
 from gsbake.capture.masks.consensus import intersection_over_union
-from gsbake.capture.masks.support_plane import confirmed_pixels, find_plane, hull_silhouettes, plane_masks, segment
+from gsbake.capture.masks.support_plane import confirmed_pixels, find_object, find_plane, plane_masks, segment
 from gsbake.geometry.cameras import Camera
 from tests.support.cameras import look_at
 
@@ -95,9 +95,12 @@ def test_pixels_of_the_plane_are_confirmed_and_the_ball_is_not(capture: Any) -> 
         on_ball.append(confirmed[cv2.erode(mask.astype(np.uint8), window) > 0])
         on_plane.append(confirmed[decided & (cv2.dilate(mask.astype(np.uint8), window) == 0)])
     assert np.concatenate(on_ball).mean() < 0.1 and np.concatenate(on_plane).mean() > 0.9
-    silhouettes = hull_silhouettes(cameras, pixels, plane)
-    assert silhouettes is not None
-    assert np.median([intersection_over_union(m, s) for m, s in zip(masks, silhouettes, strict=True)]) > 0.75
+    found = find_object(cameras, pixels, plane)
+    assert found is not None
+    assert np.median([intersection_over_union(m, s) for m, s in zip(masks, found.silhouettes, strict=True)]) > 0.75
+    for camera, mask, below in zip(cameras, masks, found.below, strict=True):  # the shadow of a light from above
+        centre = camera.project(np.zeros((1, 3)))[0][0]
+        assert below[int(centre[1]), int(centre[0])] and 0.2 < below.sum() / mask.sum() < 1.4
 
 
 @pytest.mark.parametrize("tilt", [0.0, 0.6])
@@ -113,13 +116,15 @@ def test_masks_of_what_stands_on_it(capture: Any, tmp_path: Path, tilt: float) -
             cv2.imwrite(str(files[kind][camera.name]), image)
     points = ground_points() @ turn.T
     found = plane_masks(cameras, files["photos"], files["guesses"], points, tmp_path / "masks", 0, 2)
-    assert found is not None and list(found) == [camera.name for camera in cameras]
-    overlap = []
-    for mask, path in zip(masks, found.values(), strict=True):
-        image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
-        assert image is not None and image.shape == mask.shape
-        overlap.append(intersection_over_union(image > 127, mask))
-    assert np.median(overlap) > 0.93 and min(overlap) > 0.85
+    assert len(found) == 2
+    for files_of_set in found:
+        assert list(files_of_set) == [camera.name for camera in cameras]
+        overlap = []
+        for mask, path in zip(masks, files_of_set.values(), strict=True):
+            image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+            assert image is not None and image.shape == mask.shape
+            overlap.append(intersection_over_union(image > 127, mask))
+        assert np.median(overlap) > 0.93 and min(overlap) > 0.85
 
 
 def test_small_holes_are_filled_and_large_ones_stay() -> None:
@@ -129,9 +134,22 @@ def test_small_holes_are_filled_and_large_ones_stay() -> None:
     photo[50:52, 60:62] = photo[45:70, 80:105] = (40, 160, 60)
     silhouette = np.zeros((120, 160), bool)
     silhouette[27:93, 37:123] = True
-    found = segment(photo, silhouette, np.zeros_like(silhouette))
+    nowhere = np.zeros_like(silhouette)
+    found = segment(photo, silhouette, nowhere, nowhere)
     assert found[50:52, 60:62].all() and not found[50:65, 85:100].any()
     assert found[32:44, 42:118].all() and not found[:24].any()
+
+
+def test_a_foot_of_the_same_colour_joins_where_it_is_possible() -> None:
+    photo = np.full((120, 160, 3), (40, 160, 60), np.uint8)
+    photo[30:90, 60:100] = photo[90:98, 30:130] = (30, 40, 200)
+    silhouette, below = np.zeros((120, 160), bool), np.zeros((120, 160), bool)
+    silhouette[28:90, 58:102] = True
+    below[84:104, 26:134] = True
+    nowhere = np.zeros_like(silhouette)
+    assert not segment(photo, silhouette, nowhere, nowhere)[92:96, 34:50].any()
+    found = segment(photo, silhouette, nowhere, below)
+    assert found[92:96, 34:50].all() and not found[100:].any() and not found[84:89, 26:56].any()
 
 
 def test_what_fills_the_photos_is_not_an_object(capture: Any) -> None:
@@ -139,6 +157,6 @@ def test_what_fills_the_photos_is_not_an_object(capture: Any) -> None:
     cameras, plane = capture[0], find_plane(ground_points(), capture[0], 0)
     assert plane is not None
     everything = np.ones((SIZE, SIZE), bool), np.zeros((SIZE, SIZE), bool)
-    assert hull_silhouettes(cameras, [everything] * COUNT, plane) is None
+    assert find_object(cameras, [everything] * COUNT, plane) is None
     nothing = np.ones((SIZE, SIZE), bool), np.ones((SIZE, SIZE), bool)
-    assert hull_silhouettes(cameras, [nothing] * COUNT, plane) is None
+    assert find_object(cameras, [nothing] * COUNT, plane) is None
