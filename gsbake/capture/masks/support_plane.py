@@ -48,8 +48,8 @@ MIN_COMPARED, MIN_CONFIRMED_SHARE = 3, 0.4
 MAX_FREE_SHARE, MIN_DECIDED_SHARE, MIN_VISIBLE_SHARE = 0.1, 0.25, 0.5
 #: Cells along an edge in the first and the second pass, and half edge of the first cube in radii of the frame.
 CELLS, FIRST_RADIUS = (40, 72), 1.3
-#: Radius in cells that closes gaps in silhouettes.
-CLOSING = 0.7
+#: Radius in cells that closes gaps in silhouettes, and in those of a single layer of cells.
+CLOSING, FLAT_CLOSING = 0.7, 1.5
 #: Share of a photo's border that the object covers at most, in the median: masks of everything agree with each other too.
 MAX_BORDER_SHARE = 0.4
 #: Longer side in pixels of the photos that are segmented, GrabCut's iterations, and guess that is taken as certain inside the hull.
@@ -203,7 +203,7 @@ def find_object(cameras: Sequence[Camera], pixels: Sequence[tuple[Mask, Mask]], 
     if np.median(border) > MAX_BORDER_SHARE:
         return None
     projection = cells - (cells @ plane.normal - plane.offset)[:, None] * plane.normal
-    below = [cv2.dilate(render_cells(projection, cell, camera, CLOSING).astype(np.uint8), disc(1)) > 0 for camera in cameras]
+    below = [cv2.dilate(render_cells(projection, cell, camera, FLAT_CLOSING).astype(np.uint8), disc(1)) > 0 for camera in cameras]
     return StandingObject(silhouettes, below)
 
 
