@@ -7,10 +7,11 @@ Vogiatzis & Cipolla, *Probabilistic visibility for multi-view stereo*, CVPR 2007
 the outside is carved, but only where the exposed surface has votes of its own: mirror images lie behind a specular surface too, but mostly
 at a different location in every photo.
 
-Mirror images that do agree (a smooth black handle reflects the same light to many photos) are detected by silhouettes, in two ways. A
-region must open through a soft part of the hull's surface, where silhouettes leave room for air (`gsbake.capture.hull.softness`). And every
-ray through the hull must still meet the object after carving (Laurentini, *The visual hull concept*, PAMI 1994: the hull is the largest
-such shape). Carving a concavity keeps this property; carving a convex part leaves empty rays in photos from the side.
+Mirror images that do agree (a smooth black handle reflects the same light to many photos) are detected by silhouettes, in three ways.
+Depths behind a hard part of the hull's surface do not vote (`gsbake.mvs.mirror_images`). A region must open through a soft part, where
+silhouettes leave room for air (`gsbake.capture.hull.softness`). And every ray through the hull must still meet the object after carving
+(Laurentini, *The visual hull concept*, PAMI 1994: the hull is the largest such shape). Carving a concavity keeps this property; carving a
+convex part leaves empty rays in photos from the side.
 """
 
 from __future__ import annotations
@@ -40,15 +41,12 @@ VOTE_SIGMA = 1.0
 #: Free space has this share of the votes. The prior adds votes for surface: at least the second, or the third as a share of the median
 #: number of votes per free cell, whichever is more.
 MIN_FREE_SHARE, PRIOR_VOTES, PRIOR_VOTE_SHARE = 0.65, 0.3, 0.2
-#: The same for cells that join a carved region (hysteresis: Canny, *A computational approach to edge detection*, PAMI 1986), from votes
-#: without mirror images; hard cells at most this far below the hull's surface do not join.
-MIN_JOINING_FREE_SHARE, JOINING_PRIOR_VOTES, JOINING_PRIOR_VOTE_SHARE, HARD_DEPTH = 0.75, 0.03, 0.03, 1.5
+#: The same for cells that join a carved region (hysteresis: Canny, *A computational approach to edge detection*, PAMI 1986); cells at most
+#: this far below a hard part of the hull's surface do not join.
+MIN_JOINING_FREE_SHARE, JOINING_PRIOR_VOTES, JOINING_PRIOR_VOTE_SHARE, HARD_DEPTH = 0.75, 0.1, 0.1, 1.5
 #: Carved regions have at least this many cells (fewer are noise), at least this mean share of surface votes on the exposed surface, and are
 #: soft in at least this share of their cells on the hull's surface.
 MIN_REGION_CELLS, MIN_SURFACE_SHARE, MIN_SOFT_SHARE = 8, 0.05, 0.15
-#: The last for what is left of a region that violates silhouettes without its hard cells, and the least number of its cells on the hull's
-#: surface as a multiple of its size to the power of 2/3: a bowl has 1.9, what spread below the surface from a leak .7 and less.
-MIN_REMAINING_SOFT_SHARE, MIN_OPENING = 0.6, 1.0
 #: A cell violates silhouettes when carving leaves this many photos with an empty ray through it (single masks may be wrong). Regions
 #: with more than this share of such cells are rejected: true concavities have up to .03 of them, false ones .1 to .67.
 MIN_EMPTY_RAYS, MAX_EMPTY_SHARE = 2, 0.1
@@ -147,34 +145,23 @@ def carve_hull(hull: Hull, cameras: Sequence[Camera], depths: Sequence[Floats], 
     The signed distance of cells at the new surface follows from the share of free-space votes: the surface lies where that share is
     MIN_FREE_SHARE, up to a cell before the true one. This is the safe side: surfels behind the true surface are occluded.
     """
-    votes, surface = _smooth_votes(hull, cameras, depths)
+    behind = behind_hard_parts(hull, softness, cameras, depths)
+    true = [np.where(mirrored, 0, depth).astype(np.float32) for depth, mirrored in zip(depths, behind, strict=True)]
+    votes, surface = (ndimage.gaussian_filter(v, VOTE_SIGMA) for v in count_votes(hull, cameras, true))
     solid = hull.field < 0
     likely_free = solid & (votes > MIN_FREE_SHARE * (votes + surface))
     if not likely_free.any():
         return CarvedHull(hull, 0.0, 0, 0, 0)
-    typical = float(np.median((votes + surface)[likely_free]))
-    prior = max(PRIOR_VOTES, PRIOR_VOTE_SHARE * typical)
-    free_share = votes / (votes + surface + prior)
-    label, count = _open_regions(solid & (free_share > MIN_FREE_SHARE), solid)
-    keep = _supported_regions(label, count, surface / (votes + surface + prior), softness, solid, MIN_SURFACE_SHARE, MIN_SOFT_SHARE, 0.0)
-    unsupported = int(np.count_nonzero(np.bincount(label.ravel())[1:] >= MIN_REGION_CELLS) - keep.sum())
+    total = votes + surface + max(PRIOR_VOTES, PRIOR_VOTE_SHARE * float(np.median((votes + surface)[likely_free])))
+    free_share = votes / total
+    label, keep, unsupported = _carvable_regions(solid, free_share, surface / total, softness)
     violating = _violates_silhouettes(label, keep, solid, hull, cameras)
     keep &= ~violating
     carved = keep[label]
-    behind = behind_hard_parts(hull, softness, cameras, depths)
-    seen = [np.where(mirrored, 0, depth).astype(np.float32) for depth, mirrored in zip(depths, behind, strict=True)]
-    votes, surface = _smooth_votes(hull, cameras, seen)
-    hard = _hard_cells(solid, softness)
-    if violating.any():
-        share = votes / (votes + surface + prior)
-        label, count = _open_regions(violating[label] & (share > MIN_FREE_SHARE) & ~hard, solid)
-        again = _supported_regions(label, count, surface, softness, solid, 0.0, MIN_REMAINING_SOFT_SHARE, MIN_OPENING)
-        again &= ~_violates_silhouettes(label, again, solid, hull, cameras)
-        keep, free_share, carved = np.concatenate([keep, again]), np.where(again[label], share, free_share), carved | again[label]
     if carved.any():
         typical = float(np.median((votes + surface)[carved]))
         weaker = votes / (votes + surface + max(JOINING_PRIOR_VOTES, JOINING_PRIOR_VOTE_SHARE * typical))
-        grown = _grow(carved, np.where(hard, 0, weaker), hull, cameras)
+        grown = _grow(carved, np.where(_hard_cells(solid, softness), 0, weaker), hull, cameras)
         free_share, carved = np.where(grown, weaker, free_share), carved | grown
     if not carved.any() or carved[solid].all():  # nothing to carve, or nothing would be left
         return CarvedHull(hull, 0.0, 0, unsupported, int(violating.sum()))
@@ -186,43 +173,38 @@ def carve_hull(hull: Hull, cameras: Sequence[Camera], depths: Sequence[Floats], 
     return CarvedHull(remaining, float(carved.sum() / solid.sum()), int(keep.sum()), unsupported, int(violating.sum()))
 
 
-def _smooth_votes(hull: Hull, cameras: Sequence[Camera], depths: Sequence[Floats]) -> tuple[Floats, Floats]:
-    """`count_votes`, smoothed."""
-    free, surface = (ndimage.gaussian_filter(votes, VOTE_SIGMA) for votes in count_votes(hull, cameras, depths))
-    return free, surface
-
-
 def _hard_cells(solid: NDArray[np.bool_], softness: Floats) -> NDArray[np.bool_]:
     """Cells (n, n, n) at most HARD_DEPTH below a hard part of the hull's surface."""
     return np.asarray((softness < SOFT) & (ndimage.distance_transform_edt(ndimage.binary_erosion(solid)) < HARD_DEPTH))
 
 
-def _open_regions(free: NDArray[np.bool_], solid: NDArray[np.bool_]) -> tuple[NDArray[np.int32], int]:
-    """Labels (n, n, n) of the regions of `free` cells of the hull that are connected to the outside, and their number."""
+def _carvable_regions(
+    solid: NDArray[np.bool_], free_share: Floats, surface_share: Floats, softness: Floats
+) -> tuple[NDArray[np.int32], NDArray[np.bool_], int]:
+    """Free regions connected to the outside: labels (n, n, n), which labels (k,) have a supported surface and open through a soft part, and
+    how many do not."""
+    outside, shell = ~solid, solid & ~ndimage.binary_erosion(solid)
+    free = solid & (free_share > MIN_FREE_SHARE)
     # A tunnel one cell wide is a leak, not a concavity.
-    free = free & ndimage.binary_opening(free | ~solid, ndimage.generate_binary_structure(3, 1))
-    label, _ = ndimage.label(free | ~solid)
-    return ndimage.label(free & np.isin(label, np.unique(label[~solid])))
-
-
-def _supported_regions(
-    label: NDArray[np.int32], count: int, surface_share: Floats, softness: Floats, solid: NDArray[np.bool_], min_surface: float,
-    min_soft: float, min_opening: float,
-) -> NDArray[np.bool_]:  # fmt: skip
-    """Which regions (count + 1,) have a surface with votes behind them and open through a soft part of the hull's surface; the first is
-    none. `min_surface` is the least share of surface votes, `min_soft` that of the opening that is soft, `min_opening` as MIN_OPENING."""
-    shell = solid & ~ndimage.binary_erosion(solid)
-    supported = np.zeros(count + 1, bool)
+    free &= ndimage.binary_opening(free | outside, ndimage.generate_binary_structure(3, 1))
+    label, _ = ndimage.label(free | outside)
+    reached = free & np.isin(label, np.unique(label[outside]))
+    label, count = ndimage.label(reached)
+    supported, unsupported = np.zeros(count + 1, bool), 0
     for number, box in enumerate(ndimage.find_objects(label), 1):
         wider = tuple(slice(max(0, s.start - 1), s.stop + 1) for s in box)
         region = label[wider] == number
-        size, opening = np.count_nonzero(region), region & shell[wider]
-        exposed = ndimage.binary_dilation(region) & solid[wider] & (label[wider] == 0)
-        if size < MIN_REGION_CELLS or not exposed.any() or np.count_nonzero(opening) <= min_opening * size ** (2 / 3):
+        if region.sum() < MIN_REGION_CELLS:
             continue
-        soft = (softness[wider][opening] > SOFT).mean()
-        supported[number] = soft >= min_soft and surface_share[wider][exposed].mean() >= min_surface
-    return supported
+        exposed = ndimage.binary_dilation(region) & solid[wider] & ~reached[wider]
+        opening = softness[wider][region & shell[wider]]
+        supported[number] = (
+            exposed.any()
+            and surface_share[wider][exposed].mean() >= MIN_SURFACE_SHARE
+            and (opening > SOFT).sum() >= MIN_SOFT_SHARE * len(opening)
+        )
+        unsupported += not supported[number]
+    return label, supported, unsupported
 
 
 def _grow(carved: NDArray[np.bool_], free_share: Floats, hull: Hull, cameras: Sequence[Camera]) -> NDArray[np.bool_]:
