@@ -40,26 +40,24 @@ def _cell_at(origin: Any, ray: Any, depth: float, cell: float) -> Any:
 
 @nb.njit(parallel=True, error_model="numpy", cache=True)
 def _behind_hard(
-    depth: Any, starts: Any, sizes: Any, intrinsics: Any, poses: Any, centres: Any, field: Any, hard: Any, lower: Any, cell: float,
-    deepest: float, out: Any,
-) -> None:  # fmt: skip
-    """Kernel of `behind_hard_parts`: all depth maps concatenated in `depth`, and the result in `out`."""
+    depth: Any, intrinsics: Any, pose: Any, centre: Any, field: Any, hard: Any, lower: Any, cell: float, deepest: float
+) -> NDArray[np.bool_]:
+    """Kernel of `behind_hard_parts` for one photo; `deepest` is the signed distance from which a depth counts."""
     n = field.shape[0]
-    upper = n * cell
-    for v in nb.prange(starts.shape[0]):
-        p, origin = poses[v], centres[v] - lower
+    origin = centre - lower
+    out = np.zeros(depth.shape, np.bool_)
+    for v in nb.prange(depth.shape[0]):
         ray = np.empty(3)
-        for pixel in range(sizes[v, 0] * sizes[v, 1]):
-            there = depth[starts[v] + pixel]
+        for u in range(depth.shape[1]):
+            there = depth[v, u]
             if not there > 0:
                 continue
-            a = (pixel % sizes[v, 0] + 0.5 - intrinsics[v, 2]) / intrinsics[v, 0]
-            b = (pixel // sizes[v, 0] + 0.5 - intrinsics[v, 3]) / intrinsics[v, 1]
+            a, b = (u + 0.5 - intrinsics[2]) / intrinsics[0], (v + 0.5 - intrinsics[3]) / intrinsics[1]
             first = 0.0
             for axis in range(3):  # the ray per unit of depth, and its depth where it enters the grid
-                ray[axis] = p[0, axis] * a + p[1, axis] * b + p[2, axis]
+                ray[axis] = pose[0, axis] * a + pose[1, axis] * b + pose[2, axis]
                 if abs(ray[axis]) > 1e-9:
-                    first = max(first, min(-origin[axis] / ray[axis], (upper - origin[axis]) / ray[axis]))
+                    first = max(first, min(-origin[axis] / ray[axis], (n * cell - origin[axis]) / ray[axis]))
             i, j, k = _cell_at(origin, ray, there, cell)
             if not (0 <= i < n and 0 <= j < n and 0 <= k < n and field[i, j, k] < deepest):
                 continue
@@ -67,9 +65,10 @@ def _behind_hard(
             while here < there:
                 i, j, k = _cell_at(origin, ray, here, cell)
                 if 0 <= i < n and 0 <= j < n and 0 <= k < n and field[i, j, k] < 0:
-                    out[starts[v] + pixel] = hard[i, j, k]
+                    out[v, u] = hard[i, j, k]
                     break
                 here += step
+    return out
 
 
 def behind_hard_parts(hull: Hull, softness: Floats, cameras: Sequence[Camera], depths: Sequence[Floats]) -> list[NDArray[np.bool_]]:
@@ -78,15 +77,12 @@ def behind_hard_parts(hull: Hull, softness: Floats, cameras: Sequence[Camera], d
 
     `softness` (n, n, n) as from `surface_softness`.
     """
-    if not cameras:
-        return []
-    starts = np.concatenate([[0], np.cumsum([d.size for d in depths])[:-1]]).astype(np.int64)
-    flat = np.concatenate([np.asarray(d, np.float32).ravel() for d in depths])
     hard = ndimage.maximum_filter(softness, 2 * SOFT_BORDER + 1) < SOFT
-    out = np.zeros(len(flat), bool)
     lower, cell = np.asarray(hull.lower, float), float(hull.cell)
-    _behind_hard(flat, starts, *camera_arrays(cameras), hull.field, hard, lower, cell, -MIN_DEPTH * cell, out)
-    return [out[start : start + d.size].reshape(d.shape) for start, d in zip(starts, depths, strict=True)]
+    return [
+        _behind_hard(np.asarray(depth, np.float32), intrinsics, pose, centre, hull.field, hard, lower, cell, -MIN_DEPTH * cell)
+        for depth, intrinsics, pose, centre in zip(depths, *camera_arrays(cameras)[1:], strict=True)
+    ]
 
 
 def without_mirror_images(maps: Sequence[DepthMap], hull: Hull, softness: Floats) -> tuple[list[DepthMap], float]:
