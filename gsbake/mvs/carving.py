@@ -44,12 +44,26 @@ MIN_FREE_SHARE, PRIOR_VOTES, PRIOR_VOTE_SHARE = 0.65, 0.3, 0.2
 #: The same for cells that join a carved region (hysteresis: Canny, *A computational approach to edge detection*, PAMI 1986); cells at most
 #: this far below a hard part of the hull's surface do not join.
 MIN_JOINING_FREE_SHARE, JOINING_PRIOR_VOTES, JOINING_PRIOR_VOTE_SHARE, HARD_DEPTH = 0.75, 0.1, 0.1, 1.5
-#: Carved regions have at least this many cells (fewer are noise), at least this mean share of surface votes on the exposed surface, and are
-#: soft in at least this share of their cells on the hull's surface.
-MIN_REGION_CELLS, MIN_SURFACE_SHARE, MIN_SOFT_SHARE = 8, 0.05, 0.15
+#: Carved regions have at least this many cells; fewer are noise.
+MIN_REGION_CELLS = 8
 #: A cell violates silhouettes when carving leaves this many photos with an empty ray through it (single masks may be wrong). Regions
 #: with more than this share of such cells are rejected: true concavities have up to .03 of them, false ones .1 to .67.
 MIN_EMPTY_RAYS, MAX_EMPTY_SHARE = 2, 0.1
+
+
+@dataclass(frozen=True)
+class RegionLimits:
+    """What a carved region must have: a mean share of `surface` votes on the surface that it exposes, a share of its opening in the hull's
+    surface that is `soft`, and cells in that `opening` as a multiple of its size to the power of 2/3: a bowl has 1.9, what spread below
+    the surface from a leak .7 and less."""
+
+    surface: float
+    soft: float
+    opening: float
+
+
+#: Limits of a region, and of what is left of one that violates silhouettes without its hard cells.
+REGION, REMAINDER = RegionLimits(0.05, 0.15, 0.0), RegionLimits(0.0, 0.6, 1.0)
 
 
 @dataclass(frozen=True)
@@ -153,15 +167,19 @@ def carve_hull(hull: Hull, cameras: Sequence[Camera], depths: Sequence[Floats], 
     if not likely_free.any():
         return CarvedHull(hull, 0.0, 0, 0, 0)
     total = votes + surface + max(PRIOR_VOTES, PRIOR_VOTE_SHARE * float(np.median((votes + surface)[likely_free])))
-    free_share = votes / total
-    label, keep, unsupported = _carvable_regions(solid, free_share, surface / total, softness)
+    free_share, surface_share, hard = votes / total, surface / total, _hard_cells(solid, softness)
+    free = solid & (free_share > MIN_FREE_SHARE)
+    label, keep, unsupported = _carvable_regions(free, solid, surface_share, softness, REGION)
     violating = _violates_silhouettes(label, keep, solid, hull, cameras)
-    keep &= ~violating
-    carved = keep[label]
+    carved, regions = (keep & ~violating)[label], int((keep & ~violating).sum())
+    if violating.any():
+        label, keep, _ = _carvable_regions(free & violating[label] & ~hard, solid, surface_share, softness, REMAINDER)
+        keep &= ~_violates_silhouettes(label, keep, solid, hull, cameras)
+        carved, regions = carved | keep[label], regions + int(keep.sum())
     if carved.any():
         typical = float(np.median((votes + surface)[carved]))
         weaker = votes / (votes + surface + max(JOINING_PRIOR_VOTES, JOINING_PRIOR_VOTE_SHARE * typical))
-        grown = _grow(carved, np.where(_hard_cells(solid, softness), 0, weaker), hull, cameras)
+        grown = _grow(carved, np.where(hard, 0, weaker), hull, cameras)
         free_share, carved = np.where(grown, weaker, free_share), carved | grown
     if not carved.any() or carved[solid].all():  # nothing to carve, or nothing would be left
         return CarvedHull(hull, 0.0, 0, unsupported, int(violating.sum()))
@@ -170,7 +188,7 @@ def carve_hull(hull: Hull, cameras: Sequence[Camera], depths: Sequence[Floats], 
     field = np.maximum(hull.field, edge)
     field[carved] = np.maximum(field[carved], 0.2 * hull.cell)
     remaining = replace(hull, occupancy=field < 0, field=field.astype(np.float32))
-    return CarvedHull(remaining, float(carved.sum() / solid.sum()), int(keep.sum()), unsupported, int(violating.sum()))
+    return CarvedHull(remaining, float(carved.sum() / solid.sum()), regions, unsupported, int(violating.sum()))
 
 
 def _hard_cells(solid: NDArray[np.bool_], softness: Floats) -> NDArray[np.bool_]:
@@ -179,18 +197,16 @@ def _hard_cells(solid: NDArray[np.bool_], softness: Floats) -> NDArray[np.bool_]
 
 
 def _carvable_regions(
-    solid: NDArray[np.bool_], free_share: Floats, surface_share: Floats, softness: Floats
+    free: NDArray[np.bool_], solid: NDArray[np.bool_], surface_share: Floats, softness: Floats, limits: RegionLimits
 ) -> tuple[NDArray[np.int32], NDArray[np.bool_], int]:
-    """Free regions connected to the outside: labels (n, n, n), which labels (k,) have a supported surface and open through a soft part, and
-    how many do not."""
+    """Regions of `free` cells connected to the outside: labels (n, n, n), which labels (k,) keep to the `limits`, and how many do not."""
     outside, shell = ~solid, solid & ~ndimage.binary_erosion(solid)
-    free = solid & (free_share > MIN_FREE_SHARE)
     # A tunnel one cell wide is a leak, not a concavity.
-    free &= ndimage.binary_opening(free | outside, ndimage.generate_binary_structure(3, 1))
+    free = free & ndimage.binary_opening(free | outside, ndimage.generate_binary_structure(3, 1))
     label, _ = ndimage.label(free | outside)
     reached = free & np.isin(label, np.unique(label[outside]))
     label, count = ndimage.label(reached)
-    supported, unsupported = np.zeros(count + 1, bool), 0
+    keep, refused = np.zeros(count + 1, bool), 0
     for number, box in enumerate(ndimage.find_objects(label), 1):
         wider = tuple(slice(max(0, s.start - 1), s.stop + 1) for s in box)
         region = label[wider] == number
@@ -198,13 +214,14 @@ def _carvable_regions(
             continue
         exposed = ndimage.binary_dilation(region) & solid[wider] & ~reached[wider]
         opening = softness[wider][region & shell[wider]]
-        supported[number] = (
+        keep[number] = (
             exposed.any()
-            and surface_share[wider][exposed].mean() >= MIN_SURFACE_SHARE
-            and (opening > SOFT).sum() >= MIN_SOFT_SHARE * len(opening)
+            and surface_share[wider][exposed].mean() >= limits.surface
+            and (opening > SOFT).sum() >= limits.soft * len(opening)
+            and len(opening) >= limits.opening * region.sum() ** (2 / 3)
         )
-        unsupported += not supported[number]
-    return label, supported, unsupported
+        refused += not keep[number]
+    return label, keep, refused
 
 
 def _grow(carved: NDArray[np.bool_], free_share: Floats, hull: Hull, cameras: Sequence[Camera]) -> NDArray[np.bool_]:

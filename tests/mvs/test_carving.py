@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from gsbake.capture.hull.softness import SOFT, surface_softness
 from gsbake.capture.hull.visual_hull import Hull
 from gsbake.geometry.cameras import Camera
-from gsbake.mvs.carving import _grow, carve_hull, count_empty_rays, count_votes
+from gsbake.mvs.carving import REGION, REMAINDER, _carvable_regions, _grow, carve_hull, count_empty_rays, count_votes
 from gsbake.mvs.depth_maps import z_depth
 from gsbake.mvs.mirror_images import SOFT_BORDER
 from tests.mvs.scenes import RADIUS, camera_at, sphere_depth
@@ -159,6 +159,28 @@ def test_mirror_images_around_a_bowl_do_not_spoil_it() -> None:
     # If all could be air, the bowl would be one region with what violates silhouettes.
     opened = carve_hull(hull, cameras, depths, np.full(hull.field.shape, 2 * SOFT, np.float32))
     assert opened.silhouette_violations == 1 and opened.hull is hull
+
+
+def test_what_remains_of_a_region_must_open_widely() -> None:
+    """A pocket behind a narrow hole is as good as a bowl, unless it is what is left of a region that violates silhouettes."""
+    hull = ball()
+    axis = hull.lower[0] + (np.arange(CELLS) + 0.5) * hull.cell
+    cells = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1)
+    solid, none = hull.field < 0, np.zeros(hull.field.shape, np.float32)
+    soft, hard = (np.full(hull.field.shape, k * SOFT, np.float32) for k in (2.0, 0.5))
+    bowl = solid & (np.linalg.norm(cells - BOWL, axis=-1) < HOLLOW)
+    hole = (np.abs(cells[..., 1:]).max(-1) < 1.6 * hull.cell) & (cells[..., 0] > 0.3)
+    pocket = solid & ((np.linalg.norm(cells - (0.15, 0, 0), axis=-1) < 0.35) | hole)
+    for free, remains in ((bowl, True), (pocket, False)):
+        for limits, votes, softness, kept in (
+            (REMAINDER, none, soft, remains),
+            (REMAINDER, none, hard, False),
+            (REGION, none + 1, soft, True),
+            (REGION, none, soft, False),
+            (REGION, none + 1, hard, False),
+        ):
+            label, keep, refused = _carvable_regions(free, solid, votes, softness, limits)
+            assert label.max() == 1 and keep.tolist() == [False, kept] and refused == (not kept)
 
 
 def test_rays_are_empty_without_remaining_cells() -> None:
