@@ -19,7 +19,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
-from skimage.measure import marching_cubes
 
 from benchmarks.truth import Figures, Surface, align, measure, nearest, read_centres, read_truth
 from gsbake.capture.hull.softness import SOFT, surface_softness
@@ -42,13 +41,6 @@ class HullFigures:
     off: NDArray[np.float64]
 
 
-def hull_surface(hull: Hull) -> Surface:
-    """The hull's surface in the unit frame by marching cubes."""
-    solid = np.pad(np.clip(hull.field, -4 * hull.cell, 4 * hull.cell), 1, constant_values=hull.cell)
-    vertices, faces, _, _ = marching_cubes(solid, 0.0)
-    return Surface((vertices.astype(float) - 0.5) * hull.cell + hull.lower, faces.astype(np.int64))
-
-
 def measure_hulls(run: Path, capture: Path) -> HullFigures:
     """Figures of a run. Raises UsageError when a stage is not finished or has no hull."""
     store = Store(run)
@@ -66,7 +58,7 @@ def measure_folders(poses: Path, stereo: Path, capture: Path) -> HullFigures:
     hull, carved = visual_hull(posed), Hull.load(stereo / "hull.npz")
     frame = posed.cameras.to_world
     if posed.cameras.poses != "given":
-        frame = frame.then(align(hull_surface(carved).moved(frame), read_centres(poses / "cameras.json"), truth))
+        frame = frame.then(align(Surface(*carved.triangles()).moved(frame), read_centres(poses / "cameras.json"), truth))
     cells = np.argwhere(hull.occupancy & ~ndimage.binary_erosion(hull.occupancy))
     softness = surface_softness(hull, *read_masks(posed))[tuple(cells.T)]
     distance = nearest(frame.apply(hull.lower + (cells + 0.5) * hull.cell), truth.surface, 0)[0]
@@ -74,8 +66,8 @@ def measure_folders(poses: Path, stereo: Path, capture: Path) -> HullFigures:
     bins = np.digitize(softness, SOFTNESS) - 1
     count = np.bincount(bins, minlength=len(SOFTNESS) - 1)
     return HullFigures(
-        measure(hull_surface(hull).moved(frame), truth),
-        measure(hull_surface(carved).moved(frame), truth),
+        measure(Surface(*hull.triangles()).moved(frame), truth),
+        measure(Surface(*carved.triangles()).moved(frame), truth),
         count / count.sum(),
         np.bincount(bins, off, len(SOFTNESS) - 1) / np.maximum(count, 1),
     )

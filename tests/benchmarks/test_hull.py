@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from benchmarks.hull import hull_surface, main, measure_folders, measure_hulls, tables
+from benchmarks.hull import main, measure_folders, measure_hulls, tables
+from benchmarks.truth import Surface
 from gsbake.capture.hull.visual_hull import Hull
 from gsbake.errors import UsageError
 from gsbake.geometry.cameras import CameraSet
@@ -26,7 +27,7 @@ def ball(radius: float, cells: int = 96) -> Hull:
 
 
 def test_the_surface_of_a_hull_faces_outwards() -> None:
-    surface = hull_surface(ball(RADIUS))
+    surface = Surface(*ball(RADIUS).triangles())
     points, faces = surface.sample(500, 0)
     assert np.linalg.norm(points, axis=1) == pytest.approx(RADIUS, abs=0.003)
     assert (surface.normals(faces) * points).sum(1).min() > 0.9 * RADIUS

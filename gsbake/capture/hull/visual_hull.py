@@ -218,18 +218,23 @@ class Hull:
         length = np.linalg.norm(out, axis=1, keepdims=True)
         return np.where(length > 1e-12, out / np.maximum(length, 1e-12), [0.0, 0.0, 1.0])
 
-    def surface_points(self, count: int, seed: int) -> tuple[Array, Array]:
-        """`count` points (k, 3) spread evenly by area over the hull's surface, and outward unit normals (k, 3).
-
-        Raises ValueError for an empty hull.
-        """
+    def triangles(self) -> tuple[Array, NDArray[np.int64]]:
+        """Vertices (v, 3) and outward faces (f, 3) of the surface by marching cubes. Raises ValueError for an empty hull."""
         if self.empty:
             raise ValueError("the visual hull is empty")
         from skimage.measure import marching_cubes
 
         solid = np.pad(np.clip(self.field, -4 * self.cell, 4 * self.cell), 1, constant_values=self.cell)  # closed at the grid's edge
-        verts, faces, _, _ = marching_cubes(solid, 0.0)
-        corners = (verts[faces].astype(float) - 0.5) * self.cell + self.lower
+        vertices, faces, _, _ = marching_cubes(solid, 0.0)
+        return (vertices.astype(float) - 0.5) * self.cell + self.lower, faces.astype(np.int64)
+
+    def surface_points(self, count: int, seed: int) -> tuple[Array, Array]:
+        """`count` points (k, 3) spread evenly by area over the hull's surface, and outward unit normals (k, 3).
+
+        Raises ValueError for an empty hull.
+        """
+        vertices, faces = self.triangles()
+        corners = vertices[faces]
         cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         area = np.linalg.norm(cross, axis=1)
         rng = np.random.default_rng(seed)
