@@ -22,7 +22,7 @@ from scipy import ndimage
 
 from benchmarks.truth import Figures, Surface, align, measure, nearest, read_centres, read_truth
 from gsbake.capture.hull.softness import SOFT, surface_softness
-from gsbake.capture.hull.visual_hull import Hull, read_masks, visual_hull
+from gsbake.capture.hull.visual_hull import Hull, read_masks, unit_hull
 from gsbake.capture.posed_photos import PosedPhotos
 from gsbake.errors import GsbakeError, UsageError
 from gsbake.pipeline.store import Store
@@ -55,19 +55,20 @@ def measure_folders(poses: Path, stereo: Path, capture: Path) -> HullFigures:
     if not (stereo / "hull.npz").exists():
         raise UsageError(f"{stereo} has no visual hull: not all photos have masks.")
     posed, truth = PosedPhotos.open(poses), read_truth(capture)
-    hull, carved = visual_hull(posed), Hull.load(stereo / "hull.npz")
-    frame = posed.cameras.to_world
+    masks = read_masks(posed)
+    hull, frame = unit_hull(*masks), posed.cameras.to_world
+    carved = Surface(*Hull.load(stereo / "hull.npz").triangles())
     if posed.cameras.poses != "given":
-        frame = frame.then(align(Surface(*carved.triangles()).moved(frame), read_centres(poses / "cameras.json"), truth))
+        frame = frame.then(align(carved.moved(frame), read_centres(poses / "cameras.json"), truth))
     cells = np.argwhere(hull.occupancy & ~ndimage.binary_erosion(hull.occupancy))
-    softness = surface_softness(hull, *read_masks(posed))[tuple(cells.T)]
+    softness = surface_softness(hull, *masks)[tuple(cells.T)]
     distance = nearest(frame.apply(hull.lower + (cells + 0.5) * hull.cell), truth.surface, 0)[0]
     off = distance > OFF * hull.cell * frame.scale
     bins = np.digitize(softness, SOFTNESS) - 1
     count = np.bincount(bins, minlength=len(SOFTNESS) - 1)
     return HullFigures(
         measure(Surface(*hull.triangles()).moved(frame), truth),
-        measure(Surface(*carved.triangles()).moved(frame), truth),
+        measure(carved.moved(frame), truth),
         count / count.sum(),
         np.bincount(bins, off, len(SOFTNESS) - 1) / np.maximum(count, 1),
     )

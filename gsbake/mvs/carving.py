@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from gsbake.capture.hull.rays import camera_arrays, half_steps_inside, project_point
+from gsbake.capture.hull.rays import camera_arrays, concatenate_images, half_steps_inside, project_point
 from gsbake.capture.hull.softness import SOFT
 from gsbake.capture.hull.visual_hull import Hull
 from gsbake.geometry.cameras import Camera
@@ -136,19 +136,9 @@ def count_votes(hull: Hull, cameras: Sequence[Camera], depths: Sequence[Floats])
     free, surface = np.zeros(hull.field.shape, np.float32), np.zeros(hull.field.shape, np.float32)
     if not cameras:
         return free, surface
-    sizes, intrinsics, poses, _ = camera_arrays(cameras)
+    lower, cell = np.asarray(hull.lower, float), float(hull.cell)
     _count_votes(
-        hull.field,
-        np.asarray(hull.lower, float),
-        float(hull.cell),
-        SURFACE_BAND * float(hull.cell),
-        np.concatenate([np.asarray(d, np.float32).ravel() for d in depths]),
-        np.concatenate([[0], np.cumsum([d.size for d in depths])[:-1]]).astype(np.int64),
-        sizes,
-        intrinsics,
-        poses,
-        free,
-        surface,
+        hull.field, lower, cell, SURFACE_BAND * cell, *concatenate_images(depths), *camera_arrays(cameras)[:3], free, surface
     )
     return free, surface
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from gsbake.capture.hull.softness import SOFT, surface_softness
 from gsbake.capture.hull.thin_parts import find_thin_parts
-from gsbake.capture.hull.visual_hull import Hull, read_masks, visual_hull
+from gsbake.capture.hull.visual_hull import Hull, read_masks, unit_hull
 from gsbake.capture.posed_photos import PosedPhotos
 from gsbake.config.schema import Stereo
 from gsbake.monitor import SILENT, Monitor
@@ -58,7 +58,7 @@ def run_stereo(
         monitor.progress(min(done, len(posed)), len(posed), text)
 
     with single_threaded_opencv():
-        hull = _hull(posed, monitor)
+        hull, softness = _hull(posed, monitor)
         run = StereoRun(posed, options, hull, seed, threads, scratch / "planes", report)
         with monitor.part("photos"):
             run.prepare()
@@ -66,10 +66,8 @@ def run_stereo(
             run.match()
         with monitor.part("consistency"):
             maps = run.filter_depths()
-        softness = None
-        if hull is not None:
+        if hull is not None and softness is not None:
             with monitor.part("mirror images"):
-                softness = surface_softness(hull, *read_masks(posed))
                 maps = _without_mirror_images(maps, hull, softness, monitor)
         with monitor.part("fusion"):
             cloud, maps = _fuse(run, maps, hull, monitor)
@@ -94,16 +92,17 @@ def _skip_reason(posed: PosedPhotos, options: Stereo) -> str | None:
     return None
 
 
-def _hull(posed: PosedPhotos, monitor: Monitor) -> Hull | None:
-    """The visual hull, which bounds the depths; None where a photo has no mask or the hull is empty."""
-    hull = None
+def _hull(posed: PosedPhotos, monitor: Monitor) -> tuple[Hull | None, NDArray[np.float32] | None]:
+    """The visual hull, which bounds the depths, and the softness of its surface; None where a photo has no mask or the hull is empty."""
+    hull, softness = None, None
     if posed.has_masks:
         with monitor.part("hull"):
-            hull = visual_hull(posed)
-        hull = None if hull.empty else hull
+            masks = read_masks(posed)
+            hull = unit_hull(*masks)
+            hull, softness = (None, None) if hull.empty else (hull, surface_softness(hull, *masks))
     bounds = "visual hull" if hull is not None else "unit sphere"
     monitor.decide("depth bounds", bounds, "all photos have masks" if hull is not None else "not all photos have masks")
-    return hull
+    return hull, softness
 
 
 def _without_mirror_images(maps: list[DepthMap], hull: Hull, softness: NDArray[np.float32], monitor: Monitor) -> list[DepthMap]:

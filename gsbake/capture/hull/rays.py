@@ -1,4 +1,4 @@
-"""Rays of photos through the hull's grid: projection of points inside compiled kernels, and cameras as the arrays that these take."""
+"""Rays of photos through the hull's grid: projection of points inside compiled kernels, and cameras and images as arrays for these."""
 
 from __future__ import annotations
 
@@ -44,7 +44,13 @@ def half_steps_inside(solid: Any, i: float, j: float, k: float, dx: float, dy: f
 
 def camera_arrays(cameras: Sequence[Camera]) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Sizes (v, 2) as width, height, intrinsics (v, 4) as fx, fy, cx, cy, poses (v, 3, 4), world → camera, and centres (v, 3)."""
-    sizes = np.array([(c.width, c.height) for c in cameras], np.int64)
-    intrinsics = np.array([(c.fx, c.fy, c.cx, c.cy) for c in cameras], float)
-    poses = np.array([np.concatenate([c.R, c.t[:, None]], 1) for c in cameras], float)
-    return sizes, intrinsics, poses, np.array([c.centre for c in cameras], float)
+    sizes = np.array([(c.width, c.height) for c in cameras], np.int64).reshape(-1, 2)
+    intrinsics = np.array([(c.fx, c.fy, c.cx, c.cy) for c in cameras], float).reshape(-1, 4)
+    poses = np.array([np.concatenate([c.R, c.t[:, None]], 1) for c in cameras], float).reshape(-1, 3, 4)
+    return sizes, intrinsics, poses, np.array([c.centre for c in cameras], float).reshape(-1, 3)
+
+
+def concatenate_images(images: Sequence[NDArray[np.float32]]) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+    """The pixels of all images (h, w) one after the other, and where each image starts (v,)."""
+    starts = np.concatenate([[0], np.cumsum([image.size for image in images])[:-1]]).astype(np.int64)
+    return np.concatenate([np.asarray(image, np.float32).ravel() for image in images]), starts

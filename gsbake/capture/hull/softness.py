@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from gsbake.capture.hull.rays import camera_arrays, half_steps_inside, project_point
+from gsbake.capture.hull.rays import camera_arrays, concatenate_images, half_steps_inside, project_point
 from gsbake.capture.hull.visual_hull import MAX_INCONSISTENT_SHARE, Hull, silhouette_distance
 from gsbake.capture.photos.decode import Bytes
 from gsbake.geometry.cameras import Camera
@@ -63,12 +63,10 @@ def shortest_chords(cells: NDArray[np.int64], hull: Hull, cameras: Sequence[Came
     `cameras` are pinholes of the masks' sizes. As many photos as the hull lets be wrong are passed over. At most LONGEST_CHORD, which cells
     without such a ray have too.
     """
-    fields = [silhouette_distance(mask) for mask in masks]
-    starts = np.concatenate([[0], np.cumsum([f.size for f in fields])[:-1]]).astype(np.int64)
-    ranks = 1 + int(MAX_INCONSISTENT_SHARE * len(fields) + 0.5)
+    ranks = 1 + int(MAX_INCONSISTENT_SHARE * len(masks) + 0.5)
     return np.asarray(_shortest_chords(
-        cells, hull.field < 0, np.asarray(hull.lower, float), float(hull.cell), np.concatenate([f.ravel() for f in fields]), starts,
-        *camera_arrays(cameras), ranks, EDGE_BAND, LONGEST_CHORD,
+        cells, hull.field < 0, np.asarray(hull.lower, float), float(hull.cell),
+        *concatenate_images([silhouette_distance(mask) for mask in masks]), *camera_arrays(cameras), ranks, EDGE_BAND, LONGEST_CHORD,
     ))  # fmt: skip
 
 

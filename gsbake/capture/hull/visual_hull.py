@@ -17,6 +17,7 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from gsbake.capture.hull.rays import camera_arrays, concatenate_images
 from gsbake.capture.photos.decode import Bytes
 from gsbake.geometry.cameras import Array, Camera
 from gsbake.imaging.distance import distance_to_zero
@@ -120,14 +121,12 @@ def carve(
     """
     fields = [silhouette_distance(m) for m in masks]
     sizes = np.array([f.shape for f in fields], np.int64).reshape(-1, 2)
-    starts = np.concatenate([[0], np.cumsum(sizes.prod(1))[:-1]]).astype(np.int64)
-    intrinsics = np.array([(c.fx, c.fy, c.cx, c.cy) for c in cameras], float).reshape(-1, 4)
-    poses = np.array([np.concatenate([c.R, c.t[:, None]], 1) for c in cameras], float).reshape(-1, 3, 4)
+    flat, starts = concatenate_images(fields)
+    _, intrinsics, poses, _ = camera_arrays(cameras)
     # A low-discrepancy order of the views: empty cells are excluded after a few.
     order = np.argsort(np.arange(len(fields)) * 0.6180339887498949 % 1.0)
     cell = 2.0 * radius / resolution
     min_visible = max(2, int(np.ceil(MIN_VISIBLE_SHARE * len(fields))))
-    flat = np.concatenate([f.ravel() for f in fields])
     wide = max_inconsistent_share > MAX_INCONSISTENT_SHARE
     ranked = max(_MAX_RANKED, int(max_inconsistent_share * len(fields) + 0.5) + 1) if wide else _MAX_RANKED
     return _carve(
@@ -264,5 +263,9 @@ def visual_hull(posed: PosedPhotos, resolution: int = 128, max_size: int = 512) 
 
     Raises ValueError when a photo has no mask.
     """
-    cameras, masks = read_masks(posed, max_size)
+    return unit_hull(*read_masks(posed, max_size), resolution)
+
+
+def unit_hull(cameras: Sequence[Camera], masks: Sequence[Bytes], resolution: int = 128) -> Hull:
+    """Visual hull of masks that are read, on the cube [-1, 1]³ of the unit frame; `cameras` are pinholes of the masks' sizes."""
     return Hull.from_masks(cameras, masks, np.zeros(3), 1.0, resolution)
