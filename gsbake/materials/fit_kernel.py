@@ -21,7 +21,6 @@ from numba import njit, prange
 from gsbake.materials.reflection_kernel import reflected_radiance, specular_visibility
 from gsbake.shading.split_sum_kernel import (
     _CLAMP_TERM,
-    _F0,
     _FLAGS,
     CHUNKS,
     MIN_SQUARED_LENGTH,
@@ -45,11 +44,11 @@ _POWER = np.float32(1 / 2.4)
 
 #: Columns of a texel's parameters: base colour (3), roughness, metallic, normal offset (3).
 PARAMETERS = 8
-#: Columns of a pixel's shading parameters: diffuse albedo (3), F0 (3), roughness, normal offset (3).
-SHADING = 10
+#: Columns of a pixel's shading parameters: diffuse albedo (3), base colour times metallic (3), roughness, normal offset (3), metallic.
+SHADING = 11
 #: Columns of a texel's light transport: visibility, ambient occlusion, indirect irradiance / π (3), emission (3), and for reflections of it
-#: diffuse radiosity / π (3), F0 (3), roughness, unit normal (3).
-TRANSPORT = 18
+#: diffuse radiosity / π (3), base colour times metallic (3), roughness, unit normal (3), metallic.
+TRANSPORT = 19
 
 
 @njit(inline="always", **_FLAGS)
@@ -99,9 +98,10 @@ def shade_and_differentiate(
                     w_metal = w * values[t, 4]
                     for c in range(3):
                         shading[c] += (w - w_metal) * values[t, c]
-                        shading[3 + c] += (w - w_metal) * _F0 + w_metal * values[t, c]
+                        shading[3 + c] += w_metal * values[t, c]
                         shading[7 + c] += w * values[t, 5 + c]
                     shading[6] += w * values[t, 3]
+                    shading[10] += w_metal
                     for c in range(8):
                         local[c] += w * transport[t, c]
             rough = shading[6]
@@ -127,7 +127,9 @@ def shade_and_differentiate(
             share = _table_value(lut, row, col, fx, fy, 2)
             lobe_rough = _table_value(lut, row, col, fx, fy, 3)
             mirror = _table_value(lut, row, col, fx, fy, 4)
-            transmitted = _1 - _F0 * scale - bias
+            dielectric = _table_value(lut, row, col, fx, fy, 5)
+            transmitted = _1 - dielectric
+            metal = shading[10]
             coeff = _1 + mirror * (_2 * c - _1)
             rx = coeff * nx - mirror * vx
             ry = coeff * ny - mirror * vy
@@ -138,7 +140,7 @@ def shade_and_differentiate(
             base1, stride1, fx1, fy1 = _taps(u, v, sizes[level + 1], offsets[level + 1])
             u, v = _encode(nx, ny, nz)
             base2, stride2, fx2, fy2 = _taps(u, v, sizes[last], offsets[last])
-            visible_s, incident, hit = specular_visibility(soft, rough, occlusion, reflected, i)
+            visible_s, blocked, incident, hit = specular_visibility(soft, rough, occlusion, reflected, i)
             bounced[:] = _0
             if incident > _0:
                 two = _2 * c
@@ -147,22 +149,23 @@ def shade_and_differentiate(
 
             # Shade, compare, differentiate; one channel at a time.
             w = weight[i]
-            g_u = g_v = g_un = g_vn = g_t = g_scale = g_bias = g_share = _0
+            g_u = g_v = g_un = g_vn = g_t = g_scale = g_bias = g_share = g_metal = g_dielectric = _0
             half0 = _HALF * np.float32(sizes[level])
             half1 = _HALF * np.float32(sizes[level + 1])
             squares = _0
             loss = _0
             for ch in range(3):
                 albedo = shading[ch]
-                f0 = shading[3 + ch]
+                metal_colour = shading[3 + ch]
                 lower = _bilinear(table, base0, stride0, fx0, fy0, ch)
                 upper = _bilinear(table, base1, stride1, fx1, fy1, ch)
                 irradiance = _bilinear(table, base2, stride2, fx2, fy2, ch)
                 narrow = lower + t_level * (upper - lower)
-                light = narrow + share * (irradiance - narrow)
-                reflectance = f0 * scale + bias
                 diffuse = visible * irradiance + local[2 + ch]
-                linear = albedo * transmitted * diffuse + (visible_s * light + incident * bounced[ch]) * reflectance + local[5 + ch]
+                near = visible_s * narrow + incident * bounced[ch] + blocked * local[2 + ch]
+                light = near + share * (diffuse - near)
+                reflectance = metal_colour * scale + metal * bias + (_1 - metal) * dielectric
+                linear = albedo * transmitted * diffuse + light * reflectance + local[5 + ch]
                 encoded, slope = srgb_and_slope(min(max(linear, _0), _1))
                 error = encoded - colour[i, ch]
                 squares += error * error
@@ -171,14 +174,15 @@ def shade_and_differentiate(
                 g = _0
                 if _0 <= linear <= _1:
                     g = third * w * error / length * slope
-                g_s = g * visible_s
                 gradient[i, ch] = g * transmitted * diffuse
-                gradient[i, 3 + ch] = (g_s * light + g * incident * bounced[ch]) * scale
-                g_scale += g_s * light * f0 - _F0 * g * albedo * diffuse
-                g_bias += g_s * light - g * albedo * diffuse
-                g_light = g_s * reflectance
-                g_share += g_light * (irradiance - narrow)
-                g_narrow = g_light * (_1 - share)
+                gradient[i, 3 + ch] = g * light * scale
+                g_metal += g * light * (bias - dielectric)
+                g_scale += g * light * metal_colour
+                g_bias += g * light * metal
+                g_dielectric += g * (light * (_1 - metal) - albedo * diffuse)
+                g_light = g * reflectance
+                g_share += g_light * (diffuse - near)
+                g_narrow = g_light * (_1 - share) * visible_s
                 g_t += g_narrow * (upper - lower)
                 du, dv = _bilinear_backward(table, table_grad, base0, stride0, fx0, fy0, ch, g_narrow * (_1 - t_level))
                 g_u += du * half0
@@ -186,7 +190,7 @@ def shade_and_differentiate(
                 du, dv = _bilinear_backward(table, table_grad, base1, stride1, fx1, fy1, ch, g_narrow * t_level)
                 g_u += du * half1
                 g_v += dv * half1
-                g_irradiance = g * visible * albedo * transmitted + g_light * share
+                g_irradiance = visible * (g * albedo * transmitted + g_light * share)
                 du, dv = _bilinear_backward(table, table_grad, base2, stride2, fx2, fy2, ch, g_irradiance)
                 g_un += du * half2
                 g_vn += dv * half2
@@ -200,7 +204,7 @@ def shade_and_differentiate(
             # Split-sum table: derivatives along √(n·v) and roughness. Visibility and reflected radiance count as constants.
             g_rough = g_t / (knots[level + 1] - knots[level])
             d_root = d_row = _0
-            for k, g in ((0, g_scale), (1, g_bias), (2, g_share), (3, g_rough), (4, g_mirror)):
+            for k, g in ((0, g_scale), (1, g_bias), (2, g_share), (3, g_rough), (4, g_mirror), (5, g_dielectric)):
                 along_root, along_row = _table_slopes(lut, row, col, fx, fy, k)
                 d_root += g * along_root
                 d_row += g * along_row
@@ -215,6 +219,7 @@ def shade_and_differentiate(
             gradient[i, 7] = keep * (hx - radial * nx)
             gradient[i, 8] = keep * (hy - radial * ny)
             gradient[i, 9] = keep * (hz - radial * nz)
+            gradient[i, 10] = g_metal
         sums[chunk, 0] += loss_sum / 3
         sums[chunk, 1] += square_sum / 3
         sums[chunk, 2] += weight_sum
@@ -224,12 +229,12 @@ def shade_and_differentiate(
 def gather_gradient(touched: Any, start: Any, pixel: Any, share: Any, gradient: Any, values: Any, out: Any) -> None:
     """Set rows `touched` (m,) of `out` (texels, PARAMETERS) to the gradient of the texels' parameters `values` (texels, PARAMETERS).
 
-    It is the sum of `share` (e,) times `gradient` (n, SHADING) of `pixel` (e,), by the chain rule through diffuse albedo and F0. The
+    It is the sum of `share` (e,) times `gradient` (n, SHADING) of `pixel` (e,), by the chain rule through diffuse and metallic albedo. The
     entries of the texel touched[j] are start[j] … start[j + 1].
     """
     for j in prange(touched.shape[0]):
         t = np.uint64(touched[j])
-        a0 = a1 = a2 = f0 = f1 = f2 = rough = x = y = z = _0
+        a0 = a1 = a2 = f0 = f1 = f2 = rough = x = y = z = m = _0
         for e in range(start[j], start[j + 1]):
             p = np.uint64(pixel[e])
             w = share[e]
@@ -243,13 +248,14 @@ def gather_gradient(touched: Any, start: Any, pixel: Any, share: Any, gradient: 
             x += w * gradient[p, 7]
             y += w * gradient[p, 8]
             z += w * gradient[p, 9]
+            m += w * gradient[p, 10]
         metal = values[t, 4]
         out[t, 0] = (_1 - metal) * a0 + metal * f0
         out[t, 1] = (_1 - metal) * a1 + metal * f1
         out[t, 2] = (_1 - metal) * a2 + metal * f2
         out[t, 3] = rough
         b0, b1, b2 = values[t, 0], values[t, 1], values[t, 2]
-        out[t, 4] = (b0 - _F0) * f0 + (b1 - _F0) * f1 + (b2 - _F0) * f2 - b0 * a0 - b1 * a1 - b2 * a2
+        out[t, 4] = m + b0 * (f0 - a0) + b1 * (f1 - a1) + b2 * (f2 - a2)
         out[t, 5] = x
         out[t, 6] = y
         out[t, 7] = z
@@ -312,11 +318,11 @@ def adam_step(
 @njit(parallel=True, **_FLAGS)
 def linear_shading(
     texel: Any, normal: Any, view: Any, reflected: Any, local: Any, transport: Any, rough: Any, table: Any, knots: Any, sizes: Any,
-    offsets: Any, lut: Any, diffuse: Any, scaled: Any, constant: Any,
+    offsets: Any, lut: Any, diffuse: Any, specular: Any, scaled: Any, edge: Any, constant: Any,
 ) -> None:  # fmt: skip
     """Shading of n pixels as a linear function of base colour b.
 
-    A dielectric shows b · `diffuse` + .04 · `scaled` + `constant`, a metal b · `scaled` + `constant`; (n, 3) each. `texel` (n,) is the
+    A dielectric shows b · `diffuse` + `specular` + `constant`, a metal b · `scaled` + `edge` + `constant`; (n, 3) each. `texel` (n,) is the
     texel whose roughness `rough` (texels,) counts; `local` (n, 8) the light transport of pixels, `transport` (texels, TRANSPORT) that of
     the texels that they reflect.
     """
@@ -333,7 +339,8 @@ def linear_shading(
         bias = _table_value(lut, row, col, fx, fy, 1)
         share = _table_value(lut, row, col, fx, fy, 2)
         mirror = _table_value(lut, row, col, fx, fy, 4)
-        transmitted = _1 - _F0 * scale - bias
+        dielectric = _table_value(lut, row, col, fx, fy, 5)
+        transmitted = _1 - dielectric
         coeff = _1 + mirror * (_2 * c - _1)
         u, v = _encode(coeff * nx - mirror * vx, coeff * ny - mirror * vy, coeff * nz - mirror * vz)
         level, t = _roughness_level(_table_value(lut, row, col, fx, fy, 3), knots)
@@ -341,7 +348,7 @@ def linear_shading(
         base1, stride1, fx1, fy1 = _taps(u, v, sizes[level + 1], offsets[level + 1])
         u, v = _encode(nx, ny, nz)
         base2, stride2, fx2, fy2 = _taps(u, v, sizes[last], offsets[last])
-        visible_s, incident, hit = specular_visibility(soft, roughness, local[i, 1], reflected, i)
+        visible_s, blocked, incident, hit = specular_visibility(soft, roughness, local[i, 1], reflected, i)
         bounced = np.zeros(3, np.float32)
         if incident > _0:
             two = _2 * c
@@ -352,10 +359,14 @@ def linear_shading(
             upper = _bilinear(table, base1, stride1, fx1, fy1, ch)
             irradiance = _bilinear(table, base2, stride2, fx2, fy2, ch)
             narrow = lower + t * (upper - lower)
-            light = visible_s * (narrow + share * (irradiance - narrow)) + incident * bounced[ch]
-            diffuse[i, ch] = transmitted * (local[i, 0] * irradiance + local[i, 2 + ch])
+            wide = local[i, 0] * irradiance + local[i, 2 + ch]
+            near = visible_s * narrow + incident * bounced[ch] + blocked * local[i, 2 + ch]
+            light = near + share * (wide - near)
+            diffuse[i, ch] = transmitted * wide
+            specular[i, ch] = light * dielectric
             scaled[i, ch] = light * scale
-            constant[i, ch] = light * bias + local[i, 5 + ch]
+            edge[i, ch] = light * bias
+            constant[i, ch] = local[i, 5 + ch]
 
 
 @njit(parallel=True, **_FLAGS)

@@ -26,8 +26,9 @@ from gsbake.materials.options import FitOptions, Priors
 from gsbake.materials.photo_batch import (
     DIFFUSE,
     EMISSION,
-    F0,
     INDIRECT,
+    METAL_COLOUR,
+    METALLIC,
     NORMAL,
     ROUGHNESS,
     VISIBILITY,
@@ -145,15 +146,15 @@ class FitModel:
         visible = transport.visible_share(self._mean_radiance())
         self._transport[:, VISIBILITY] = visible
         if self._surface.indirect:
-            # Albedo of both lobes together, (1 − m) base colour + F0: indirect light is not sharp enough to depend on roughness.
+            # Albedo of both lobes together, base colour and of dielectrics F0: indirect light is not sharp enough to depend on roughness.
             reflectance = self._values[:, :3] + np.float32(0.04) * (1 - self._values[:, 4:5])
             lit = self._irradiance() * visible[:, None]
             indirect = transport.indirect_irradiance(lit, reflectance)
             self._transport[:, INDIRECT] = indirect
             metal = self._values[:, 4:5] * self._values[:, :3]
             self._transport[:, DIFFUSE] = (self._values[:, :3] - metal) * (lit + indirect)
-            self._transport[:, F0] = metal + np.float32(0.04) * (1 - self._values[:, 4:5])
-            self._transport[:, ROUGHNESS] = self._values[:, 3]
+            self._transport[:, METAL_COLOUR] = metal
+            self._transport[:, ROUGHNESS], self._transport[:, METALLIC] = self._values[:, 3], self._values[:, 4]
 
     def _mean_radiance(self) -> Floats:
         """The environment map (6, size, size, 3) in the object's frame, the mean over photos where the light moves."""

@@ -1,8 +1,9 @@
 """Reference implementation of a step of the material fit in PyTorch: shading and loss of one photo's pixels, and the priors.
 
 The split sum (`shading.split_sum`) with the light transport of each texel: visibility of the present light, indirect light and emission.
-Where a pixel's reflected ray was traced and meets the object, the radiance of the texel that it hits replaces the environment: its diffuse
-radiosity, its emission, and the environment that it reflects itself.
+The cosine lobe of specular reflection sees what the diffuse term does. Of the prefiltered lobe, what ambient occlusion blocks has the mean
+radiance of what blocks it, which indirect light tells; where a pixel's reflected ray was traced and meets the object, the radiance of the
+texel that it hits replaces the environment: its diffuse radiosity, its emission, and the environment that it reflects itself.
 `fit_kernel` computes the same with its gradient.
 """
 
@@ -14,26 +15,36 @@ import torch
 from torch import Tensor
 
 from gsbake.imaging.srgb_torch import linear_to_srgb
-from gsbake.materials.photo_batch import DIFFUSE, EMISSION, F0, INDIRECT, LOCAL, NORMAL, OCCLUSION, ROUGHNESS, VISIBILITY
+from gsbake.materials.photo_batch import (
+    DIFFUSE,
+    EMISSION,
+    INDIRECT,
+    LOCAL,
+    METAL_COLOUR,
+    METALLIC,
+    NORMAL,
+    OCCLUSION,
+    ROUGHNESS,
+    VISIBILITY,
+)
 from gsbake.materials.pixels import Pixels
 from gsbake.materials.reflection_kernel import MIN_BLOCKED
 from gsbake.shading import brdf
 from gsbake.shading.light_tables import LightTables
 from gsbake.shading.split_sum import (
-    mirror_reflection,
-    shade,
+    mirror_weight,
+    prefiltered_light,
     soft_cosine,
     specular_light,
     specular_occlusion,
-    traced_specular_visibility,
-    transmitted_share,
+    unit,
 )
 
 
 @dataclass(frozen=True)
 class PixelTransport:
     """Light transport at n pixels: `local` (n, 8), the columns up to `EMISSION`; where reflections were traced, which are `blocked` (n,)
-    by the object, the `rows` (k,) of these and the transport `met` (k, 18) of the texels that their reflected rays meet."""
+    by the object, the `rows` (k,) of these and the transport `met` (k, TRANSPORT) of the texels that their reflected rays meet."""
 
     local: Tensor
     blocked: Tensor | None
@@ -62,27 +73,44 @@ class Batch:
         return cls(texel, bilinear, view, colour, weight, _interpolate(normal, texel, bilinear), reflected)
 
     def shade(self, values: Tensor, normal_offset: Tensor, tables: LightTables, transport: Tensor) -> Tensor:
-        """Linear colours (n, 3) of the pixels for texels with material `values` (texels, 5) and light `transport` (texels, 18)."""
+        """Linear colours (n, 3) of the pixels for texels with material `values` (texels, 5) and light `transport` (texels, TRANSPORT)."""
         metal = values[:, 4:]
-        parameters = torch.cat([(1 - metal) * values[:, :3], 0.04 * (1 - metal) + metal * values[:, :3], values[:, 3:4]], 1)
+        parameters = torch.cat([(1 - metal) * values[:, :3], metal * values[:, :3], values[:, 3:]], 1)
         g = _interpolate(parameters, self.texel, self.bilinear)
-        albedo, f0, roughness = g[:, :3], g[:, 3:6], g[:, 6]
-        black, zero = torch.zeros_like(albedo), torch.zeros_like(roughness)
+        albedo, metal_colour, roughness, metallic = g[:, :3], g[:, 3:6], g[:, 6], g[:, 7:]
+        surface, at = unit(self._normals(normal_offset)), self._transport(transport)
+        split = brdf.split_sum(soft_cosine((surface * self.view).sum(1)), roughness)
+        scale, bias, dielectric = split.scale[:, None], split.bias[:, None], split.dielectric[:, None]
+        diffuse = at.local[:, VISIBILITY, None] * tables.diffuse(surface) + at.local[:, INDIRECT]
+        near = self._near_light(surface, roughness.detach(), split, tables, at)
+        light = near + split.share[:, None] * (diffuse - near)
+        reflectance = metal_colour * scale + metallic * bias + (1 - metallic) * dielectric
+        return albedo * (1 - dielectric) * diffuse + light * reflectance + at.local[:, EMISSION]
 
-        def shaded(base: Tensor, metallic: Tensor) -> Tensor:
-            return self._shade(self._normals(normal_offset), base, roughness, metallic, tables, self._transport(transport))
-
-        # Shading is linear in diffuse albedo and F0: three materials give its coefficients.
-        dielectric = shaded(black, zero)
-        specular = (shaded(black + 1, zero + 1) - dielectric) / 0.96
-        return dielectric + albedo * (shaded(black + 1, zero) - dielectric) + (f0 - 0.04) * specular
+    def _near_light(
+        self, surface: Tensor, roughness: Tensor, split: brdf.SplitSum, tables: LightTables, transport: PixelTransport
+    ) -> Tensor:
+        """Light (n, 3) in the prefiltered lobe of unit normals: environment, object around, and what traced rays meet. Gradients go through
+        the environment alone."""
+        occlusion = transport.local[:, OCCLUSION]
+        ambient = specular_occlusion(surface, self.view, roughness, occlusion)
+        around = ((1 - ambient) / (1 - occlusion).clamp_min(MIN_BLOCKED))[:, None] * transport.local[:, INDIRECT]
+        environment = prefiltered_light(surface, self.view, split, tables)
+        if transport.blocked is None or transport.rows is None or transport.met is None:
+            return ambient[:, None] * environment + around
+        mirror = mirror_weight(roughness)[:, None]
+        at, facing = transport.rows, surface.detach()[transport.rows]
+        ray = 2 * (facing * self.view[at]).sum(1, keepdim=True) * facing - self.view[at]
+        met = torch.zeros_like(around).index_copy(0, at, reflected_radiance(transport.met, ray, tables))
+        open_share = torch.where(transport.blocked[:, None], 0.0, mirror) + (1 - mirror) * ambient[:, None]
+        return open_share * environment + (1 - mirror) * around + mirror * met
 
     def _normals(self, normal_offset: Tensor) -> Tensor:
         """Shading normals (n, 3) of the pixels, of any length, with the texels' `normal_offset` (texels, 3)."""
         return self.normal + _interpolate(normal_offset, self.texel, self.bilinear)
 
     def _transport(self, transport: Tensor) -> PixelTransport:
-        """Light transport at each pixel from that of the texels (texels, 18)."""
+        """Light transport at each pixel from that of the texels (texels, TRANSPORT)."""
         local = _interpolate(transport[:, LOCAL], self.texel, self.bilinear)
         if self.reflected_texel is None:
             return PixelTransport(local, None, None, None)
@@ -90,37 +118,21 @@ class Batch:
         rows = torch.nonzero(blocked)[:, 0]
         return PixelTransport(local, blocked, rows, transport[self.reflected_texel[rows]])
 
-    def _shade(
-        self, normal: Tensor, albedo: Tensor, roughness: Tensor, metallic: Tensor, tables: LightTables, transport: PixelTransport
-    ) -> Tensor:
-        """Linear colours (n, 3): split sum with visibility, reflections of the object, indirect diffuse light and emission."""
-        local, view, blocked = transport.local, self.view, transport.blocked
-        occlusion = local[:, OCCLUSION]
-        visibility = None if blocked is None else traced_specular_visibility(normal, view, roughness, occlusion, blocked)
-        lit = shade(normal, view, albedo, roughness, metallic, tables, occlusion, local[:, VISIBILITY], visibility)
-        if transport.rows is not None and transport.met is not None:
-            at = transport.rows
-            unit = torch.nn.functional.normalize(normal[at].detach(), dim=1)
-            ray = 2 * (unit * view[at]).sum(1, keepdim=True) * unit - view[at]
-            radiance = reflected_radiance(transport.met, ray, tables)
-            lit = lit.index_add(0, at, mirror_reflection(normal[at], view[at], albedo[at], roughness[at], metallic[at], radiance))
-        transmitted = transmitted_share(normal, view, roughness)
-        return lit + ((1 - metallic) * transmitted)[:, None] * albedo * local[:, INDIRECT] + local[:, EMISSION]
-
 
 @torch.no_grad()
 def reflected_radiance(met: Tensor, ray: Tensor, tables: LightTables) -> Tensor:
-    """Radiance (k, 3) that surfaces with light transport `met` (k, 18) send against the unit `ray` (k, 3) that meets each.
+    """Radiance (k, 3) that surfaces with light transport `met` (k, TRANSPORT) send against the unit `ray` (k, 3) that meets each.
 
     Of what blocks their specular lobe the mean radiance counts, which their indirect light tells.
     """
     normal, roughness, occlusion = met[:, NORMAL], met[:, ROUGHNESS], met[:, OCCLUSION]
     split = brdf.split_sum(soft_cosine(-(normal * ray).sum(1)), roughness)
-    scale, bias = split.scale[:, None], split.bias[:, None]
     visible = specular_occlusion(normal, -ray, roughness, occlusion)
     blocked = ((1 - visible) / (1 - occlusion).clamp_min(MIN_BLOCKED))[:, None] * met[:, INDIRECT]
     light = visible[:, None] * specular_light(normal, -ray, split, tables, tables.diffuse(normal)) + blocked
-    return (1 - 0.04 * scale - bias) * met[:, DIFFUSE] + met[:, EMISSION] + light * (met[:, F0] * scale + bias)
+    metallic, dielectric = met[:, METALLIC, None], split.dielectric[:, None]
+    reflectance = met[:, METAL_COLOUR] * split.scale[:, None] + metallic * split.bias[:, None] + (1 - metallic) * dielectric
+    return (1 - dielectric) * met[:, DIFFUSE] + met[:, EMISSION] + light * reflectance
 
 
 def _interpolate(values: Tensor, texel: Tensor, bilinear: Tensor) -> Tensor:

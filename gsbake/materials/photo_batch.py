@@ -23,9 +23,10 @@ from gsbake.shading.light_tables import LightTables, prefilter_cube_map
 Floats = NDArray[np.float32]
 
 #: Columns of a texel's light transport: visibility (0..1) of the present light and, for specular reflection, of uniform light (ambient
-#: occlusion); indirect irradiance / π; emission; for reflections of the object diffuse radiosity / π, F0, roughness and unit normal.
+#: occlusion); indirect irradiance / π; emission; for reflections of the object diffuse radiosity / π, base colour times metallic, roughness, unit
+#: normal, and metallic.
 VISIBILITY, OCCLUSION, INDIRECT, EMISSION = 0, 1, slice(2, 5), slice(5, 8)
-DIFFUSE, F0, ROUGHNESS, NORMAL = slice(8, 11), slice(11, 14), 14, slice(15, 18)
+DIFFUSE, METAL_COLOUR, ROUGHNESS, NORMAL, METALLIC = slice(8, 11), slice(11, 14), 14, slice(15, 18), 18
 #: The columns that pixels interpolate.
 LOCAL = slice(0, 8)
 
@@ -149,11 +150,11 @@ class PhotoBatch:
 
     def _shader(self, normal: Floats, tables: KernelTables, local: Floats, transport: Floats) -> Shader:
         """The function that shades the pixels with the `normal` (n, 3), their light transport `local` (n, 8), and that of the texels."""
-        last: list[tuple[NDArray[np.float32], tuple[Floats, Floats, Floats]]] = []
+        last: list[tuple[NDArray[np.float32], tuple[Floats, ...]]] = []
 
-        def parts(roughness: NDArray[np.float32]) -> tuple[Floats, Floats, Floats]:
+        def parts(roughness: NDArray[np.float32]) -> tuple[Floats, ...]:
             if not last or last[0][0] is not roughness:
-                out = np.empty_like(normal), np.empty_like(normal), np.empty_like(normal)
+                out = tuple(np.empty_like(normal) for _ in range(5))
                 fit_kernel.linear_shading(
                     self.dominant_texel, normal, self.view, self.reflected, local, transport, np.ascontiguousarray(roughness, np.float32),
                     *tables.arrays, *out,
@@ -162,10 +163,9 @@ class PhotoBatch:
             return last[0][1]
 
         def shaded(base: float, roughness: NDArray[np.float32], metallic: float) -> Floats:
-            diffuse, scaled, constant = parts(roughness)
+            diffuse, specular, scaled, edge, constant = parts(roughness)
             b, m = np.float32(base), np.float32(metallic)
-            f0 = np.float32(0.04) * (1 - m) + m * b
-            return (1 - m) * b * diffuse + f0 * scaled + constant
+            return (1 - m) * (b * diffuse + specular) + m * (b * scaled + edge) + constant
 
         return shaded
 

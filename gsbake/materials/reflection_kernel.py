@@ -14,7 +14,6 @@ from numba import njit
 
 from gsbake.shading.split_sum_kernel import (
     _CLAMP_TERM,
-    _F0,
     _FLAGS,
     _bilinear,
     _encode,
@@ -43,21 +42,24 @@ def specular_occlusion(cosine: Any, roughness: Any, occlusion: Any) -> Any:
 
 @njit(inline="always", **_FLAGS)
 def specular_visibility(cosine: Any, roughness: Any, occlusion: Any, reflected: Any, i: Any) -> Any:
-    """Visible share of the specular lobe of pixel i, weight of the radiance that a traced ray meets, and the texel where it does.
+    """Visible share of the specular lobe of pixel i; what the indirect irradiance / π is multiplied by for the light of the rest; weight of
+    the radiance that a traced ray meets, and the texel where it does.
 
     `reflected` (n,) as in `shade_and_differentiate`, empty: not traced.
     """
     visible, mirror = specular_occlusion(cosine, roughness, occlusion), _mirror_weight(roughness)
+    blocked = (_1 - visible) / max(_1 - occlusion, _MIN_BLOCKED)
     incident = _0
     hit = np.uint64(0)
     if reflected.shape[0] > 0:
         visible *= _1 - mirror
+        blocked *= _1 - mirror
         if reflected[i] >= 0:
             incident = mirror
             hit = np.uint64(reflected[i])
         else:
             visible += mirror
-    return visible, incident, hit
+    return visible, blocked, incident, hit
 
 
 @njit(inline="always", **_FLAGS)
@@ -77,7 +79,8 @@ def reflected_radiance(
     bias = _table_value(lut, row, col, fx, fy, 1)
     share = _table_value(lut, row, col, fx, fy, 2)
     mirror = _table_value(lut, row, col, fx, fy, 4)
-    transmitted = _1 - _F0 * scale - bias
+    dielectric = _table_value(lut, row, col, fx, fy, 5)
+    metal = transport[hit, 18]
     coeff = _1 + mirror * (_2 * c - _1)
     u, v = _encode(coeff * nx + mirror * x, coeff * ny + mirror * y, coeff * nz + mirror * z)
     level, t = _roughness_level(_table_value(lut, row, col, fx, fy, 3), knots)
@@ -93,5 +96,6 @@ def reflected_radiance(
         upper = _bilinear(table, base1, stride1, fx1, fy1, ch)
         narrow = lower + t * (upper - lower)
         light = narrow + share * (_bilinear(table, base2, stride2, fx2, fy2, ch) - narrow)
-        specular = (visible * light + blocked * transport[hit, 2 + ch]) * (transport[hit, 11 + ch] * scale + bias)
-        out[ch] = transmitted * transport[hit, 8 + ch] + transport[hit, 5 + ch] + specular
+        reflectance = transport[hit, 11 + ch] * scale + metal * bias + (_1 - metal) * dielectric
+        specular = (visible * light + blocked * transport[hit, 2 + ch]) * reflectance
+        out[ch] = (_1 - dielectric) * transport[hit, 8 + ch] + transport[hit, 5 + ch] + specular

@@ -1,7 +1,7 @@
 """Ray-traced reflections of the object on itself: one reflected ray per pixel, traced once, as mesh and cameras do not change.
 
 A smooth lobe reflects the environment where the ray is unoccluded, else the texel that it hits. How far a rough lobe follows that ray is
-decided in shading (`gsbake.shading.split_sum.traced_specular_visibility`).
+decided in shading (`gsbake.materials.reflection_kernel.specular_visibility`).
 
 Whitted, *An improved illumination model for shaded display*, CACM 1980.
 """

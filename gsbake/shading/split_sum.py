@@ -1,10 +1,9 @@
 """Deferred split-sum shading of G-buffers under a prefiltered environment light.
 
-    F0  = .04 (1 − metallic) + metallic · albedo
-    T   = 1 − .04 A(n·v, roughness) − B(n·v, roughness)
     S   = (1 − s) · L(d, ρ) + s · E(n)
-    out = (1 − metallic) · albedo · T · E(n) + S · (F0 · A(n·v, roughness) + B(n·v, roughness))
+    out = (1 − metallic) · (albedo · (1 − D) · E(n) + D · S) + metallic · (albedo · A + B) · S
 
+with the directional albedos of dielectrics, D, and of conductors, F0 · A + B, at n·v and roughness (`brdf`).
 (METHOD §6; Karis, *Real Shading in Unreal Engine 4*, 2013; Munkberg et al., nvdiffrec, CVPR 2022.) On the CPU in float32, forward and
 backward pass are one Numba kernel each; other devices and float64 use PyTorch. Shadowing and inter-reflection enter through the occlusion
 and visibility arguments only.
@@ -34,7 +33,6 @@ def shade(
     tables: LightTables,
     occlusion: torch.Tensor | None = None,
     diffuse_visibility: torch.Tensor | None = None,
-    specular_visibility: torch.Tensor | None = None,
 ) -> torch.Tensor:
     """Linear colours (n, 3) of n pixels.
 
@@ -48,7 +46,6 @@ def shade(
     occlusion: (n,), ambient occlusion, 1 = unoccluded; None is unoccluded. It scales the diffuse term and, converted to specular occlusion
     (Lagarde & de Rousiers, *Moving Frostbite to PBR*, 2014), the specular term.
     diffuse_visibility: (n,), factor of the diffuse term instead of `occlusion`: the visible share of this light's irradiance.
-    specular_visibility: (n,), factor of the specular term instead of that from `occlusion`, see `traced_specular_visibility`.
 
     Notes
     -----
@@ -59,7 +56,7 @@ def shade(
         visibility_d = visibility_s = torch.ones_like(roughness)
     else:
         visibility_d = occlusion if diffuse_visibility is None else diffuse_visibility
-        visibility_s = specular_occlusion(normal, view, roughness, occlusion) if specular_visibility is None else specular_visibility
+        visibility_s = specular_occlusion(normal, view, roughness, occlusion)
     inputs = (normal, view, albedo, roughness, metallic, visibility_d, visibility_s, tables.table)
     if all(t.device.type == "cpu" and t.dtype == torch.float32 for t in inputs):
         colour: torch.Tensor = _Kernel.apply(tables.layout, *inputs)
@@ -67,56 +64,38 @@ def shade(
     return _reference(normal, view, albedo, roughness, metallic, visibility_d, visibility_s, tables)
 
 
-def traced_specular_visibility(
-    normal: torch.Tensor, view: torch.Tensor, roughness: torch.Tensor, occlusion: torch.Tensor, blocked: torch.Tensor
-) -> torch.Tensor:
-    """Visibility (n,) of the specular lobe, 1 = unoccluded, where a traced ray tells whether the mirror direction is `blocked` (n,).
-
-    The share of the lobe that follows the mirror direction is multiplied by the ray's visibility, the rest by the specular occlusion from
-    `occlusion` (n,). Only the occlusion gets a gradient.
-    """
-    with torch.no_grad():
-        mirror = _mirror_weight(roughness)
-    ambient = specular_occlusion(normal, view, roughness, occlusion)
-    return (1.0 - mirror) * ambient + mirror * (~blocked)
-
-
-def mirror_reflection(
-    normal: torch.Tensor, view: torch.Tensor, albedo: torch.Tensor, roughness: torch.Tensor, metallic: torch.Tensor, radiance: torch.Tensor
-) -> torch.Tensor:
-    """Specular reflection (n, 3) of `radiance` (n, 3) that arrives along the mirror direction.
-
-    It replaces the share of the environment that `traced_specular_visibility` blocks. Gradients go to albedo and metallic only.
-    """
-    with torch.no_grad():
-        cosine = soft_cosine((_unit(normal) * view).sum(dim=1))
-        split = brdf.split_sum(cosine, roughness)
-        incident = _mirror_weight(roughness).unsqueeze(1) * radiance
-    metal = metallic.unsqueeze(1)
-    f0 = 0.04 * (1.0 - metal) + metal * albedo
-    return incident * (f0 * split.scale.unsqueeze(1) + split.bias.unsqueeze(1))
-
-
 def transmitted_share(normal: torch.Tensor, view: torch.Tensor, roughness: torch.Tensor) -> torch.Tensor:
-    """Share (n,) of diffuse reflection that a dielectric's specular layer lets through, 1 − (.04 A + B)."""
-    split = brdf.split_sum(soft_cosine((_unit(normal) * view).sum(dim=1)), roughness)
-    return 1.0 - 0.04 * split.scale - split.bias
+    """Share (n,) of diffuse reflection that a dielectric's specular layer lets through, 1 − D."""
+    return 1.0 - brdf.split_sum(soft_cosine((unit(normal) * view).sum(dim=1)), roughness).dielectric
+
+
+def reflectance(split: brdf.SplitSum, albedo: torch.Tensor, metallic: torch.Tensor) -> torch.Tensor:
+    """Directional albedo (n, 3) of the specular lobe of materials with `albedo` (n, 3) and `metallic` (n,)."""
+    metal = metallic.unsqueeze(1)
+    return metal * (albedo * split.scale.unsqueeze(1) + split.bias.unsqueeze(1)) + (1.0 - metal) * split.dielectric.unsqueeze(1)
 
 
 def specular_light(
     normal: torch.Tensor, view: torch.Tensor, split: brdf.SplitSum, tables: LightTables, irradiance: torch.Tensor
 ) -> torch.Tensor:
     """Light (n, 3) of the environment in the specular lobe of unit normals; `irradiance` / π (n, 3) is that at the normals."""
-    mirror, share = split.mirror.unsqueeze(1), split.share.unsqueeze(1)
+    share = split.share.unsqueeze(1)
+    return (1.0 - share) * prefiltered_light(normal, view, split, tables) + share * irradiance
+
+
+def prefiltered_light(normal: torch.Tensor, view: torch.Tensor, split: brdf.SplitSum, tables: LightTables) -> torch.Tensor:
+    """Light (n, 3) of the environment in the prefiltered one of the two lobes of unit normals."""
+    mirror = split.mirror.unsqueeze(1)
     cosine = (normal * view).sum(dim=1, keepdim=True)
     direction = (1.0 + mirror * (2.0 * cosine - 1.0)) * normal - mirror * view
-    return (1.0 - share) * tables.specular(direction, split.roughness) + share * irradiance
+    return tables.specular(direction, split.roughness)
 
 
-def _unit(normal: torch.Tensor) -> torch.Tensor:
+def unit(normal: torch.Tensor) -> torch.Tensor:
+    """The normals (n, 3) with unit length; one shorter than .01 gets no gradient."""
     squared = (normal * normal).sum(dim=1, keepdim=True)
-    unit = normal * squared.clamp_min(float(kernels.MIN_SQUARED_LENGTH)).rsqrt()
-    return torch.where(squared > float(kernels.MIN_SQUARED_LENGTH), unit, unit.detach())
+    found = normal * squared.clamp_min(float(kernels.MIN_SQUARED_LENGTH)).rsqrt()
+    return torch.where(squared > float(kernels.MIN_SQUARED_LENGTH), found, found.detach())
 
 
 def soft_cosine(cosine: torch.Tensor) -> torch.Tensor:
@@ -124,7 +103,7 @@ def soft_cosine(cosine: torch.Tensor) -> torch.Tensor:
     return 0.5 * (cosine + (cosine * cosine + 4.0 * float(kernels.COSINE_CLAMP_WIDTH) ** 2).sqrt())
 
 
-def _mirror_weight(roughness: torch.Tensor) -> torch.Tensor:
+def mirror_weight(roughness: torch.Tensor) -> torch.Tensor:
     """Share (n,) of the lobe that follows the mirror direction, 1 at roughness 0 and 0 at roughness 1: s (√s + α) with s = 1 − α, which is
     how far the lobe's dominant direction does (Lagarde & de Rousiers, *Moving Frostbite to PBR*, 2014)."""
     alpha = roughness.clamp(0.0, 1.0).square()
@@ -135,7 +114,7 @@ def _mirror_weight(roughness: torch.Tensor) -> torch.Tensor:
 def specular_occlusion(normal: torch.Tensor, view: torch.Tensor, roughness: torch.Tensor, occlusion: torch.Tensor) -> torch.Tensor:
     """Specular occlusion (n,) of Lagarde & de Rousiers, 1 = unoccluded. Only the ambient occlusion gets a gradient."""
     with torch.no_grad():
-        cosine = soft_cosine((_unit(normal) * view).sum(dim=1)).clamp_max(1.0)
+        cosine = soft_cosine((unit(normal) * view).sum(dim=1)).clamp_max(1.0)
         exponent = torch.exp2(-16.0 * roughness - 1.0)
     return ((cosine + occlusion).clamp_min(1e-3) ** exponent - 1.0 + occlusion).clamp(0.0, 1.0)
 
@@ -151,15 +130,12 @@ def _reference(
     tables: LightTables,
 ) -> torch.Tensor:
     """Reference implementation of `shade` in PyTorch, for any device and precision."""
-    unit = _unit(normal)
-    cosine = (unit * view).sum(dim=1, keepdim=True)
+    surface = unit(normal)
+    cosine = (surface * view).sum(dim=1, keepdim=True)
     split = brdf.split_sum(soft_cosine(cosine.squeeze(1)), roughness)
-    scale, bias = split.scale.unsqueeze(1), split.bias.unsqueeze(1)
-    irradiance = tables.diffuse(unit)
-    metal = metallic.unsqueeze(1)
-    f0 = 0.04 * (1.0 - metal) + metal * albedo
-    diffuse = (1.0 - metal) * albedo * (1.0 - 0.04 * scale - bias) * irradiance
-    specular = specular_light(unit, view, split, tables, irradiance) * (f0 * scale + bias)
+    irradiance = tables.diffuse(surface)
+    diffuse = ((1.0 - metallic) * (1.0 - split.dielectric)).unsqueeze(1) * albedo * irradiance
+    specular = specular_light(surface, view, split, tables, irradiance) * reflectance(split, albedo, metallic)
     return visibility_d.unsqueeze(1) * diffuse + visibility_s.unsqueeze(1) * specular
 
 

@@ -29,7 +29,6 @@ _2 = np.float32(2.0)
 _HALF = np.float32(0.5)
 _U1 = np.uint64(1)
 _MIN_L1_NORM = np.float32(MIN_L1_NORM)
-_F0 = np.float32(0.04)
 
 #: Squared length below which a normal gets no gradient.
 MIN_SQUARED_LENGTH = np.float32(1e-4)
@@ -184,7 +183,8 @@ def forward(
             share = _table_value(lut, row, col, fx, fy, 2)
             rough = _table_value(lut, row, col, fx, fy, 3)
             mirror = _table_value(lut, row, col, fx, fy, 4)
-            transmitted = _1 - _F0 * scale - bias
+            dielectric = _table_value(lut, row, col, fx, fy, 5)
+            transmitted = _1 - dielectric
 
             coeff = _1 + mirror * (_2 * c - _1)
             u, v = _encode(coeff * nx - mirror * view[i, 0], coeff * ny - mirror * view[i, 1], coeff * nz - mirror * view[i, 2])
@@ -199,11 +199,11 @@ def forward(
                 lower = _bilinear(table, base0, stride0, fx0, fy0, ch)
                 upper = _bilinear(table, base1, stride1, fx1, fy1, ch)
                 irradiance = _bilinear(table, base2, stride2, fx2, fy2, ch)
-                f0 = _F0 * (_1 - metal) + metal * albedo[i, ch]
+                reflectance = metal * (albedo[i, ch] * scale + bias) + (_1 - metal) * dielectric
                 narrow = lower + t * (upper - lower)
                 light = narrow + share * (irradiance - narrow)
                 diffuse = (_1 - metal) * albedo[i, ch] * transmitted * irradiance
-                out[i, ch] = visibility_d[i] * diffuse + visibility_s[i] * light * (f0 * scale + bias)
+                out[i, ch] = visibility_d[i] * diffuse + visibility_s[i] * light * reflectance
 
 
 @njit(parallel=True, **_FLAGS)
@@ -227,7 +227,8 @@ def backward(
             share = _table_value(lut, row, col, fx, fy, 2)
             rough = _table_value(lut, row, col, fx, fy, 3)
             mirror = _table_value(lut, row, col, fx, fy, 4)
-            transmitted = _1 - _F0 * scale - bias
+            dielectric = _table_value(lut, row, col, fx, fy, 5)
+            transmitted = _1 - dielectric
 
             coeff = _1 + mirror * (_2 * c - _1)
             rx = coeff * nx - mirror * view[i, 0]
@@ -242,7 +243,7 @@ def backward(
             base2, stride2, fx2, fy2 = _taps(u, v, sizes[last], offsets[last])
             metal = metallic[i]
 
-            g_u = g_v = g_un = g_vn = g_t = g_scale = g_bias = g_share = g_metal = g_vd = g_vs = _0
+            g_u = g_v = g_un = g_vn = g_t = g_scale = g_bias = g_share = g_dielectric = g_metal = g_vd = g_vs = _0
             half0 = _HALF * np.float32(sizes[level])
             half1 = _HALF * np.float32(sizes[level + 1])
             half2 = _HALF * np.float32(sizes[last])
@@ -252,19 +253,20 @@ def backward(
                 lower = _bilinear(table, base0, stride0, fx0, fy0, ch)
                 upper = _bilinear(table, base1, stride1, fx1, fy1, ch)
                 irradiance = _bilinear(table, base2, stride2, fx2, fy2, ch)
-                f0 = _F0 * (_1 - metal) + metal * base
+                metallic_reflectance = base * scale + bias
                 narrow = lower + t * (upper - lower)
                 light = narrow + share * (irradiance - narrow)
-                reflectance = f0 * scale + bias
+                reflectance = metal * metallic_reflectance + (_1 - metal) * dielectric
                 diffuse = g * (_1 - metal) * base * irradiance  # gradient of visibility and transmittance together
                 g_d = g * visibility_d[i] * transmitted
                 g_s = g * visibility_s[i]
                 g_vd += diffuse * transmitted
                 g_vs += g * light * reflectance
                 g_albedo[i, ch] = g_d * (_1 - metal) * irradiance + g_s * light * scale * metal
-                g_metal += g_s * light * scale * (base - _F0) - g_d * base * irradiance
-                g_scale += g_s * light * f0 - _F0 * visibility_d[i] * diffuse
-                g_bias += g_s * light - visibility_d[i] * diffuse
+                g_metal += g_s * light * (metallic_reflectance - dielectric) - g_d * base * irradiance
+                g_scale += g_s * light * metal * base
+                g_bias += g_s * light * metal
+                g_dielectric += g_s * light * (_1 - metal) - visibility_d[i] * diffuse
                 g_light = g_s * reflectance
                 g_share += g_light * (irradiance - narrow)
                 g_narrow = g_light * (_1 - share)
@@ -291,7 +293,7 @@ def backward(
             # Split-sum table: derivatives along √(n·v) and roughness.
             g_rough = g_t / (knots[level + 1] - knots[level])
             d_root = d_row = _0
-            for k, g in ((0, g_scale), (1, g_bias), (2, g_share), (3, g_rough), (4, g_mirror)):
+            for k, g in ((0, g_scale), (1, g_bias), (2, g_share), (3, g_rough), (4, g_mirror), (5, g_dielectric)):
                 along_root, along_row = _table_slopes(lut, row, col, fx, fy, k)
                 d_root += g * along_root
                 d_row += g * along_row

@@ -1,9 +1,9 @@
 """Direct lighting of the analytic scene: a reference renderer that shares no code with the surfel rasteriser or the split sum.
 
-Microfacet model: GGX with height-correlated Smith shadowing (Heitz, *Understanding the masking-shadowing function*, JCGT 2014) and
-Schlick's Fresnel, `F0 = .04 (1 - m) + m albedo`, alpha = roughness²; plus Lambert `(1 - m) albedo / pi` times what the specular layer of a
-dielectric lets through, one minus its directional albedo (Kulla and Conty, *Revisiting physically based shading at Imageworks*, 2017).
-Light comes from a rectangle
+Microfacet model: GGX with height-correlated Smith shadowing (Heitz, *Understanding the masking-shadowing function*, JCGT 2014), alpha =
+roughness², and the Fresnel term `m (albedo + (1 - albedo) (1 - v.h)^5) + (1 - m) F`, Schlick's of metals and Fresnel's equations at the
+index of refraction 1.5 of dielectrics; plus Lambert `(1 - m) albedo / pi` times what the specular layer of a dielectric lets through, one
+minus its directional albedo (Kulla and Conty, *Revisiting physically based shading at Imageworks*, 2017). Light comes from a rectangle
 (stratified points, each with a shadow ray), a sun (one shadow ray) and an environment whose radiance `a + b z` is linear in the
 direction, so that its irradiance `pi (a + 2/3 b n_z)` is exact. Ambient visibility is sampled with hemisphere rays; the specular part is
 summed over visible half vectors (Dupuy and Benyoub, *Sampling visible GGX normals with spherical caps*, CGF 2023).
@@ -116,6 +116,15 @@ def _microfacet(nl: float, nv: float, nh: float, alpha: float) -> float:
     return a2 / (math.pi * base * base) * 0.5 / smith
 
 
+@_inlined
+def _dielectric_fresnel(cosine: float) -> float:
+    """Reflectance of a dielectric of index of refraction 1.5 at the cosine of incidence, for unpolarised light."""
+    refracted = math.sqrt(1 - (1 - cosine * cosine) / (1.5 * 1.5))
+    across = (cosine - 1.5 * refracted) / (cosine + 1.5 * refracted)
+    along = (1.5 * cosine - refracted) / (1.5 * cosine + refracted)
+    return 0.5 * (across * across + along * along)
+
+
 @_compiled
 def brdf_cosine(
     light: tuple[float, float, float],
@@ -137,14 +146,13 @@ def brdf_cosine(
     nh = (n[0] * hx + n[1] * hy + n[2] * hz) / length
     lh = (light[0] * hx + light[1] * hy + light[2] * hz) / length
     specular = _microfacet(nl, nv, nh, surface[3] * surface[3])
-    schlick = (1 - lh) ** 5
-    diffuse = transmitted * (1 - surface[4]) / math.pi
-    base = 0.04 * (1 - surface[4])
-    r0, g0, b0 = base + surface[4] * surface[0], base + surface[4] * surface[1], base + surface[4] * surface[2]
+    schlick, dielectric = (1 - lh) ** 5, (1 - surface[4]) * _dielectric_fresnel(lh)
+    diffuse, metal = transmitted * (1 - surface[4]) / math.pi, surface[4] * (1 - schlick)
+    edge = dielectric + surface[4] * schlick
     return (
-        nl * (diffuse * surface[0] + specular * (r0 + (1 - r0) * schlick)),
-        nl * (diffuse * surface[1] + specular * (g0 + (1 - g0) * schlick)),
-        nl * (diffuse * surface[2] + specular * (b0 + (1 - b0) * schlick)),
+        nl * (diffuse * surface[0] + specular * (metal * surface[0] + edge)),
+        nl * (diffuse * surface[1] + specular * (metal * surface[1] + edge)),
+        nl * (diffuse * surface[2] + specular * (metal * surface[2] + edge)),
     )
 
 
@@ -239,8 +247,6 @@ def _environment_specular(
     alpha = surface[3] * surface[3]
     a2 = alpha * alpha
     nv = max(n[0] * v[0] + n[1] * v[1] + n[2] * v[2], 1e-4)
-    base = 0.04 * (1 - surface[4])
-    r0, g0, b0 = base + surface[4] * surface[0], base + surface[4] * surface[1], base + surface[4] * surface[2]
     wx, wy = alpha * (v[0] * tx + v[1] * ty + v[2] * tz), alpha * (v[0] * ux + v[1] * uy + v[2] * uz)
     inverse = 1 / math.sqrt(wx * wx + wy * wy + nv * nv)
     wx, wy, wz = wx * inverse, wy * inverse, nv * inverse
@@ -258,12 +264,13 @@ def _environment_specular(
         if vh <= 0 or nl <= 0:
             continue
         weight = nl * (smith_v + nv) / (nl * smith_v + nv * math.sqrt(a2 + (1 - a2) * nl * nl))
-        schlick = (1 - vh) ** 5
-        reflected += weight * (0.04 + 0.96 * schlick)
+        schlick, dielectric = (1 - vh) ** 5, _dielectric_fresnel(vh)
+        reflected += weight * dielectric
+        metal, edge = surface[4] * (1 - schlick), (1 - surface[4]) * dielectric + surface[4] * schlick
         lz = 2 * vh * hz - v[2]
-        r += weight * (r0 + (1 - r0) * schlick) * (rig.ambient[0] + rig.gradient[0] * lz)
-        g += weight * (g0 + (1 - g0) * schlick) * (rig.ambient[1] + rig.gradient[1] * lz)
-        b += weight * (b0 + (1 - b0) * schlick) * (rig.ambient[2] + rig.gradient[2] * lz)
+        r += weight * (metal * surface[0] + edge) * (rig.ambient[0] + rig.gradient[0] * lz)
+        g += weight * (metal * surface[1] + edge) * (rig.ambient[1] + rig.gradient[1] * lz)
+        b += weight * (metal * surface[2] + edge) * (rig.ambient[2] + rig.gradient[2] * lz)
     count = len(rig.half_vector_samples)
     return r / count, g / count, b / count, reflected / count
 

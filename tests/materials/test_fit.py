@@ -224,13 +224,16 @@ def test_trials_find_the_roughness(glossy: Scene) -> None:
 
 
 def test_metal_is_found_from_the_best_start() -> None:
-    """A sphere of two metals, in reference images: from the start that the trials choose, nearly all texels end as metal."""
+    """A sphere of two metals, in reference images: from the start that the trials choose, nearly all texels end as metal, whatever the order
+    of the photos (median of five)."""
     scene = Scene(0.25, reference=True, metallic=1.0)
     errors = trial_errors(scene)
     metallic, roughness = min(errors, key=lambda start: errors[start])
-    fitted = scene.fit(roughness, metallic=metallic).run(scene.photos[2:], scene.photos[:2], FitSchedule(200))
-    known = fitted.weight > 0.3
-    assert (fitted.values[known, 4] > 0.5).mean() > 0.9
+    shares = []
+    for seed in range(5):
+        fitted = scene.fit(roughness, metallic=metallic).run(scene.photos[2:], scene.photos[:2], FitSchedule(200, seed))
+        shares.append((fitted.values[fitted.weight > 0.3, 4] > 0.5).mean())
+    assert np.median(shares) > 0.9
     dielectric = scene.fit(0.2).run(scene.photos[2:], scene.photos[:2], FitSchedule(200, metal_searches_at=()))
     assert fitted.held_out_psnr is not None and dielectric.held_out_psnr is not None
     assert fitted.held_out_psnr > dielectric.held_out_psnr + 1

@@ -31,7 +31,7 @@ class Case:
         self.values = np.concatenate([rng.uniform(0.02, 0.98, (TEXELS, 5)), rng.normal(0, 0.1, (TEXELS, 3))], 1).astype(np.float32)
         self.transport = rng.uniform(0, 1, (TEXELS, fit_kernel.TRANSPORT)).astype(np.float32)
         self.transport[:, 2:14] *= 0.2
-        self.transport[:, 15:] = self.normal[rng.permutation(TEXELS)]
+        self.transport[:, 15:18] = self.normal[rng.permutation(TEXELS)]
         texel = rng.integers(0, TEXELS, (PIXELS, 4))
         bilinear = rng.dirichlet(np.ones(4), PIXELS).astype(np.float32)
         bilinear[:50] = [1, 0, 0, 0]
@@ -71,6 +71,24 @@ def test_loss_and_gradients(traced: bool) -> None:
         # A pixel on a kink of the interpolation (a texel's edge) may fall on either side.
         error = np.linalg.norm(found - expected) / np.linalg.norm(expected)
         assert error < 2e-3
+
+
+@pytest.mark.parametrize("traced", [False, True])
+def test_object_as_bright_as_the_room_changes_nothing(traced: bool) -> None:
+    """Under an even light L, whatever blocks it sends L as well: every material shows what it would show in the open."""
+    case, level = Case(5, traced), 0.7
+    tables = EnvironmentLight.from_radiance(np.full((6, 8, 8, 3), level, np.float32)).prefilter().detach()
+    transport = np.zeros_like(case.transport)
+    occlusion = case.transport[:, :1] * 0.85  # at least so much is blocked that indirect light tells what blocks it
+    transport[:, :2], transport[:, 2:5], transport[:, 15:18] = occlusion, level * (1 - occlusion), case.normal
+    transport[:, 8:11] = level  # diffuse radiosity / π of a white object, whose specular layer reflects the same
+    values = torch.tensor(case.values[:, :5])
+    batch = Batch.of(case.pixels, torch.as_tensor(case.normal))
+    shaded = batch.shade(values, torch.zeros(TEXELS, 3), tables, torch.as_tensor(transport))
+    clear = np.zeros_like(transport)
+    clear[:, :2] = 1
+    alone = Batch.of(replace(case.pixels, reflected_texel=None), torch.as_tensor(case.normal))
+    torch.testing.assert_close(shaded, alone.shade(values, torch.zeros(TEXELS, 3), tables, torch.as_tensor(clear)), rtol=2e-3, atol=1e-3)
 
 
 def test_results_do_not_depend_on_threads() -> None:

@@ -18,12 +18,12 @@ from gsbake.materials.fit_kernel import TRANSPORT
 from gsbake.materials.fit_reference import reflected_radiance
 from gsbake.materials.fit_surface import FitSurface
 from gsbake.materials.options import FitSchedule, Priors
-from gsbake.materials.photo_batch import EMISSION, F0, NORMAL, OCCLUSION, ROUGHNESS
+from gsbake.materials.photo_batch import EMISSION, METAL_COLOUR, METALLIC, NORMAL, OCCLUSION, ROUGHNESS
 from gsbake.materials.pixels import PixelReader, Pixels
 from gsbake.materials.reflections import ReflectionTracer
 from gsbake.materials.visibility import Visibility
 from gsbake.shading.environment import EnvironmentLight
-from gsbake.shading.split_sum import shade
+from gsbake.shading.split_sum import shade, transmitted_share
 from gsbake.texturing.texels import rasterise
 from tests.support.cameras import look_at
 
@@ -113,8 +113,9 @@ def test_reflection_does_not_change_base_colour(corner: Corner) -> None:
         )
         view, m = torch.as_tensor(pixels.view), len(pixels)
         specular = shade(normal, view, torch.zeros(m, 3), torch.full((m,), 0.1), torch.zeros(m), tables).detach()
-        wall = torch.tensor([0.94, 0.44, 0.09]) * spread.mean()
+        wall = torch.tensor([0.9, 0.4, 0.05]) * 0.96 * spread.mean() + 0.04  # seen near its normal; its layer reflects the sky
         specular = torch.where(torch.as_tensor(blocked)[:, None], specular * wall, specular)
+        diffuse = diffuse * transmitted_share(normal, view, torch.full((m,), 0.1))[:, None]
         # A light that is said to move, here by nothing, has no prior of its radiance: the sky's is 1, and the prior expects .7.
         return replace(pixels, colour=encode((diffuse + specular).numpy()).astype(np.float32), to_light=np.eye(3))
 
@@ -135,7 +136,8 @@ def test_a_reflected_mirror_shows_the_light_behind_the_viewer() -> None:
     """A ray that comes down onto a mirror at 45° leaves along +x: it carries F0 times the light from there, and what the texel emits."""
     light = EnvironmentLight.from_function(lambda at: np.repeat(np.where(at[:, :1] > 0.5, 2.0, 0.1), 3, 1), 32).prefilter().detach()
     met = torch.zeros(1, TRANSPORT)
-    met[0, OCCLUSION], met[0, EMISSION], met[0, F0], met[0, ROUGHNESS] = 1, torch.tensor([0, 0, 0.5]), torch.tensor([0.9, 0.6, 0.3]), 0.1
+    met[0, OCCLUSION], met[0, EMISSION], met[0, ROUGHNESS], met[0, METALLIC] = 1, torch.tensor([0, 0, 0.5]), 0.1, 1
+    met[0, METAL_COLOUR] = torch.tensor([0.9, 0.6, 0.3])
     met[0, NORMAL] = torch.tensor([np.sqrt(0.5), 0, np.sqrt(0.5)])
     found = reflected_radiance(met, torch.tensor([[0.0, 0, -1]]), light)[0]
     fresnel = (1 - np.sqrt(0.5)) ** 5

@@ -15,15 +15,17 @@ from gsbake.geometry.raycast import RayCaster
 from gsbake.imaging.srgb import encode
 from gsbake.materials.adjacency import neighbours
 from gsbake.materials.fit import MaterialFit
+from gsbake.materials.fit_model import FitState
 from gsbake.materials.fit_surface import FitSurface
 from gsbake.materials.options import FitSchedule, Priors
 from gsbake.materials.pixels import PixelReader, Pixels
 from gsbake.materials.visibility import ROTATIONS, Visibility, directions, unoccluded_irradiance
 from gsbake.shading import cubemap
 from gsbake.shading.environment import EnvironmentLight
-from gsbake.shading.split_sum import shade
+from gsbake.shading.split_sum import transmitted_share
 from gsbake.texturing.texels import Texels, rasterise
 from tests.support.cameras import look_at
+from tests.support.monte_carlo import render
 
 Doubles = NDArray[np.float64]
 WHITE = EnvironmentLight.from_function(lambda d: np.ones((len(d), 3)), 16).radiance().detach().numpy()
@@ -194,29 +196,45 @@ class Tray:
             for start, met in links:
                 gained[start] += self.base_color[met] * irradiance[met] / rounds
             irradiance = direct + gained
-        self.inside = self.box.quad < 5
-        reader, tables = PixelReader(self.box.caster, self.box.uv, texels, 4.0), light.prefilter()
-        self.photos = [self.photo(reader, tables, k, self.base_color * irradiance) for k in range(12)]
+        self.inside, self.cube, self.slot, self.diffuse = self.box.quad < 5, cube, slot, self.base_color * irradiance
+        reader = PixelReader(self.box.caster, self.box.uv, texels, 4.0)
+        self.photos = [self.photo(reader, k) for k in range(12)]
 
-    def photo(self, reader: PixelReader, tables: object, k: int, diffuse: Doubles) -> Pixels:
+    def incident(self, point: Doubles, ray: Doubles) -> Doubles:
+        """Radiance (n, 3) that arrives at points (n, 3) along rays (n, 3): of the sky, or of what the box reflects diffusely."""
+        hits = self.box.caster.first_hit(point, ray)
+        faces, bary = self.box.caster.faces[hits.face[hits.hit]], hits.bary[hits.hit]
+        column, row = (np.einsum("nk,nkd->nd", bary, self.box.uv[faces]) * self.box.texels.size).astype(int).T
+        radiance = np.asarray(self.cube[cubemap.texel_index(32, ray)], np.float64)
+        radiance[hits.hit] = self.diffuse[self.slot[row * self.box.texels.size + column]]
+        return radiance
+
+    def photo(self, reader: PixelReader, k: int) -> Pixels:
         turn, high = 2.4 * k, 0.3 + 1.1 * k / 12
         centre = 5 * np.array([np.cos(turn) * np.cos(high), np.sin(turn) * np.cos(high), np.sin(high)])
         blank = reader.read(look_at(centre, size=64, focal=100), np.zeros((64, 64, 3), np.uint8), None)
-        colour, normal = (np.einsum("nk,nkc->nc", blank.bilinear, x[blank.texel]) for x in (diffuse, self.box.normal))
-        n = len(blank)
-        specular = shade(torch.as_tensor(normal).float(), torch.as_tensor(blank.view), torch.zeros(n, 3), torch.full((n,), 0.5),
-                      torch.zeros(n), tables)  # type: ignore[arg-type]  # fmt: skip
-        return replace(blank, colour=encode(colour + specular.detach().numpy()))
+        colour, normal, point = (
+            np.einsum("nk,nkc->nc", blank.bilinear, x[blank.texel]) for x in (self.diffuse, self.box.normal, self.box.at + 1e-4 * self.box.normal)
+        )
+        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+        n, view = len(blank), blank.view.astype(np.float64)
+        rough = np.full(n, 0.5)
+        specular = render(normal, view, np.zeros((n, 3)), rough, np.zeros(n), lambda ray: self.incident(point, ray), 64, k)
+        lets_through = transmitted_share(*(torch.as_tensor(x).float() for x in (normal, view, rough)))
+        return replace(blank, colour=encode(colour * lets_through.numpy()[:, None] + specular))
 
     def error(self, visibility: Visibility | None, indirect: bool, sparsity: float = 0.0) -> float:
-        """Mean error of the fitted base colour (sRGB) inside the box, up to a gain."""
+        """Mean error of the base colour (sRGB) inside the box fitted under the true light, up to a gain."""
         priors = replace(Priors.of(Bake()), sparsity=sparsity)
         texels = self.box.texels
         ambient = np.ones(len(texels)) if visibility is None else visibility.visible_share(WHITE)
         start = np.full((len(texels), 3), 0.4)
         pairs = neighbours(texels, self.box.at, self.box.normal)
         surface = FitSurface(texels, self.box.at, pairs, self.box.normal, ambient, start, visibility, indirect)
-        fitted = MaterialFit(surface, 16, priors, 0.5).run(self.photos, [], FitSchedule(300))
+        fit = MaterialFit(surface, 32, priors, 0.5)
+        values = np.column_stack([start, np.tile([0.5, 0.05], (len(start), 1))]).astype(np.float32)
+        fit.restore(FitState(values, self.cube.reshape(6, 32, 32, 3)), self.photos)
+        fitted = fit.run(self.photos, [], FitSchedule(300, light_searches_at=(), fixed_light=True))
         known = fitted.weight > 0.3
         gain = (fitted.values[known, :3] * self.base_color[known]).sum(0) / (fitted.values[known, :3] ** 2).sum(0)
         known &= self.inside

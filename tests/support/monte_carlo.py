@@ -1,9 +1,10 @@
 """A reference renderer: direct light of a distant environment on convex surfaces by Monte Carlo, in NumPy.
 
-It shares no code with `gsbake.shading`: the BRDF of glTF 2.0 (appendix B: Lambert, GGX with the height-correlated Smith term, Schlick's
-Fresnel) is sampled half by the cosine and half by GGX's half vectors, combined by the balance heuristic (Veach & Guibas, *Optimally
+It shares no code with `gsbake.shading`: the BRDF of glTF 2.0 (appendix B: Lambert, GGX with the height-correlated Smith term; Schlick's
+Fresnel for metals, Fresnel's equations for dielectrics) is sampled half by the cosine and half by GGX's half vectors, combined by the balance heuristic (Veach & Guibas, *Optimally
 combining sampling techniques*, SIGGRAPH 1995). Nothing is prefiltered, no sum is split. Diffuse reflection gets what the specular layer of
-a dielectric lets through, one minus its directional albedo (Kulla & Conty, *Revisiting physically based shading at Imageworks*, 2017).
+a dielectric lets through, one minus its directional albedo, and light is scattered between microfacets (Kulla & Conty, *Revisiting
+physically based shading at Imageworks*, 2017).
 """
 
 from __future__ import annotations
@@ -12,6 +13,8 @@ from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
+
+from tests.support.directional_albedo import MEAN_DIELECTRIC, mean_bright, single_scattering
 
 Doubles = NDArray[np.float64]
 
@@ -36,6 +39,10 @@ def render(
     tangent, across = frames(normal)
     nv = np.maximum((normal * view).sum(1), 1e-3)
     specular, diffuse, reflected = np.zeros((n, 3)), np.zeros((n, 3)), np.zeros(n)
+    mean, lost = _lost_between_microfacets(nv, roughness)
+    average = albedo + (1 - albedo) / 21  # of Schlick's term over the hemisphere
+    again_metal = 1 + average * mean[:, None] / (1 - average * (1 - mean[:, None])) * lost[:, None]
+    again = 1 + MEAN_DIELECTRIC * mean / (1 - MEAN_DIELECTRIC * (1 - mean)) * lost
     for k in range(samples):
         u, turn = (k + draw.random(n)) / samples, 2 * np.pi * draw.random(n)
         if k % 2:
@@ -52,15 +59,25 @@ def render(
         distribution = alpha**2 / (np.pi * (nh**2 * (alpha**2 - 1) + 1) ** 2)
         safe = np.maximum(nl, 1e-6)
         smith = safe * np.sqrt(nv**2 * (1 - alpha**2) + alpha**2) + nv * np.sqrt(safe**2 * (1 - alpha**2) + alpha**2)
-        f0 = 0.04 * (1 - metallic[:, None]) + metallic[:, None] * albedo
-        fresnel = f0 + (1 - f0) * ((1 - vh) ** 5)[:, None]
+        into = np.sqrt(1 - (1 - vh**2) / 1.5**2)
+        dielectric = 0.5 * again * (((vh - 1.5 * into) / (vh + 1.5 * into)) ** 2 + ((1.5 * vh - into) / (1.5 * vh + into)) ** 2)
+        conductor = again_metal * (albedo + (1 - albedo) * ((1 - vh) ** 5)[:, None])
+        fresnel = metallic[:, None] * conductor + ((1 - metallic) * dielectric)[:, None]
         density = 0.5 * safe / np.pi + 0.5 * distribution * nh / (4 * vh)
         share, lobe = np.where(up, safe / density / samples, 0.0), distribution * 0.5 / smith
         incident = share[:, None] * environment(light)
         specular += lobe[:, None] * fresnel * incident
         diffuse += (1 - metallic[:, None]) * albedo / np.pi * incident
-        reflected += share * lobe * (0.04 + 0.96 * (1 - vh) ** 5)
+        reflected += share * lobe * dielectric
     return np.asarray(specular + (1 - reflected)[:, None] * diffuse)
+
+
+def _lost_between_microfacets(nv: Doubles, roughness: Doubles) -> tuple[Doubles, Doubles]:
+    """Of lobes with a Fresnel term of 1 the mean albedo over the hemisphere (n,), and (1 − E)/E at n·v (n,), both to .05."""
+    key, inverse = np.unique(np.round(np.stack([np.maximum(nv, 0.05), np.maximum(roughness, 0.05)], 1) * 20) / 20, axis=0, return_inverse=True)
+    bright = np.array([sum(single_scattering(float(c), float(r))[:2]) for c, r in key])[inverse.ravel()]
+    mean = np.array([mean_bright(float(r)) for _, r in key])[inverse.ravel()]
+    return mean, (1 - bright) / bright
 
 
 def local(tangent: Doubles, across: Doubles, normal: Doubles, cosine: Doubles, turn: Doubles) -> Doubles:

@@ -29,8 +29,10 @@ def textbook(
     d = 1 / (np.pi * a**2 * nh**4 * (1 + tan2 / a**2) ** 2)
     lam = [0.5 * (np.sqrt(1 + a**2 * (1 - c**2) / c**2) - 1) for c in (nl, nv)]
     g = 1 / (1 + lam[0] + lam[1])
-    f0 = 0.04 * (1 - metallic) + metallic * albedo
-    f = f0 + (1 - f0) * (1 - vh) ** 5
+    into = np.arcsin(np.sqrt(1 - vh**2) / 1.5)  # Snell's law, then Fresnel's two polarisations
+    out = np.arccos(vh)
+    dielectric = 0.5 * ((np.sin(out - into) / np.sin(out + into)) ** 2 + (np.tan(out - into) / np.tan(out + into)) ** 2)
+    f = metallic * (albedo + (1 - albedo) * (1 - vh) ** 5) + (1 - metallic) * dielectric
     return nl * (d * g * f / (4 * nl * nv) + transmitted * (1 - metallic) * albedo / np.pi)
 
 
