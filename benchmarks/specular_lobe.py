@@ -3,7 +3,8 @@
 python -m benchmarks.specular_lobe FOLDER … [--samples 200] [--seed 0]
 
 FOLDER holds environment maps as in `benchmarks.light_levels`. Normals, views and roughnesses (.2 to .9) of a white metal are random; each
-map is scaled to a mean of .7, white being 1. Prints the PSNR of displayed sRGB values, by n·v and by roughness, of
+map is scaled to a mean of .7, white being 1; all have the albedo of a single scattering, as lobes are compared. Prints the PSNR of
+displayed sRGB values, by n·v and by roughness, of
 
 - `one lobe`: the light prefiltered at normal incidence, along the dominant direction of Lagarde & de Rousiers (2014),
 - `two lobes`: what `gsbake.shading.split_sum` does.
@@ -57,6 +58,10 @@ class Samples:
         view = cosine[:, None] * normal + np.sqrt(1 - cosine**2)[:, None] * across
         return cls(normal, view, cosine, roughness)
 
+    def albedo(self) -> Floats:
+        """Directional albedo (n, 1) of a white metal that scatters light once."""
+        return brdf.directional_albedo(self.cosine, self.roughness**2)[:, :2].sum(1, keepdims=True)
+
     def exact(self, radiance: NDArray[Any]) -> Floats:
         """GGX of a white metal (n, 3) summed over the cube map `radiance` (6, SIZE, SIZE, 3)."""
         light, area = cubemap.directions(FINE_SIZE).reshape(-1, 3), cubemap.solid_angles(FINE_SIZE).ravel()
@@ -76,14 +81,15 @@ class Samples:
         mirror = ((1 - alpha) * (np.sqrt(1 - alpha) + alpha))[:, None]
         direction = unit((1 + mirror * (2 * self.cosine[:, None] - 1)) * self.normal - mirror * self.view)
         light = tables.specular(torch.from_numpy(direction), torch.from_numpy(self.roughness))
-        split = brdf.split_sum(torch.from_numpy(self.cosine), torch.from_numpy(self.roughness))
-        return np.asarray((light * (split.scale + split.bias)[:, None]).numpy())
+        return light.numpy() * self.albedo()
 
     def two_lobes(self, tables: LightTables) -> Floats:
         """The same by the shading of the fit."""
         white, metal = torch.ones(len(self.normal), 3, dtype=torch.float64), torch.ones(len(self.normal), dtype=torch.float64)
         normal, view, roughness = (torch.from_numpy(x) for x in (self.normal, self.view, self.roughness))
-        return np.asarray(shade(normal, view, white, roughness, metal, tables).numpy())
+        split = brdf.split_sum(torch.from_numpy(self.cosine), roughness)
+        whole = (split.scale + split.bias).numpy()[:, None]
+        return shade(normal, view, white, roughness, metal, tables).numpy() / whole * self.albedo()
 
 
 def squared_errors(image: NDArray[np.float32], samples: Samples) -> tuple[Floats, Floats]:

@@ -23,8 +23,8 @@ from gsbake.shading.light_tables import LightTables, prefilter_cube_map
 Floats = NDArray[np.float32]
 
 #: Columns of a texel's light transport: visibility (0..1) of the present light and, for specular reflection, of uniform light (ambient
-#: occlusion); indirect irradiance / π; emission; for reflections of the object diffuse radiosity / π, base colour times metallic, roughness, unit
-#: normal, and metallic.
+#: occlusion); indirect irradiance / π; emission; for reflections of the object diffuse radiosity / π, base colour times metallic,
+#: roughness, unit normal, and metallic.
 VISIBILITY, OCCLUSION, INDIRECT, EMISSION = 0, 1, slice(2, 5), slice(5, 8)
 DIFFUSE, METAL_COLOUR, ROUGHNESS, NORMAL, METALLIC = slice(8, 11), slice(11, 14), 14, slice(15, 18), 18
 #: The columns that pixels interpolate.

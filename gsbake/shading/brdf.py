@@ -130,8 +130,8 @@ def _table_tensor(dtype: torch.dtype, device: torch.device) -> torch.Tensor:
 
 @dataclass(frozen=True)
 class SplitSum:
-    """A row of the split-sum table for n pixels, (n,) each: `scale` A and `bias` B of conductors' F0, the lobe's `share` of the cosine lobe,
-    `roughness` of the prefiltered lobe and weight `mirror` of the mirror direction in its direction, and `dielectric`, the albedo D."""
+    """A row of the split-sum table for n pixels, (n,) each: `scale` A and `bias` B of conductors' F0, of the lobe the `share` of the cosine
+    lobe, `roughness` of the prefiltered one and weight `mirror` of the mirror direction in its direction; `dielectric`, albedo D."""
 
     scale: torch.Tensor
     bias: torch.Tensor

@@ -224,8 +224,8 @@ def test_trials_find_the_roughness(glossy: Scene) -> None:
 
 
 def test_metal_is_found_from_the_best_start() -> None:
-    """A sphere of two metals, in reference images: from the start that the trials choose, nearly all texels end as metal, whatever the order
-    of the photos (median of five)."""
+    """A sphere of two metals, in reference images: from the start that the trials choose, nearly all texels end as metal (median of five
+    orders of the photos)."""
     scene = Scene(0.25, reference=True, metallic=1.0)
     errors = trial_errors(scene)
     metallic, roughness = min(errors, key=lambda start: errors[start])

@@ -214,7 +214,8 @@ class Tray:
         centre = 5 * np.array([np.cos(turn) * np.cos(high), np.sin(turn) * np.cos(high), np.sin(high)])
         blank = reader.read(look_at(centre, size=64, focal=100), np.zeros((64, 64, 3), np.uint8), None)
         colour, normal, point = (
-            np.einsum("nk,nkc->nc", blank.bilinear, x[blank.texel]) for x in (self.diffuse, self.box.normal, self.box.at + 1e-4 * self.box.normal)
+            np.einsum("nk,nkc->nc", blank.bilinear, x[blank.texel])
+            for x in (self.diffuse, self.box.normal, self.box.at + 1e-4 * self.box.normal)
         )
         normal /= np.linalg.norm(normal, axis=1, keepdims=True)
         n, view = len(blank), blank.view.astype(np.float64)

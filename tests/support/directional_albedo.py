@@ -1,7 +1,7 @@
 """Directional albedo of GGX by brute force, single scattering and with light that is scattered between microfacets.
 
-Shares no code with `gsbake.shading`: textbook formulas summed over a grid of half-vectors, and the approximation of Kulla & Conty, *Revisiting
-physically based shading at Imageworks*, 2017.
+Shares no code with `gsbake.shading`: textbook formulas summed over a grid of half-vectors, and the approximation of Kulla & Conty,
+*Revisiting physically based shading at Imageworks*, 2017.
 """
 
 from __future__ import annotations

@@ -1,10 +1,10 @@
 """A reference renderer: direct light of a distant environment on convex surfaces by Monte Carlo, in NumPy.
 
 It shares no code with `gsbake.shading`: the BRDF of glTF 2.0 (appendix B: Lambert, GGX with the height-correlated Smith term; Schlick's
-Fresnel for metals, Fresnel's equations for dielectrics) is sampled half by the cosine and half by GGX's half vectors, combined by the balance heuristic (Veach & Guibas, *Optimally
-combining sampling techniques*, SIGGRAPH 1995). Nothing is prefiltered, no sum is split. Diffuse reflection gets what the specular layer of
-a dielectric lets through, one minus its directional albedo, and light is scattered between microfacets (Kulla & Conty, *Revisiting
-physically based shading at Imageworks*, 2017).
+Fresnel for metals, Fresnel's equations for dielectrics) is sampled half by the cosine and half by GGX's half vectors, combined by the
+balance heuristic (Veach & Guibas, *Optimally combining sampling techniques*, SIGGRAPH 1995). Nothing is prefiltered, no sum is split.
+Diffuse reflection gets what the specular layer of a dielectric lets through, one minus its directional albedo, and light is scattered
+between microfacets (Kulla & Conty, *Revisiting physically based shading at Imageworks*, 2017).
 """
 
 from __future__ import annotations
@@ -74,7 +74,8 @@ def render(
 
 def _lost_between_microfacets(nv: Doubles, roughness: Doubles) -> tuple[Doubles, Doubles]:
     """Of lobes with a Fresnel term of 1 the mean albedo over the hemisphere (n,), and (1 − E)/E at n·v (n,), both to .05."""
-    key, inverse = np.unique(np.round(np.stack([np.maximum(nv, 0.05), np.maximum(roughness, 0.05)], 1) * 20) / 20, axis=0, return_inverse=True)
+    rounded = np.round(np.maximum(np.stack([nv, roughness], 1), 0.05) * 20) / 20
+    key, inverse = np.unique(rounded, axis=0, return_inverse=True)
     bright = np.array([sum(single_scattering(float(c), float(r))[:2]) for c, r in key])[inverse.ravel()]
     mean = np.array([mean_bright(float(r)) for _, r in key])[inverse.ravel()]
     return mean, (1 - bright) / bright
