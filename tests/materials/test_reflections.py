@@ -20,6 +20,7 @@ from gsbake.materials.fit_surface import FitSurface
 from gsbake.materials.options import FitSchedule, Priors
 from gsbake.materials.photo_batch import EMISSION, METAL_COLOUR, METALLIC, NORMAL, OCCLUSION, ROUGHNESS
 from gsbake.materials.pixels import PixelReader, Pixels
+from gsbake.materials.reflection_kernel import specular_visibility
 from gsbake.materials.reflections import ReflectionTracer
 from gsbake.materials.visibility import Visibility
 from gsbake.shading.environment import EnvironmentLight
@@ -143,3 +144,17 @@ def test_a_reflected_mirror_shows_the_light_behind_the_viewer() -> None:
     fresnel = (1 - np.sqrt(0.5)) ** 5
     expected = [2 * (f0 + (1 - f0) * fresnel) + emitted for f0, emitted in ((0.9, 0), (0.6, 0), (0.3, 0.5))]
     assert found.tolist() == pytest.approx(expected, rel=0.03)
+
+
+def test_smooth_lobe_goes_by_its_mirror_direction_and_a_rough_one_by_the_ambient_share() -> None:
+    """Half of the hemisphere is blocked; the reflected ray of the first pixel is blocked, that of the second is not."""
+    cosine, half, reflected, none = np.float32(0.8), np.float32(0.5), np.array([7, -1], np.int32), np.zeros(0, np.int32)
+    smooth, rough = np.float32(0.02), np.float32(1)
+    visible, around, incident, texel = specular_visibility(cosine, smooth, half, reflected, 0)
+    assert [visible, around, incident, texel] == pytest.approx([0, 0, 1, 7], abs=1e-3)
+    visible, around, incident, _ = specular_visibility(cosine, smooth, half, reflected, 1)
+    assert [visible, around, incident] == pytest.approx([1, 0, 0], abs=1e-3)
+    for pixels, i in ((reflected, 0), (reflected, 1), (none, 0)):
+        visible, around, incident, _ = specular_visibility(cosine, rough, half, pixels, i)
+        assert [visible, incident] == pytest.approx([0.5, 0], abs=1e-3)
+        assert around == pytest.approx(1, abs=2e-3)  # of the indirect irradiance, which half of the hemisphere sends
