@@ -23,8 +23,8 @@ def test_lambert_under_a_linear_sky() -> None:
 
 def test_white_furnace() -> None:
     view = np.array([[0.6, 0.0, 0.8]])
-    smooth, rough = (render(UP, view, WHITE, np.full(1, r), np.ones(1), lambda d: np.ones((len(d), 3)), 4096) for r in (0.15, 0.9))
-    assert 0.97 < smooth.mean() < 1.001
-    assert 0.4 < rough.mean() < 0.8  # one bounce of a rough metal loses the rest
+    for roughness in (0.15, 0.6, 0.9):  # light between microfacets: a white metal loses nothing
+        metal = render(UP, view, WHITE, np.full(1, roughness), np.ones(1), lambda d: np.ones((len(d), 3)), 4096)
+        np.testing.assert_allclose(metal, 1, atol=0.003)
     dielectric = render(UP, view, WHITE, np.full(1, 0.3), np.zeros(1), lambda d: np.ones((len(d), 3)), 4096)
     np.testing.assert_allclose(dielectric, 1, rtol=0.01)  # what the specular layer lets through is reflected
