@@ -34,6 +34,7 @@ from gsbake.shading.light_tables import LightTables
 from gsbake.shading.split_sum import (
     mirror_weight,
     prefiltered_light,
+    reflectance,
     soft_cosine,
     specular_light,
     specular_occlusion,
@@ -77,15 +78,14 @@ class Batch:
         metal = values[:, 4:]
         parameters = torch.cat([(1 - metal) * values[:, :3], metal * values[:, :3], values[:, 3:]], 1)
         g = _interpolate(parameters, self.texel, self.bilinear)
-        albedo, metal_colour, roughness, metallic = g[:, :3], g[:, 3:6], g[:, 6], g[:, 7:]
+        albedo, metal_colour, roughness, metallic = g[:, :3], g[:, 3:6], g[:, 6], g[:, 7]
         surface, at = unit(self._normals(normal_offset)), self._transport(transport)
         split = brdf.split_sum(soft_cosine((surface * self.view).sum(1)), roughness)
-        scale, bias, dielectric = split.scale[:, None], split.bias[:, None], split.dielectric[:, None]
         diffuse = at.local[:, VISIBILITY, None] * tables.diffuse(surface) + at.local[:, INDIRECT]
         near = self._near_light(surface, roughness.detach(), split, tables, at)
         light = near + split.share[:, None] * (diffuse - near)
-        reflectance = metal_colour * scale + metallic * bias + (1 - metallic) * dielectric
-        return albedo * (1 - dielectric) * diffuse + light * reflectance + at.local[:, EMISSION]
+        below = albedo * (1 - split.dielectric[:, None]) * diffuse
+        return below + light * reflectance(split, metal_colour, metallic) + at.local[:, EMISSION]
 
     def _near_light(
         self, surface: Tensor, roughness: Tensor, split: brdf.SplitSum, tables: LightTables, transport: PixelTransport
@@ -130,9 +130,8 @@ def reflected_radiance(met: Tensor, ray: Tensor, tables: LightTables) -> Tensor:
     visible = specular_occlusion(normal, -ray, roughness, occlusion)
     blocked = ((1 - visible) / (1 - occlusion).clamp_min(MIN_BLOCKED))[:, None] * met[:, INDIRECT]
     light = visible[:, None] * specular_light(normal, -ray, split, tables, tables.diffuse(normal)) + blocked
-    metallic, dielectric = met[:, METALLIC, None], split.dielectric[:, None]
-    reflectance = met[:, METAL_COLOUR] * split.scale[:, None] + metallic * split.bias[:, None] + (1 - metallic) * dielectric
-    return (1 - dielectric) * met[:, DIFFUSE] + met[:, EMISSION] + light * reflectance
+    specular = light * reflectance(split, met[:, METAL_COLOUR], met[:, METALLIC])
+    return (1 - split.dielectric[:, None]) * met[:, DIFFUSE] + met[:, EMISSION] + specular
 
 
 def _interpolate(values: Tensor, texel: Tensor, bilinear: Tensor) -> Tensor:

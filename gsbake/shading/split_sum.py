@@ -69,10 +69,10 @@ def transmitted_share(normal: torch.Tensor, view: torch.Tensor, roughness: torch
     return 1.0 - brdf.split_sum(soft_cosine((unit(normal) * view).sum(dim=1)), roughness).dielectric
 
 
-def reflectance(split: brdf.SplitSum, albedo: torch.Tensor, metallic: torch.Tensor) -> torch.Tensor:
-    """Directional albedo (n, 3) of the specular lobe of materials with `albedo` (n, 3) and `metallic` (n,)."""
+def reflectance(split: brdf.SplitSum, metal_colour: torch.Tensor, metallic: torch.Tensor) -> torch.Tensor:
+    """Directional albedo (n, 3) of the specular lobe of materials of `metallic` (n,); `metal_colour` (n, 3) is albedo times metallic."""
     metal = metallic.unsqueeze(1)
-    return metal * (albedo * split.scale.unsqueeze(1) + split.bias.unsqueeze(1)) + (1.0 - metal) * split.dielectric.unsqueeze(1)
+    return metal_colour * split.scale.unsqueeze(1) + metal * split.bias.unsqueeze(1) + (1.0 - metal) * split.dielectric.unsqueeze(1)
 
 
 def specular_light(
@@ -135,7 +135,7 @@ def _reference(
     split = brdf.split_sum(soft_cosine(cosine.squeeze(1)), roughness)
     irradiance = tables.diffuse(surface)
     diffuse = ((1.0 - metallic) * (1.0 - split.dielectric)).unsqueeze(1) * albedo * irradiance
-    specular = specular_light(surface, view, split, tables, irradiance) * reflectance(split, albedo, metallic)
+    specular = specular_light(surface, view, split, tables, irradiance) * reflectance(split, metallic.unsqueeze(1) * albedo, metallic)
     return visibility_d.unsqueeze(1) * diffuse + visibility_s.unsqueeze(1) * specular
 
 

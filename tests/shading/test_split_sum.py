@@ -12,7 +12,7 @@ from gsbake.geometry.vectors import unit
 from gsbake.shading.environment import EnvironmentLight
 from gsbake.shading.light_tables import LightTables
 from gsbake.shading.split_sum import _reference, shade
-from tests.support.directional_albedo import MEAN_DIELECTRIC, between_microfacets
+from tests.support.directional_albedo import MEAN_DIELECTRIC, between_microfacets, fresnel_of_dielectric
 
 
 def buffers(count: int, seed: int, dtype: torch.dtype = torch.float32) -> list[torch.Tensor]:
@@ -62,7 +62,8 @@ def test_sphere_against_the_rendering_equation() -> None:
     count = 20_000
     u, phi = (np.arange(count) + rng.random(count)) / count, 2 * math.pi * ((np.arange(count) * 0.6180339887) % 1)
     local = np.stack([np.sqrt(u) * np.cos(phi), np.sqrt(u) * np.sin(phi), np.sqrt(1 - u)], axis=1)
-    for roughness, metallic, tolerance in ((0.5, 0.0, 0.02), (0.9, 0.0, 0.02), (0.4, 1.0, 0.1), (0.6, 1.0, 0.1), (0.6, 0.5, 0.1)):
+    dielectrics, metals = ((0.5, 0.0, 0.02), (0.8, 0.0, 0.02), (0.9, 0.0, 0.02)), ((0.4, 1.0, 0.1), (0.6, 1.0, 0.1), (0.9, 0.5, 0.1))
+    for roughness, metallic, tolerance in dielectrics + metals:
         albedo, alpha = np.array([0.6, 0.35, 0.2]), roughness**2
         truth = np.empty_like(normal)
         for i, n in enumerate(normal):
@@ -72,9 +73,7 @@ def test_sphere_against_the_rendering_equation() -> None:
             nl, nv, nh, vh = local[:, 2], n @ view[i], h @ n, h @ view[i]
             density = alpha**2 / (math.pi * (nh**2 * (alpha**2 - 1) + 1) ** 2)
             visibility = 0.5 / (nl * math.sqrt(nv**2 * (1 - alpha**2) + alpha**2) + nv * np.sqrt(nl**2 * (1 - alpha**2) + alpha**2))
-            out, into = np.arccos(vh), np.arcsin(np.sqrt(1 - vh**2) / 1.5)
-            dielectric = 0.5 * ((np.sin(out - into) / np.sin(out + into)) ** 2 + (np.tan(out - into) / np.tan(out + into)) ** 2)
-            dielectric *= between_microfacets(round(nv, 2), roughness, MEAN_DIELECTRIC)
+            dielectric = fresnel_of_dielectric(vh) * between_microfacets(round(nv, 2), roughness, MEAN_DIELECTRIC)
             again = [between_microfacets(round(nv, 2), roughness, f0 + (1 - f0) / 21) for f0 in albedo]
             conductor = (albedo + (1 - albedo) * (1 - vh[:, None]) ** 5) * again
             lobe = density * visibility

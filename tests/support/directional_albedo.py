@@ -8,11 +8,21 @@ from __future__ import annotations
 
 import math
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 #: Mean Fresnel reflectance over the hemisphere, cosine-weighted, of a dielectric of index of refraction 1.5 (d'Eon & Irving, 2011).
 MEAN_DIELECTRIC = 0.0918
+
+
+def fresnel_of_dielectric(cosine: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Reflectance at the cosine of incidence, by Snell's law and Fresnel's two polarisations, index of refraction 1.5."""
+    outside = np.arccos(np.clip(cosine, 1e-9, 1 - 1e-12))
+    inside = np.arcsin(np.sin(outside) / 1.5)
+    across = np.sin(outside - inside) / np.sin(outside + inside)
+    return np.asarray(0.5 * (across**2 + (np.tan(outside - inside) / np.tan(outside + inside)) ** 2))
 
 
 @lru_cache(maxsize=4096)
@@ -34,10 +44,7 @@ def single_scattering(cosine: float, roughness: float) -> tuple[float, float, fl
     lam = lambda c: (np.sqrt(1 + alpha**2 * (1 - c * c) / (c * c)) - 1) / 2  # noqa: E731
     shadow = 1 / (1 + lam(np.where(lit, nl, 1.0)) + lam(cosine))
     value = np.where(lit, density * shadow * vh / cosine * dh, 0.0)
-    vh = np.clip(vh, 1e-9, 1 - 1e-12)
-    schlick = (1 - vh) ** 5
-    out, into = np.arccos(vh), np.arcsin(np.sqrt(1 - vh**2) / 1.5)
-    dielectric = 0.5 * ((np.sin(out - into) / np.sin(out + into)) ** 2 + (np.tan(out - into) / np.tan(out + into)) ** 2)
+    schlick, dielectric = (1 - np.clip(vh, 0, 1)) ** 5, fresnel_of_dielectric(vh)
     return float((value * (1 - schlick)).sum()), float((value * schlick).sum()), float((value * dielectric).sum())
 
 
@@ -50,7 +57,11 @@ def mean_bright(roughness: float) -> float:
 
 def between_microfacets(cosine: float, roughness: float, average: float) -> float:
     """Factor on the albedo by light scattered between microfacets, whose mean Fresnel term is `average`."""
-    mean, bright = mean_bright(roughness), sum(single_scattering(cosine, roughness)[:2])
+    return float(scattered_again(mean_bright(roughness), sum(single_scattering(cosine, roughness)[:2]), average))
+
+
+def scattered_again(mean: Any, bright: Any, average: Any) -> Any:
+    """The same from the albedo `bright` that the lobe has with a Fresnel term of 1, and its mean over the hemisphere."""
     return 1 + average * mean / (1 - average * (1 - mean)) * (1 - bright) / bright
 
 

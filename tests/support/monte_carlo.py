@@ -14,7 +14,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from tests.support.directional_albedo import MEAN_DIELECTRIC, mean_bright, single_scattering
+from tests.support.directional_albedo import MEAN_DIELECTRIC, fresnel_of_dielectric, mean_bright, scattered_again, single_scattering
 
 Doubles = NDArray[np.float64]
 
@@ -39,10 +39,9 @@ def render(
     tangent, across = frames(normal)
     nv = np.maximum((normal * view).sum(1), 1e-3)
     specular, diffuse, reflected = np.zeros((n, 3)), np.zeros((n, 3)), np.zeros(n)
-    mean, lost = _lost_between_microfacets(nv, roughness)
-    average = albedo + (1 - albedo) / 21  # of Schlick's term over the hemisphere
-    again_metal = 1 + average * mean[:, None] / (1 - average * (1 - mean[:, None])) * lost[:, None]
-    again = 1 + MEAN_DIELECTRIC * mean / (1 - MEAN_DIELECTRIC * (1 - mean)) * lost
+    mean, bright = _bright_albedo(nv, roughness)
+    again_metal = scattered_again(mean[:, None], bright[:, None], albedo + (1 - albedo) / 21)  # mean of Schlick's term over the hemisphere
+    again = scattered_again(mean, bright, MEAN_DIELECTRIC)
     for k in range(samples):
         u, turn = (k + draw.random(n)) / samples, 2 * np.pi * draw.random(n)
         if k % 2:
@@ -59,8 +58,7 @@ def render(
         distribution = alpha**2 / (np.pi * (nh**2 * (alpha**2 - 1) + 1) ** 2)
         safe = np.maximum(nl, 1e-6)
         smith = safe * np.sqrt(nv**2 * (1 - alpha**2) + alpha**2) + nv * np.sqrt(safe**2 * (1 - alpha**2) + alpha**2)
-        into = np.sqrt(1 - (1 - vh**2) / 1.5**2)
-        dielectric = 0.5 * again * (((vh - 1.5 * into) / (vh + 1.5 * into)) ** 2 + ((1.5 * vh - into) / (1.5 * vh + into)) ** 2)
+        dielectric = again * fresnel_of_dielectric(vh)
         conductor = again_metal * (albedo + (1 - albedo) * ((1 - vh) ** 5)[:, None])
         fresnel = metallic[:, None] * conductor + ((1 - metallic) * dielectric)[:, None]
         density = 0.5 * safe / np.pi + 0.5 * distribution * nh / (4 * vh)
@@ -72,13 +70,13 @@ def render(
     return np.asarray(specular + (1 - reflected)[:, None] * diffuse)
 
 
-def _lost_between_microfacets(nv: Doubles, roughness: Doubles) -> tuple[Doubles, Doubles]:
-    """Of lobes with a Fresnel term of 1 the mean albedo over the hemisphere (n,), and (1 − E)/E at n·v (n,), both to .05."""
+def _bright_albedo(nv: Doubles, roughness: Doubles) -> tuple[Doubles, Doubles]:
+    """Albedos of lobes with a Fresnel term of 1: the mean over the hemisphere (n,), and that at n·v (n,); n·v and roughness to .05."""
     rounded = np.round(np.maximum(np.stack([nv, roughness], 1), 0.05) * 20) / 20
     key, inverse = np.unique(rounded, axis=0, return_inverse=True)
     bright = np.array([sum(single_scattering(float(c), float(r))[:2]) for c, r in key])[inverse.ravel()]
     mean = np.array([mean_bright(float(r)) for _, r in key])[inverse.ravel()]
-    return mean, (1 - bright) / bright
+    return mean, bright
 
 
 def local(tangent: Doubles, across: Doubles, normal: Doubles, cosine: Doubles, turn: Doubles) -> Doubles:

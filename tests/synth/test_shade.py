@@ -8,6 +8,7 @@ from numpy.random import default_rng
 
 from gsbake.synth import scene
 from gsbake.synth.shade import SAMPLE_SUBSETS, brdf_cosine, make_light_rig, outgoing_radiance
+from tests.support.directional_albedo import fresnel_of_dielectric
 
 OX, OY, _ = scene.ORIGIN
 SIDE = (OX - 0.40, OY, 0.60)  # on the jar, opposite the handle: its whole hemisphere is free
@@ -29,10 +30,7 @@ def textbook(
     d = 1 / (np.pi * a**2 * nh**4 * (1 + tan2 / a**2) ** 2)
     lam = [0.5 * (np.sqrt(1 + a**2 * (1 - c**2) / c**2) - 1) for c in (nl, nv)]
     g = 1 / (1 + lam[0] + lam[1])
-    into = np.arcsin(np.sqrt(1 - vh**2) / 1.5)  # Snell's law, then Fresnel's two polarisations
-    out = np.arccos(vh)
-    dielectric = 0.5 * ((np.sin(out - into) / np.sin(out + into)) ** 2 + (np.tan(out - into) / np.tan(out + into)) ** 2)
-    f = metallic * (albedo + (1 - albedo) * (1 - vh) ** 5) + (1 - metallic) * dielectric
+    f = metallic * (albedo + (1 - albedo) * (1 - vh) ** 5) + (1 - metallic) * fresnel_of_dielectric(vh)
     return nl * (d * g * f / (4 * nl * nv) + transmitted * (1 - metallic) * albedo / np.pi)
 
 
