@@ -6,8 +6,7 @@ summed in a fixed number of chunks. `gather_gradient` adds the pixels' gradients
 `adam_step` adds the priors and updates each texel from its neighbours' old values. Every sum has a fixed order: results do not depend on
 threads.
 
-All literals are float32: a float64 constant would widen the whole expression. The fast-math flags omit `nnan`, because the index clamps
-must hold for NaN.
+All literals are float32: a float64 constant would widen the whole expression.
 """
 
 from __future__ import annotations

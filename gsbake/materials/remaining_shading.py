@@ -82,7 +82,7 @@ def _solve(pairs: tuple[NDArray[Any], ...], widening: float) -> tuple[Doubles, f
     return found, float(agreement.sum())
 
 
-@njit(parallel=True, cache=True, error_model="numpy", fastmath={"contract", "nsz"})
+@njit(parallel=True, cache=True, error_model="numpy")
 def normal_equations(
     first: Any, second: Any, basis: Any, logs: Any, share: Any, scale: Any, found: Any, wider: Any, matrices: Any, rights: Any,
     weights: Any, agreement: Any,

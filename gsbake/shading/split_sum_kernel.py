@@ -4,8 +4,7 @@ Pixels are independent: the forward kernel writes the colour, the backward kerne
 inputs. Gradients of the light table are summed over pixels, in a fixed number of chunks with one table each, so the result does not depend
 on the number of threads.
 
-All literals are float32: a float64 constant would widen the whole expression. The fast-math flags omit `nnan`, because the index clamps
-must hold for NaN.
+All literals are float32: a float64 constant would widen the whole expression.
 """
 
 from __future__ import annotations
@@ -18,7 +17,9 @@ from numba import njit, prange
 
 from gsbake.shading.octahedral import MIN_L1_NORM
 
-_FLAGS: Any = {"fastmath": {"nsz", "arcp", "contract", "afn", "reassoc"}, "error_model": "numpy", "cache": True}
+#: No fast-math flags: Numba optimises the body of a parallel loop once for the process that compiles it and once more for the copy on the
+#: disk, so with them a first run would round differently from all later ones.
+_FLAGS: Any = {"error_model": "numpy", "cache": True}
 
 #: Pixel chunks with separate gradient tables; fixed, for results that do not depend on the number of threads.
 CHUNKS = 8

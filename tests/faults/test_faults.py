@@ -58,6 +58,7 @@ def damages(reference: Reference, folder: Path, count: int, seed: int, stages: t
     return outcomes
 
 
+@pytest.mark.timeout(900)  # its fixture is a whole bake, on a fresh machine with the compilation of all kernels
 def test_a_few_kills(reference: Reference, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     tell(capsys, "kills", kills(reference, tmp_path, 1, 1))
 
