@@ -11,17 +11,17 @@ environment. Rows replace those of the same object, profile, seed, overrides and
 from __future__ import annotations
 
 import argparse
-import csv
 import json
 import statistics
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from benchmarks.csv_rows import read_rows, write_rows
 from benchmarks.objects.entries import Entry, read_entries
 from benchmarks.timeline import ROOT
 from gsbake.errors import GsbakeError
@@ -72,24 +72,6 @@ def row_of(entry: Entry, arguments: argparse.Namespace, commit: str, seconds: fl
     figures = {column: round(float(score[name]), 4) for column, name in FIGURES.items()}
     run = arguments.profile, " ".join(sorted(arguments.settings)), arguments.seed, commit, cpu_name(), round(seconds, 1)
     return Row(entry.name, entry.metal, *run, **figures, gains=gains)
-
-
-def read_rows(path: Path) -> list[Row]:
-    """The rows of a CSV file written by `write_rows`; none when it does not exist."""
-    if not path.is_file():
-        return []
-    kinds: dict[str, Callable[[str], Any]] = {f.name: {"int": int, "float": float}.get(str(f.type), str) for f in fields(Row)}
-    with path.open(newline="") as file:
-        return [Row(**{name: kinds[name](value) for name, value in line.items()}) for line in csv.DictReader(file)]
-
-
-def write_rows(path: Path, rows: Sequence[Row]) -> None:
-    """Write rows; of several with one key, the last."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("w", newline="") as file:
-        writer = csv.DictWriter(file, [f.name for f in fields(Row)], lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(asdict(row) for row in {row.key: row for row in rows}.values())
 
 
 def markdown(rows: Sequence[Row]) -> str:
@@ -189,7 +171,7 @@ def main() -> None:
             print(f"{name}: {error}", file=sys.stderr)
             continue
         rows.append(row_of(entry, arguments, commit, seconds, found))
-        write_rows(arguments.csv, [*read_rows(arguments.csv), rows[-1]])
+        write_rows(arguments.csv, [*read_rows(arguments.csv, Row), rows[-1]])
         print(markdown(rows[-1:]), flush=True)
     if not rows:
         sys.exit(1)

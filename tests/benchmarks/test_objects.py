@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from benchmarks.objects.__main__ import Row, markdown, read_rows, write_rows
+from benchmarks.csv_rows import read_rows, write_rows
+from benchmarks.objects.__main__ import Row, markdown
 from benchmarks.objects.entries import read_entries
 from benchmarks.objects.models import MODELS, Material, model_glb
 from gsbake.errors import BadInputError
@@ -95,7 +96,7 @@ def test_rows_survive_the_file_and_replace_their_like(tmp_path: Path) -> None:
     """A measured row replaces that of the same object and commit, and no other."""
     path = tmp_path / "rows.csv"
     write_rows(path, [row("toy", 20.0), row("vase", 22.0), row("toy", 24.0, "b"), row("toy", 26.0)])
-    found = read_rows(path)
+    found = read_rows(path, Row)
     assert sorted((r.object, r.commit, r.relit) for r in found) == [("toy", "a", 26.0), ("toy", "b", 24.0), ("vase", "a", 22.0)]
     assert found[0].seed == 0 and found[0].gains == "1.00 1.10 0.90"
 

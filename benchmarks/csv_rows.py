@@ -1,0 +1,40 @@
+"""CSV files of benchmark rows: dataclasses of texts, whole numbers and floats, of which those with one `key` replace each other."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, fields
+from pathlib import Path
+from typing import Any, Protocol, TypeVar
+
+
+class KeyedRow(Protocol):
+    """A dataclass with a key."""
+
+    __dataclass_fields__: dict[str, Any]
+
+    @property
+    def key(self) -> tuple[str, ...]:
+        """Rows of one key replace each other."""
+
+
+AnyRow = TypeVar("AnyRow", bound=KeyedRow)
+
+
+def read_rows(path: Path, kind: type[AnyRow]) -> list[AnyRow]:
+    """The rows of a CSV file written by `write_rows`; none when it does not exist."""
+    if not path.is_file():
+        return []
+    parsers: dict[str, Callable[[str], Any]] = {f.name: {"int": int, "float": float}.get(str(f.type), str) for f in fields(kind)}
+    with path.open(newline="") as file:
+        return [kind(**{name: parsers[name](value) for name, value in line.items()}) for line in csv.DictReader(file)]
+
+
+def write_rows(path: Path, rows: Sequence[KeyedRow]) -> None:
+    """Write one or more rows of one kind; of several with one key, the last."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("w", newline="") as file:
+        writer = csv.DictWriter(file, [f.name for f in fields(rows[0])], lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(asdict(row) for row in {row.key: row for row in rows}.values())
