@@ -1,11 +1,12 @@
 """Ablation of the material fit's rules over many objects: the bake of finished runs once more without each of them, scored.
 
-python -m benchmarks.ablation RUNS CAPTURES OUT [--only brass_vase,toy] [--rules metal-trials,emission] [--seed 0] [--scorer DIR]
-    [--csv FILE]
+python -m benchmarks.ablation RUNS CAPTURES OUT [--only brass_vase,toy] [--rules metal-trials,emission] [--seed 0] [--views 0]
+    [--scorer DIR] [--csv FILE]
 
 RUNS has a folder of a finished run (`--profile relight`) per object, CAPTURES the capture of the same name with its reference in `gt/`;
 `benchmarks.objects` makes both. Mesh, poses and photos are those of the run. The first row of an object has all rules, then one is taken
-out at a time (`RULES`), by replacing its function in this process. Seconds are those of the bake. Rows have commit, host and seed, and
+out at a time (`RULES`), by replacing its function in this process. Seconds are those of the bake. `--views` scores on that many of the
+reference's views, evenly chosen, instead of all. Rows have commit, host and seed, and
 replace those of the same object, rule, seed and commit in the CSV file. The table at the end has, for each rule, what it brings on the
 objects whose figures it changes: the mean, and the worst object.
 """
@@ -15,6 +16,7 @@ from __future__ import annotations
 import argparse
 import json
 import statistics
+import shutil
 import subprocess
 import sys
 import time
@@ -28,6 +30,7 @@ from unittest.mock import patch
 import numpy as np
 
 from benchmarks.csv_rows import read_rows, write_rows
+from benchmarks.materials import truth_subset
 from benchmarks.objects.__main__ import FIGURES, PYTHON, SCORER, current_commit, score
 from benchmarks.timeline import ROOT
 from gsbake.config.load import load_profile
@@ -140,6 +143,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--only", type=lambda text: text.split(","), metavar="NAME,…", help="all finished runs by default")
     parser.add_argument("--rules", type=lambda text: text.split(","), default=list(RULES), metavar="RULE,…", help="all by default")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--views", type=int, default=0, help="0: all")
     parser.add_argument("--scorer", type=Path, default=SCORER)
     parser.add_argument("--csv", type=Path, default=RESULTS)
     options = parser.parse_args(arguments)
@@ -150,12 +154,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
     names = options.only or sorted(path.parent.name for path in options.runs.glob("*/asset.glb"))
     commit, failed = current_commit(), 0
     for name in names:
+        scored, capture = options.out / "truth" / name, options.captures / name
+        shutil.rmtree(scored, ignore_errors=True)
+        scored.mkdir(parents=True)
+        if truth_subset(capture / "gt", options.views, scored / "gt") == capture / "gt":
+            scored = capture
         for rule in dict.fromkeys(["none", *options.rules]):
-            out, capture = options.out / rule / name, options.captures / name
+            out = options.out / rule / name
             try:
                 seconds = bake_without(rule, options.runs / name, out, options.seed)
-                given = (capture / "transforms.json").is_file()
-                found = score(capture, out / "asset.glb", None if given else out / "cameras.json", options.scorer)
+                cameras = None if (capture / "transforms.json").is_file() else out / "cameras.json"
+                found = score(scored, out / "asset.glb", cameras, options.scorer)
             except (GsbakeError, subprocess.CalledProcessError) as error:
                 print(f"{name} without {rule}: {error}", file=sys.stderr)
                 failed += 1

@@ -55,7 +55,7 @@ def table(cameras: Sequence[Camera], masks: Sequence[Bytes], groups: int) -> str
     everything = range(len(cameras))
     lines = ["| photos | own hull leaves out, median (worst) | hull of all |", "|---|---|---|"]
     of_all = left_out(cameras, masks, everything, everything)
-    for group in np.array_split(np.arange(len(cameras)), groups):
+    for group in (part.tolist() for part in np.array_split(np.arange(len(cameras)), groups)):
         own, every = left_out(cameras, masks, group, group), of_all[group]
         figures = (f"{np.median(shares):.2%} ({shares.max():.2%})" for shares in (own, every))
         lines.append(f"| {cameras[group[0]].name} to {cameras[group[-1]].name} | {' | '.join(figures)} |")

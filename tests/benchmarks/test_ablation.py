@@ -1,0 +1,42 @@
+"""The ablation of the material fit: every rule can be taken out, and the table has what each brings."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from benchmarks import ablation
+from benchmarks.ablation import RULES, SETTINGS, Row, markdown
+from benchmarks.csv_rows import read_rows, write_rows
+from gsbake.config.load import load_profile
+from gsbake.materials.fit import MaterialFit
+
+ROW = Row("toy", "none", 0, "abc1234", "cpu", 60.0, 25.0, 26.0, 23.0, 24.0, 0.1, 0.2)
+
+
+@pytest.mark.parametrize("rule", [rule for rule in RULES if rule != "none"])
+def test_rules_are_taken_out_and_put_back(rule: str) -> None:
+    """A rule whose function is renamed is found here; settings are valid."""
+    before = MaterialFit.__dict__.get("_search_metals")
+    with RULES[rule]() as replaced:
+        assert (replaced is not None) != (rule in SETTINGS)
+    assert MaterialFit.__dict__.get("_search_metals") is before
+    load_profile("relight", [SETTINGS[rule]] if rule in SETTINGS else [])
+
+
+def test_a_rule_is_judged_on_the_objects_that_it_changes(tmp_path: Path) -> None:
+    rows = [ROW, replace(ROW, object="stool"), replace(ROW, object="steel")]
+    rows += [replace(ROW, rule="emission", relit=24.0, seconds=50.0), replace(ROW, rule="emission", object="stool", relit=25.5, base=22.0)]
+    rows += [replace(ROW, rule="emission", object="steel"), replace(ROW, rule="sparsity")]
+    write_rows(tmp_path / "rows.csv", [*rows, rows[0]])
+    assert read_rows(tmp_path / "rows.csv", Row) == rows
+    lines = markdown(rows).splitlines()
+    assert lines[2] == "| emission | 2 of 3 | +0.2 (+0.0) | -0.5 stool | +0.5 (+0.0) | +0.0 toy | +0.000 | +5 |"
+    assert lines[3] == "| sparsity | 0 of 1 | – | – | – | – | – | – |"
+
+
+def test_unfinished_runs_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(ablation.UsageError, match="no finished stage ingest"):
+        ablation.bake_without("none", tmp_path, tmp_path / "out", 0)
