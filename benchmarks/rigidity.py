@@ -3,11 +3,11 @@
 python -m benchmarks.rigidity RUN [--groups 4] [--without NAME,…]
 
 RUN is the folder of a run whose stage `poses` is finished, all photos with masks. The hull of some photos covers the silhouettes in these
-photos, whatever its shape, as far as masks and poses are right and nothing moves (Laurentini, *The visual hull concept for silhouette-based
-image understanding*, PAMI 1994). Photos are taken in the order of their names, in groups of equal size. A line per group has the share of
-its silhouettes that the group's own hull leaves out, and the hull of all photos: median and worst. Where the first is small and the second
-is not, the object changed between the groups (a lid, a hinge, cloth), and no rigid asset has all the silhouettes. A cell that one photo
-excludes is outside: `--without` leaves out photos whose masks are known to be wrong.
+photos as far as masks and poses are right and nothing moves (`gsbake.capture.hull.rigidity`, which warns of it in runs). Photos are taken
+in the order of their names, in groups of equal size. A line per group has the share of its silhouettes that the group's own hull leaves
+out, and the hull of all photos: median and worst. Where the first is small and the second is not, the object changed between the groups (a
+lid, a hinge, cloth), and no rigid asset has all the silhouettes. A cell that one photo excludes is outside: `--without` leaves out photos
+whose masks are known to be wrong.
 """
 
 from __future__ import annotations
@@ -17,47 +17,36 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from gsbake.capture.hull.rigidity import left_out
 from gsbake.capture.hull.visual_hull import Hull, read_masks
 from gsbake.capture.posed_photos import PosedPhotos
 from gsbake.errors import GsbakeError, UsageError
 from gsbake.geometry.cameras import Camera
-from gsbake.geometry.raycast import RayCaster
 from gsbake.pipeline.store import Store
 
-#: Cells along an edge of the hulls, and pixels at the masks' edges that do not count: about a cell.
-RESOLUTION, BORDER = 192, 3
+#: Cells along an edge of the hulls.
+RESOLUTION = 192
 
 Bytes = NDArray[np.uint8]
 
 
-def left_out(cameras: Sequence[Camera], masks: Sequence[Bytes], hull: Sequence[int], shown: Sequence[int]) -> NDArray[np.float64]:
-    """Share of the silhouette in each of the photos `shown` that the visual hull of the photos `hull` leaves out.
-
-    `cameras` are pinholes of the sizes of the `masks` (h, w), in the unit frame.
-    """
-    used = [cameras[i] for i in hull], [masks[i] for i in hull]
-    found = Hull.from_masks(*used, np.zeros(3), 1.0, RESOLUTION, max_inconsistent_share=0.0)
-    caster, shares = RayCaster(*found.triangles()), []
-    kernel = np.ones((2 * BORDER + 1, 2 * BORDER + 1), np.uint8)
-    for camera, mask in ((cameras[i], masks[i]) for i in shown):
-        inside = cv2.erode((mask > 127).astype(np.uint8), kernel) > 0
-        hit = caster.first_hit(camera.centre[None], camera.rays().reshape(-1, 3)).hit.reshape(inside.shape)
-        shares.append(float((inside & ~hit).sum() / max(1, inside.sum())))
-    return np.array(shares)
+def shares(cameras: Sequence[Camera], masks: Sequence[Bytes], used: Sequence[int], shown: Sequence[int]) -> NDArray[np.float64]:
+    """Share of the silhouette in each of the photos `shown` that the visual hull of the photos `used` leaves out."""
+    hull = Hull.from_masks([cameras[i] for i in used], [masks[i] for i in used], np.zeros(3), 1.0, RESOLUTION, max_inconsistent_share=0.0)
+    return left_out(hull, [cameras[i] for i in shown], [masks[i] for i in shown])
 
 
 def table(cameras: Sequence[Camera], masks: Sequence[Bytes], groups: int) -> str:
     """A Markdown table with a line per group of photos."""
     everything = range(len(cameras))
     lines = ["| photos | own hull leaves out, median (worst) | hull of all |", "|---|---|---|"]
-    of_all = left_out(cameras, masks, everything, everything)
+    of_all = shares(cameras, masks, everything, everything)
     for group in (part.tolist() for part in np.array_split(np.arange(len(cameras)), groups)):
-        own, every = left_out(cameras, masks, group, group), of_all[group]
-        figures = (f"{np.median(shares):.2%} ({shares.max():.2%})" for shares in (own, every))
+        own, every = shares(cameras, masks, group, group), of_all[group]
+        figures = (f"{np.median(found):.2%} ({found.max():.2%})" for found in (own, every))
         lines.append(f"| {cameras[group[0]].name} to {cameras[group[-1]].name} | {' | '.join(figures)} |")
     return "\n".join(lines)
 

@@ -18,7 +18,7 @@ def run(ctx: Context) -> dict[str, Any]:
 
 STAGE = Stage(
     name="stereo",
-    version=9,
+    version=10,
     title="Multi-view stereo",
     run=run,
     summary="{points} points, {confirmed_share:%} of the object confirmed",

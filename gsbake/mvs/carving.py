@@ -59,11 +59,14 @@ class RegionLimits:
 
     surface: float
     soft: float
-    opening: float
+    opening: float = 0.0
 
 
-#: Limits of a region, and of what is left of one that violates silhouettes without its hard cells.
-REGION, REMAINDER = RegionLimits(0.05, 0.15, 0.0), RegionLimits(0.0, 0.6, 1.0)
+#: Limits of a region: either many votes for its surface or a soft opening. Behind a glossy front most depths are mirror images, whose votes
+#: are less than the first and which open through less than the second.
+REGION = (RegionLimits(0.12, 0.15), RegionLimits(0.05, 0.3))
+#: Those of what is left of a region that violates silhouettes, without its hard cells.
+REMAINDER = (RegionLimits(0.0, 0.6, 1.0),)
 
 
 @dataclass(frozen=True)
@@ -187,9 +190,10 @@ def _hard_cells(solid: NDArray[np.bool_], softness: Floats) -> NDArray[np.bool_]
 
 
 def _carvable_regions(
-    free: NDArray[np.bool_], solid: NDArray[np.bool_], surface_share: Floats, softness: Floats, limits: RegionLimits
+    free: NDArray[np.bool_], solid: NDArray[np.bool_], surface_share: Floats, softness: Floats, limits: Sequence[RegionLimits]
 ) -> tuple[NDArray[np.int32], NDArray[np.bool_], int]:
-    """Regions of `free` cells connected to the outside: labels (n, n, n), which labels (k,) keep to the `limits`, and how many do not."""
+    """Regions of `free` cells connected to the outside: labels (n, n, n), which labels (k,) keep to some of the `limits`, and how many
+    keep to none."""
     outside, shell = ~solid, solid & ~ndimage.binary_erosion(solid)
     # A tunnel one cell wide is a leak, not a concavity.
     free = free & ndimage.binary_opening(free | outside, ndimage.generate_binary_structure(3, 1))
@@ -204,11 +208,11 @@ def _carvable_regions(
             continue
         exposed = ndimage.binary_dilation(region) & solid[wider] & ~reached[wider]
         opening = softness[wider][region & shell[wider]]
-        keep[number] = (
-            exposed.any()
-            and surface_share[wider][exposed].mean() >= limits.surface
-            and (opening > SOFT).sum() >= limits.soft * len(opening)
-            and len(opening) >= limits.opening * region.sum() ** (2 / 3)
+        keep[number] = exposed.any() and any(
+            surface_share[wider][exposed].mean() >= limit.surface
+            and (opening > SOFT).sum() >= limit.soft * len(opening)
+            and len(opening) >= limit.opening * region.sum() ** (2 / 3)
+            for limit in limits
         )
         refused += not keep[number]
     return label, keep, refused

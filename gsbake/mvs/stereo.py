@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from gsbake.capture.hull.rigidity import moved_part
 from gsbake.capture.hull.softness import SOFT, surface_softness
 from gsbake.capture.hull.thin_parts import find_thin_parts
 from gsbake.capture.hull.visual_hull import Hull, read_masks, unit_hull
@@ -100,6 +101,9 @@ def _hull(posed: PosedPhotos, monitor: Monitor) -> tuple[Hull | None, NDArray[np
             masks = read_masks(posed)
             hull = unit_hull(*masks)
             hull, softness = (None, None) if hull.empty else (hull, surface_softness(hull, *masks))
+        with monitor.part("rigidity"):
+            if hull is not None and (warning := moved_part(hull, *masks)):
+                monitor.warn(warning)
     bounds = "visual hull" if hull is not None else "unit sphere"
     monitor.decide("depth bounds", bounds, "all photos have masks" if hull is not None else "not all photos have masks")
     return hull, softness

@@ -183,6 +183,20 @@ def test_what_remains_of_a_region_must_open_widely() -> None:
             assert label.max() == 1 and keep.tolist() == [False, kept] and refused == (not kept)
 
 
+def test_few_votes_need_a_softer_opening() -> None:
+    """Depths behind a glossy front vote for few surfaces, and open through a front that is soft here and there."""
+    hull = ball()
+    axis = hull.lower[0] + (np.arange(CELLS) + 0.5) * hull.cell
+    cells = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1)
+    solid = hull.field < 0
+    bowl = solid & (np.linalg.norm(cells - BOWL, axis=-1) < HOLLOW)
+    some, half = np.random.default_rng(0).random(hull.field.shape) < 0.2, cells[..., 1] > 0
+    for soft, votes, kept in ((some, 0.08, False), (some, 0.2, True), (half, 0.08, True), (half, 0.03, False)):
+        softness = np.where(soft, 2 * SOFT, 0.5 * SOFT).astype(np.float32)
+        _, keep, _ = _carvable_regions(bowl, solid, np.full(hull.field.shape, votes, np.float32), softness, REGION)
+        assert keep.tolist() == [False, kept]
+
+
 def test_rays_are_empty_without_remaining_cells() -> None:
     hull = ball()
     middle = np.array([[CELLS // 2, CELLS // 2, CELLS // 2]])
