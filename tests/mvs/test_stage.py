@@ -88,6 +88,21 @@ def test_resume_after_interruption(poses: Path, done: tuple[Path, dict[str, Any]
     assert (tmp_path / "again" / "hull.npz").read_bytes() == (done[0] / "hull.npz").read_bytes()
 
 
+def test_silhouettes_of_an_object_that_is_not_rigid_are_a_warning(
+    poses: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The stage asks about the hull of all masks; `tests/capture/hull/test_rigidity.py` has what is found."""
+    asked, monitor = [], Recorder()
+
+    def moved_part(hull: Hull, cameras: list[Any], masks: list[Any]) -> str:
+        asked.append((hull, len(cameras), len(masks)))
+        return "moved"
+
+    monkeypatch.setattr("gsbake.mvs.stereo.moved_part", moved_part)
+    run(poses, tmp_path / "out", monitor, max_size=64)
+    assert monitor.warnings[:1] == ["moved"] and asked[0][1:] == (len(CAMERAS), len(CAMERAS)) and not asked[0][0].empty
+
+
 def test_skipping(poses: Path, tmp_path: Path) -> None:
     assert run(poses, tmp_path / "never", enabled="never") == {"points": 0} and not list((tmp_path / "never").iterdir())
     few, monitor = tmp_path / "few", Recorder()

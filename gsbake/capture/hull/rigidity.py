@@ -56,8 +56,7 @@ def moved_part(hull: Hull, cameras: Sequence[Camera], masks: Sequence[Bytes]) ->
     `cameras` and `masks` (h, w) are those of the hull, in the order in which the photos were taken.
     """
     count = min(GROUPS, len(masks) // MIN_GROUP)
-    much = float(np.quantile(left_out(hull, cameras, masks), QUANTILE))
-    if count < 2 or much < MIN_LEFT_OUT:
+    if count < 2 or (much := float(np.quantile(left_out(hull, cameras, masks), QUANTILE))) < MIN_LEFT_OUT:
         return None
     own = 0.0
     for group in np.array_split(np.arange(len(masks)), count):
