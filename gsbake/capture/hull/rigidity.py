@@ -41,7 +41,8 @@ def left_out(hull: Hull, cameras: Sequence[Camera], masks: Sequence[Bytes]) -> N
     middle = hull.lower + 0.5 * hull.cell * np.array(hull.occupancy.shape)
     for camera, mask in zip(cameras, masks, strict=True):
         small = camera.downscaled_to(COMPARED_SIZE)
-        border = math.ceil(small.fx * hull.cell / max(float(np.linalg.norm(small.centre - middle)), 1e-6))
+        distance = max(float(np.linalg.norm(small.centre - middle)), hull.cell)  # a camera may be inside
+        border = min(COMPARED_SIZE, math.ceil(small.fx * hull.cell / distance))
         inside = cv2.resize(mask, (small.width, small.height), interpolation=cv2.INTER_AREA) > 127
         inside = cv2.erode(inside.astype(np.uint8), np.ones((2 * border + 1, 2 * border + 1), np.uint8)) > 0
         hit = caster.first_hit(small.centre[None], small.rays().reshape(-1, 3)).hit.reshape(inside.shape)

@@ -52,6 +52,14 @@ def test_a_part_that_moved_is_found(cameras: list[Camera], still: list[np.ndarra
     assert "A part has moved between photos" in str(moved_part(hull, cameras, masks))
 
 
+def test_a_camera_in_the_object_sees_nothing_missing(cameras: list[Camera], still: list[np.ndarray]) -> None:
+    """Its border of one cell is the whole photo."""
+    inside = look_at("in", np.zeros(3), np.array([1.0, 0.0, 0.0]), 0.0, 300.0, (80.0, 80.0), 160)
+    full = np.full((160, 160), 255, np.uint8)
+    hull = unit_hull(cameras, still)
+    assert left_out(hull, [*cameras, inside], [*still, full])[-1] == 0
+
+
 def test_wrong_masks_are_no_motion(cameras: list[Camera], still: list[np.ndarray]) -> None:
     """Four of sixteen masks, in both groups, lack half the object: the hull leaves out much, but so do those of the groups."""
     masks = [mask.copy() for mask in still]
