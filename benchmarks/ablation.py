@@ -33,8 +33,9 @@ from benchmarks.csv_rows import read_rows, write_rows
 from benchmarks.materials import truth_subset
 from benchmarks.objects.__main__ import FIGURES, PYTHON, SCORER, current_commit, score
 from benchmarks.timeline import ROOT
+from benchmarks.upper_bound import finished_folders
 from gsbake.config.load import load_profile
-from gsbake.errors import GsbakeError, UsageError
+from gsbake.errors import GsbakeError
 from gsbake.gltf.export import ExportOptions, export_asset
 from gsbake.materials.bake import BakeOptions, bake_textures
 from gsbake.materials.fit import MaterialFit
@@ -42,10 +43,8 @@ from gsbake.materials.initialisation import DEFAULT_START
 from gsbake.materials.light_intensity import LightAdjustment
 from gsbake.materials.metal_trials import TrialResult
 from gsbake.pipeline.machine import cpu_name
-from gsbake.pipeline.store import Store
 
 RESULTS = ROOT / "benchmarks" / "results" / "ablation.csv"
-STAGES = ("ingest", "poses", "refine", "mesh", "bake")
 
 _UNCHANGED = LightAdjustment(np.ones(3), 1.0, 0.0, 0.0)
 #: {rule: what takes it out of the fit}.
@@ -95,11 +94,7 @@ def bake_without(rule: str, run: Path, out: Path, seed: int) -> float:
 
     Raises UsageError when the run is not finished.
     """
-    store = Store(run)
-    known = {name: store.manifests(name) for name in STAGES}
-    if missing := [name for name in STAGES if not known[name]]:
-        raise UsageError(f"{run} has no finished stage {missing[0]}; run `gsbake run` to its end first.")
-    folder = {name: found[0][0] for name, found in known.items()}
+    folder = finished_folders(run)
     manifest = json.loads((folder["bake"] / "manifest.json").read_text(encoding="utf-8"))
     overrides = [f"{key}={value}" for key, value in manifest["settings"].items()]
     profile = load_profile("relight", [*overrides, *([SETTINGS[rule]] if rule in SETTINGS else [])]).profile
@@ -154,11 +149,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     names = options.only or sorted(path.parent.name for path in options.runs.glob("*/asset.glb"))
     commit, failed = current_commit(), 0
     for name in names:
-        scored, capture = options.out / "truth" / name, options.captures / name
-        shutil.rmtree(scored, ignore_errors=True)
-        scored.mkdir(parents=True)
-        if truth_subset(capture / "gt", options.views, scored / "gt") == capture / "gt":
-            scored = capture
+        subset, capture = options.out / "truth" / name / "gt", options.captures / name
+        shutil.rmtree(subset, ignore_errors=True)
+        scored = truth_subset(capture / "gt", options.views, subset).parent
         for rule in dict.fromkeys(["none", *options.rules]):
             out = options.out / rule / name
             try:

@@ -30,15 +30,20 @@ from gsbake.texturing.texels import rasterise
 STAGES = ("ingest", "poses", "refine", "mesh", "bake")
 
 
-def lay_true_maps(run: Path, capture: Path, out: Path, normals: bool = False) -> None:
-    """Write the asset of `run` with the true maps of `capture` to `out`. Raises UsageError when the run is not finished."""
-    from safetensors.numpy import load_file
-
+def finished_folders(run: Path) -> dict[str, Path]:
+    """{stage: artifact folder} of `STAGES`. Raises UsageError when the run is not finished."""
     store = Store(run)
     known = {name: store.manifests(name) for name in STAGES}
     if missing := [name for name in STAGES if not known[name]]:
         raise UsageError(f"{run} has no finished stage {missing[0]}; run `gsbake run` to its end first.")
-    folder = {name: found[0][0] for name, found in known.items()}
+    return {name: found[0][0] for name, found in known.items()}
+
+
+def lay_true_maps(run: Path, capture: Path, out: Path, normals: bool = False) -> None:
+    """Write the asset of `run` with the true maps of `capture` to `out`. Raises UsageError when the run is not finished."""
+    from safetensors.numpy import load_file
+
+    folder = finished_folders(run)
     baked = out / "baked"
     shutil.rmtree(baked, ignore_errors=True)
     shutil.copytree(folder["bake"], baked)

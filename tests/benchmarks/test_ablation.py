@@ -11,6 +11,7 @@ from benchmarks import ablation
 from benchmarks.ablation import RULES, SETTINGS, Row, markdown
 from benchmarks.csv_rows import read_rows, write_rows
 from gsbake.config.load import load_profile
+from gsbake.errors import UsageError
 from gsbake.materials.fit import MaterialFit
 
 ROW = Row("toy", "none", 0, "abc1234", "cpu", 60.0, 25.0, 26.0, 23.0, 24.0, 0.1, 0.2)
@@ -38,5 +39,5 @@ def test_a_rule_is_judged_on_the_objects_that_it_changes(tmp_path: Path) -> None
 
 
 def test_unfinished_runs_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(ablation.UsageError, match="no finished stage ingest"):
+    with pytest.raises(UsageError, match="no finished stage ingest"):
         ablation.bake_without("none", tmp_path, tmp_path / "out", 0)
