@@ -5,10 +5,10 @@ python -m benchmarks.ablation RUNS CAPTURES OUT [--only brass_vase,toy] [--rules
 
 RUNS has a folder of a finished run (`--profile relight`) per object, CAPTURES the capture of the same name with its reference in `gt/`;
 `benchmarks.objects` makes both. Mesh, poses and photos are those of the run. The first row of an object has all rules, then one is taken
-out at a time (`RULES`), by replacing its function in this process. Seconds are those of the bake. `--views` scores on that many of the
-reference's views, evenly chosen, instead of all. Rows have commit, host and seed, and
-replace those of the same object, rule, seed and commit in the CSV file. The table at the end has, for each rule, what it brings on the
-objects whose figures it changes: the mean, and the worst object.
+out at a time (`RULES`), by replacing its function in this process. Seconds are those of the bake; set OMP_WAIT_POLICY=PASSIVE where other
+work runs beside it. `--views` scores on that many of the reference's views, evenly chosen, instead of all. Rows have commit, host and
+seed, and replace those of the same object, rule, seed and commit in the CSV file. The table at the end has, for each rule, what it brings
+on the objects whose figures it changes: the mean, and the worst object.
 """
 
 from __future__ import annotations
@@ -99,7 +99,8 @@ def bake_without(rule: str, run: Path, out: Path, seed: int) -> float:
     overrides = [f"{key}={value}" for key, value in manifest["settings"].items()]
     profile = load_profile("relight", [*overrides, *([SETTINGS[rule]] if rule in SETTINGS else [])]).profile
     baked = out / "baked"
-    baked.mkdir(parents=True, exist_ok=True)
+    shutil.rmtree(out, ignore_errors=True)  # of a run that was stopped
+    baked.mkdir(parents=True)
     begun = time.perf_counter()
     with RULES[rule]():
         bake_textures(folder["poses"], folder["refine"], folder["mesh"], baked, BakeOptions.of(profile), seed=seed)

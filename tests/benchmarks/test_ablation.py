@@ -41,3 +41,16 @@ def test_a_rule_is_judged_on_the_objects_that_it_changes(tmp_path: Path) -> None
 def test_unfinished_runs_are_refused(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="no finished stage ingest"):
         ablation.bake_without("none", tmp_path, tmp_path / "out", 0)
+
+
+def test_what_a_stopped_run_left_is_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The export writes into a folder that it makes."""
+    out, folders = tmp_path / "out", {stage: tmp_path / stage for stage in ("ingest", "poses", "refine", "mesh", "bake")}
+    folders["bake"].mkdir()
+    (folders["bake"] / "manifest.json").write_text('{"settings": {}}')
+    (out / "previews").mkdir(parents=True)
+    monkeypatch.setattr(ablation, "finished_folders", lambda run: folders)
+    monkeypatch.setattr(ablation, "bake_textures", lambda *_, **__: None)
+    monkeypatch.setattr(ablation, "export_asset", lambda *_: (out / "previews").mkdir())
+    ablation.bake_without("none", tmp_path, out, 0)
+    assert sorted(path.name for path in out.iterdir()) == ["baked", "previews"]

@@ -22,8 +22,8 @@ Bytes = NDArray[np.uint8]
 
 #: Longer side in pixels of the images in which hull and masks are compared.
 COMPARED_SIZE = 256
-#: A hull leaves out too much where it leaves out this share of the silhouettes or more, in the quantile of the photos. Two rendered objects
-#: and a real one that are rigid have less than .0001, a real one with a lid that moved .016.
+#: A hull leaves out too much where it leaves out this share of the silhouettes or more, in the quantile of the photos. Of seven
+#: captures with masks one with a lid that moved is above it, and one whose masks disagree within groups of photos too.
 MIN_LEFT_OUT, QUANTILE = 0.005, 0.9
 #: The object moved between groups of photos whose own hulls leave out less than this part of that; at most so many groups, of so many
 #: photos, with hulls of so many cells along an edge.
