@@ -99,7 +99,7 @@ def bake_without(rule: str, run: Path, out: Path, seed: int) -> float:
     overrides = [f"{key}={value}" for key, value in manifest["settings"].items()]
     profile = load_profile("relight", [*overrides, *([SETTINGS[rule]] if rule in SETTINGS else [])]).profile
     baked = out / "baked"
-    shutil.rmtree(out, ignore_errors=True)  # of a run that was stopped
+    shutil.rmtree(baked, ignore_errors=True)  # of a run that was stopped
     baked.mkdir(parents=True)
     begun = time.perf_counter()
     with RULES[rule]():

@@ -172,7 +172,7 @@ def _write_light(baked: Path, out: Path, frame: Similarity) -> None:
 
 def _write_previews(folder: Path, maps: TextureMaps, mesh: GltfMesh) -> None:
     """Write PNG previews of the maps and of the UV layout."""
-    folder.mkdir()
+    folder.mkdir(exist_ok=True)  # as the other files, those of an earlier export are overwritten
     size = min(PREVIEW_SIZE, maps.base_color.shape[0])
 
     def reduced(image: NDArray[np.uint8]) -> NDArray[np.uint8]:

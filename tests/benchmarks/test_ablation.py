@@ -44,13 +44,14 @@ def test_unfinished_runs_are_refused(tmp_path: Path) -> None:
 
 
 def test_what_a_stopped_run_left_is_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The export writes into a folder that it makes."""
+    """A texture that the new bake does not write would be exported with it."""
     out, folders = tmp_path / "out", {stage: tmp_path / stage for stage in ("ingest", "poses", "refine", "mesh", "bake")}
     folders["bake"].mkdir()
     (folders["bake"] / "manifest.json").write_text('{"settings": {}}')
-    (out / "previews").mkdir(parents=True)
+    (out / "baked").mkdir(parents=True)
+    (out / "baked" / "emissive.exr").touch()
     monkeypatch.setattr(ablation, "finished_folders", lambda run: folders)
     monkeypatch.setattr(ablation, "bake_textures", lambda *_, **__: None)
     monkeypatch.setattr(ablation, "export_asset", lambda *_: (out / "previews").mkdir())
     ablation.bake_without("none", tmp_path, out, 0)
-    assert sorted(path.name for path in out.iterdir()) == ["baked", "previews"]
+    assert sorted(path.name for path in out.rglob("*")) == ["baked", "previews"]

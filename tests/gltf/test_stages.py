@@ -237,6 +237,15 @@ def test_the_same_input_gives_the_same_bytes(run: Path, tmp_path: Path) -> None:
     assert (tmp_path / "export/asset.glb").read_bytes() == (run / "export/asset.glb").read_bytes()
 
 
+def test_an_earlier_export_is_overwritten(run: Path, tmp_path: Path) -> None:
+    export(run, tmp_path / "export")
+    before = (tmp_path / "export/previews/base_color.png").read_bytes()
+    (tmp_path / "export/previews/base_color.png").write_bytes(b"old")
+    folders = (run / name for name in ("ingest", "poses", "refine", "bake"))
+    export_asset(*folders, tmp_path / "export", ExportOptions(Export(), "none", SIZE))
+    assert (tmp_path / "export/previews/base_color.png").read_bytes() == before
+
+
 def test_an_asset_over_the_triangle_limit_fails(run: Path, tmp_path: Path) -> None:
     with pytest.raises(BadInputError, match="triangle count"):
         export(run, tmp_path / "export", max_triangles=1000)
