@@ -1,12 +1,14 @@
 """Trials of metal and dielectric: groups of texels are turned into the other kind, and validation photos decide.
 
-The search for metals (`metallic`) compares both kinds under the present light. But a light that was fitted while a region passed for the
-wrong kind has adapted to it, and goes on confirming it: gradient steps and searches in turn stay where they are (coordinate descent in a
-nonconvex problem). So here a whole group of similar texels is turned over, texels and light adapt for a few steps, and only then the two
-are compared, by the robust error on photos that the fit does not see.
+The search for metals (`metallic`) compares both kinds texel by texel, each at the roughness that suits it best. But a light that was fitted
+while a region passed for the wrong kind has adapted to it, and a texel alone has a roughness for every error: gradient steps and searches
+in turn stay where they are (coordinate descent in a nonconvex problem). So here groups of similar texels are turned over, texels and light
+adapt for a few steps, and only then the two are compared, by the robust error on photos that the fit does not see.
 
 Groups are found by k-means in the space of fitted material and photographed colour. The group's pixels together choose the roughness of
-the other kind, and tell whether a trial is worth its time: likelihoods that clearly speak for the present kind are believed.
+the other kind, and tell by their likelihoods whether a trial is worth its time. First all groups that are likelier as metal are turned at
+once, then all that are likelier as dielectric: bands of iron that passed for wood make a light under which none of them does well alone.
+Then groups are tried one at a time, also those that are a little less likely as the other kind.
 """
 
 from __future__ import annotations
@@ -37,17 +39,19 @@ MIN_WEIGHT = 0.3
 LOG_OFFSET, LUMINANCE_FACTOR = 0.02, 0.3
 #: Mean log-likelihood ratio per pixel for the present kind up to which a group has a trial.
 MAX_EVIDENCE = 2.0
-#: A group becomes metal when that lowers the validation error by the first share, and by the second multiple of its share of the texels, so
-#: by as much of its own error if that is as large as elsewhere; dielectric when the error does not rise: most things are.
+#: Groups change when that lowers the validation error by the first share, and by the second multiple of their share of the texels, so by as
+#: much of their own error if that is as large as elsewhere; a single one becomes dielectric when the error does not rise: most things are.
 MIN_DECREASE, MIN_OWN_DECREASE = 0.005, 0.5
 
 #: Called after every step with the number of steps done and their total.
 Each = Callable[[int, int], None]
+#: A trial: the mean log-likelihood ratio per pixel of a group for its present kind, whether it is to be metal, and its texels (m,).
+Trial = tuple[float, bool, NDArray[np.int64]]
 
 
 @dataclass(frozen=True)
-class TurnedGroup:
-    """A group that became `metal` or dielectric, its `share` of observed texels, and the relative `decrease` of the validation error."""
+class Turn:
+    """Groups that became `metal` or dielectric, their `share` of observed texels, and the relative `decrease` of the validation error."""
 
     metal: bool
     share: float
@@ -59,11 +63,11 @@ class TurnedGroup:
 
 @dataclass(frozen=True)
 class TrialResult:
-    """The fit's result `fitted` after trials, the number of `trials`, and the groups that were `turned`."""
+    """The fit's result `fitted` after trials, the number of `trials`, and those that were kept, `turned`."""
 
     fitted: Fitted
     trials: int = 0
-    turned: tuple[TurnedGroup, ...] = ()
+    turned: tuple[Turn, ...] = ()
 
     def __str__(self) -> str:
         return f"{self.trials} trials of the other kind: {', '.join(map(str, self.turned)) or 'none kept'}"
@@ -87,7 +91,7 @@ class _Trials:
 
     def __init__(self, fit: MaterialFit, level: FitLevel, schedule: FitSchedule, each: Each) -> None:
         self.fit, self.level, self.schedule, self.each = fit, level, schedule, each
-        self.observed, self.count, self.turned = 0, 0, list[TurnedGroup]()
+        self.observed, self.count, self.turned = 0, 0, list[Turn]()
         self._adapt()
         self.state = fit.state()
         self.fitted = self._adapt()
@@ -96,34 +100,49 @@ class _Trials:
         return self.fit.run(self.level.fitted, self.level.held_out, self.schedule, self.each)
 
     def run(self, observed: NDArray[np.bool_]) -> None:
-        """Try the groups of `observed` (n,) texels, those first whose evidence for the other kind is strongest."""
+        """Try the groups of `observed` (n,) texels together and alone, those first whose evidence for the other kind is strongest."""
         self.observed = int(observed.sum())
+        models, tries = self._candidates(observed)
+        for metal in (True, False):
+            likelier = [group for for_present, other, group in tries if other == metal and for_present < 0]
+            if len(likelier) > 1 and self._try(models, metal, likelier):
+                models, tries = self._candidates(observed)
+        for _, metal, group in tries:
+            self._try(models, metal, [group])
         self.fit.restore(self.state, self.level.fitted)
-        models, tries = _Models(self.fit, self.level), []
+
+    def _candidates(self, observed: NDArray[np.bool_]) -> tuple[_Models, list[Trial]]:
+        """The models of all texels under the present light, and the trials that they are worth."""
+        self.fit.restore(self.state, self.level.fitted)
+        models, tries = _Models(self.fit, self.level), list[Trial]()
         for group in _groups(self.state.values, np.asarray(self.level.surface.base_color), observed):
             share, for_dielectric = (self.state.values[group, 4] > 0.5).mean(), models.evidence(group)
             for metal, for_present in ((True, for_dielectric), (False, -for_dielectric)):
                 if share != metal and for_present < MAX_EVIDENCE:
                     tries.append((for_present, metal, group))
-        for _, metal, group in sorted(tries, key=lambda entry: entry[0]):
-            self._try(models, metal, group)
-        self.fit.restore(self.state, self.level.fitted)
+        return models, sorted(tries, key=lambda entry: entry[0])
 
-    def _try(self, models: _Models, metal: bool, group: NDArray[np.int64]) -> None:
-        """Turn the `group` (m,) of texels into `metal` or dielectric, and keep that where validation photos prefer it."""
-        texel = group[(self.state.values[group, 4] > 0.5) != metal]
-        if len(texel) < MIN_SHARE * self.observed:
-            return
-        base, roughness = models.best(metal, group, texel)
+    def _try(self, models: _Models, metal: bool, groups: list[NDArray[np.int64]]) -> bool:
+        """Turn `groups` (m,) of texels into `metal` or dielectric and keep that where validation photos prefer it: whether they do."""
+        kind, texels, values = self.fit.kind(metal), [], []
+        for group in groups:
+            texel = group[(self.state.values[group, 4] > 0.5) != metal]
+            base, roughness = models.best(metal, group, texel)
+            texels.append(texel)
+            values.append(np.column_stack([base, np.full(len(texel), roughness), np.full(len(texel), kind)]))
+        share = sum(map(len, texels)) / max(1, self.observed)
+        if share < MIN_SHARE:
+            return False
         self.fit.restore(self.state, self.level.fitted)
-        metallic = self.fit.kind(metal)
-        self.fit.set_materials(texel, np.column_stack([base, np.full(len(texel), roughness), np.full(len(texel), metallic)]))
+        self.fit.set_materials(np.concatenate(texels), np.concatenate(values))
         self.count += 1
-        decrease, share = 1 - validation_error(self._adapt()) / max(validation_error(self.fitted), 1e-12), len(texel) / self.observed
-        if decrease > (max(MIN_DECREASE, MIN_OWN_DECREASE * share) if metal else 0):
-            self.state = self.fit.state()
-            self.fitted = self._adapt()
-            self.turned.append(TurnedGroup(metal, share, decrease))
+        decrease = 1 - validation_error(self._adapt()) / max(validation_error(self.fitted), 1e-12)
+        if not decrease > (max(MIN_DECREASE, MIN_OWN_DECREASE * share) if metal or len(groups) > 1 else 0):
+            return False
+        self.state = self.fit.state()
+        self.fitted = self._adapt()
+        self.turned.append(Turn(metal, share, decrease))
+        return True
 
 
 class _Models:

@@ -66,7 +66,7 @@ def compare_light_motions(levels: Mapping[Motion, FitLevel], plan: FitPlan, prog
 
 def _with_better_metals(choice: ChosenFit, level: FitLevel, plan: FitPlan, each: Callable[[int, int], None]) -> ChosenFit:
     """The choice after metals' base colours had their noise removed, to which the light adapted, with those groups of texels turned into
-    the other kind that validation photos prefer as such."""
+    the other kind that validation photos prefer as such; where there are any, the light's intensity is searched for again."""
     quiet = FitSchedule(plan.steps(ADAPT_SHARE), plan.seed, (), emission=False, light_searches_at=(), sparsity=False, normals=False)
     steps, intensity = replace(quiet, rate=ADAPT_RATE), choice.fit.light_intensity()
     for turn in range(NOISE_ROUNDS):
@@ -74,7 +74,10 @@ def _with_better_metals(choice: ChosenFit, level: FitLevel, plan: FitPlan, each:
         choice = replace(choice, fitted=choice.fit.run(level.fitted, level.held_out, replace(steps, seed=plan.seed + turn), each))
     found = try_kinds(choice.fit, choice.fitted, level, steps, each)
     choice.fit.set_light_intensity(intensity)  # gradient steps drift along the valley that the search had left
-    return replace(choice, fitted=found.fitted, evidence=f"{choice.evidence}; {found}")
+    fitted = found.fitted
+    if found.turned:
+        fitted = choice.fit.run(level.fitted, level.held_out, replace(steps, light_searches_at=(0.0,)), each)
+    return replace(choice, fitted=fitted, evidence=f"{choice.evidence}; {found}")
 
 
 def fit_two_levels(coarse: FitLevel, fine: FitLevel, texture: CoarseTexture, plan: FitPlan, progress: Progress) -> ChosenFit:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ import pytest
 from gsbake.materials.fit import MaterialFit
 from gsbake.materials.fit_surface import Fitted
 from gsbake.materials.levels import FitLevel
-from gsbake.materials.metal_trials import GROUPS, MIN_SHARE, TrialResult, _groups, try_kinds
+from gsbake.materials.metal_trials import GROUPS, MIN_SHARE, TrialResult, _groups, _Trials, try_kinds
 from gsbake.materials.options import FitSchedule
 from tests.materials.test_fit import Scene
 
@@ -43,6 +44,23 @@ def test_groups_of_the_wrong_kind_are_turned(start: float) -> None:
     assert "metal" in str(found) or "dielectric" in str(found)
     assert before.held_out_loss is not None and found.fitted.held_out_loss is not None
     assert found.fitted.held_out_loss < before.held_out_loss
+
+
+def test_groups_that_are_likelier_as_metal_are_turned_together(monkeypatch: pytest.MonkeyPatch) -> None:
+    plain, tries = _Trials._try, []
+
+    def spy(self: _Trials, models: Any, metal: bool, groups: list[Any]) -> bool:
+        observed = self.state.values.copy()
+        kept = plain(self, models, metal, groups)
+        tries.append((metal, len(groups), kept, int((observed != self.state.values).any(1).sum())))
+        return kept
+
+    monkeypatch.setattr(_Trials, "_try", spy)
+    _, _, found = tried(Scene(0.25, metallic=1.0, striped=True), 0.05)
+    metal, groups, kept, changed = tries[0]
+    assert metal and groups > 1 and kept and changed
+    assert all(count == 1 for _, count, *_ in tries[2:])
+    assert found.turned[0].metal and found.turned[0].share > 2 * MIN_SHARE
 
 
 def test_groups_of_the_right_kind_stay() -> None:
