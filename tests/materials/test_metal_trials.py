@@ -10,9 +10,11 @@ import pytest
 
 from gsbake.materials.fit import MaterialFit
 from gsbake.materials.fit_surface import Fitted
+from gsbake.materials.initialisation import ChosenFit
 from gsbake.materials.levels import FitLevel
-from gsbake.materials.metal_trials import GROUPS, MIN_SHARE, TrialResult, _groups, _Trials, try_kinds
+from gsbake.materials.metal_trials import GROUPS, MIN_SHARE, TrialResult, Turn, _groups, _Trials, try_kinds
 from gsbake.materials.options import FitSchedule
+from gsbake.materials.two_level_fit import FitPlan, _with_better_metals
 from tests.materials.test_fit import Scene
 
 QUIET = FitSchedule(120, metal_searches_at=(), emission=False, light_searches_at=(), sparsity=False, normals=False)
@@ -66,6 +68,16 @@ def test_groups_that_are_likelier_as_metal_are_turned_together(monkeypatch: pyte
 def test_groups_of_the_right_kind_stay() -> None:
     fit, before, _ = tried(Scene(0.25), 0.05)
     assert (fit.state().values[before.weight > 0.3, 4] > 0.5).mean() < 0.03
+
+
+@pytest.mark.parametrize("turned", [(), (Turn(True, 0.1, 0.1),)])
+def test_the_light_is_searched_for_again_where_kinds_changed(turned: tuple[Turn, ...], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("gsbake.materials.two_level_fit.try_kinds", lambda _, fitted, *__: TrialResult(fitted, 1, turned))
+    scene = Scene(0.25)
+    fit, level = scene.fit(0.3, metallic=0.05), FitLevel(scene.surface(), scene.photos[2:], scene.photos[:2])
+    start = ChosenFit(fit, fit.run(level.fitted, level.held_out, QUIET), 0.05, 0.3, 1, "")
+    choice = _with_better_metals(start, level, FitPlan(120, 16, fit._priors), nothing)
+    assert len(choice.fitted.light_adjustments) == len(turned)
 
 
 def test_the_fit_ends_in_the_state_that_was_kept() -> None:
