@@ -3,8 +3,9 @@
     python -m benchmarks.objects.models OUT
 
 writes one GLB each. Materials cover what the material fit must tell apart: coloured, neutral and dark metals, oxide beside clean metal,
-wood with iron bands, coloured glossy plastic, white glaze, cloth, and an emissive part. Base colours of metals are measured reflectances
-(Lagarde & de Rousiers, *Moving Frostbite to PBR*, 2014); noise is a sum of random plane waves, so models do not depend on library versions.
+perforated metal, wood with iron bands, coloured glossy plastic, white glaze, cloth, and an emissive part. Base colours of metals are
+measured reflectances (Lagarde & de Rousiers, *Moving Frostbite to PBR*, 2014); noise is a sum of random plane waves, so models do not
+depend on library versions.
 """
 
 from __future__ import annotations
@@ -134,6 +135,14 @@ def tea_set() -> trimesh.Trimesh:
     return trimesh.util.concatenate(parts)
 
 
+def lantern() -> trimesh.Trimesh:
+    """A cylinder that narrows to a cap, on a wider foot."""
+    return revolved([
+        (0, 0), (0.62, 0), (0.65, 0.04), (0.64, 0.2), (0.52, 0.24), (0.5, 0.3), (0.5, 0.8), (0.5, 1.24), (0.53, 1.3), (0.52, 1.36),
+        (0.34, 1.56), (0.14, 1.64), (0.1, 1.72), (0, 1.75),
+    ])  # fmt: skip
+
+
 def barrel_material(p: Array) -> Material:
     """Oiled wood with dark iron bands."""
     n, angle = len(p), np.arctan2(p[:, 1], p[:, 0])
@@ -179,6 +188,21 @@ def copper_material(p: Array) -> Material:
     return copper.blend(patina, step(noise(p, 4.0, 9) - 0.5 * p[:, 2], 0.15, 0.3))
 
 
+def lantern_material(p: Array) -> Material:
+    """Painted plastic around perforated steel: round holes of 0.013 in a hexagonal grid, .024 apart, as texture."""
+    n, pitch = len(p), 0.024
+    paint = Material.uniform(n, (0.03, 0.12, 0.20), 0.3).shaded(1 + 0.05 * noise(p, 8, 2))
+    steel = Material.uniform(n, STEEL, 0.32, 1.0).shaded(1 + 0.04 * noise(p, 10, 4))
+    across = np.arctan2(p[:, 1], p[:, 0]) / (2 * np.pi) * round(np.pi / pitch)  # in holes, at the radius of .5
+    height = pitch * np.sqrt(3) / 2
+    row = np.round(p[:, 2] / height)
+    beside, above = (across + 0.5 * (row % 2) + 0.5) % 1 - 0.5, p[:, 2] - row * height
+    holes = 1 - step(np.hypot(beside * pitch, above), 0.0065, 0.003)
+    band = (p[:, 2] > 0.34) & (p[:, 2] < 1.2)
+    perforated = steel.blend(Material.uniform(n, (0.01, 0.01, 0.01), 0.8), holes)
+    return paint.blend(perforated, band.astype(float))
+
+
 def toy_material(p: Array) -> Material:
     """Woven cloth with plastic eyes and a lamp."""
     n = len(p)
@@ -212,6 +236,7 @@ MODELS: dict[str, tuple[Callable[[], trimesh.Trimesh], Callable[[Array], Materia
     "copper_bottle": (bottle, copper_material),
     "toy": (lambda: figurine(5, 0.2), toy_material),
     "steel": (lambda: figurine(9, 0.12), steel_material),
+    "lantern": (lantern, lantern_material),
 }
 
 

@@ -10,13 +10,16 @@ They are compared by a robust error: a sharp reflection a few pixels off counts 
 be, so that the PSNR prefers materials that are too rough. Fits that started with another roughness often explain the photos as well, by a
 brighter or a dimmer light: there its prior decides (`intensity_prior`), but not between metal and dielectric. Where both kinds explain the
 photos, the object is dielectric, as most are.
+
+A capture too small for validation photos distinguishes metals from dielectrics all the same, but not roughnesses: every fourth photo is
+held out while the two kinds are compared, and all are fitted from the start that is chosen.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 from gsbake.materials.fit import MaterialFit
 from gsbake.materials.fit_surface import Fitted, validation_error
@@ -25,13 +28,16 @@ from gsbake.materials.light_intensity import OBSERVATIONS
 from gsbake.materials.options import FitSchedule
 
 #: Compared starts: metallic and roughness.
-STARTS = ((0.05, 0.2), (0.05, 0.45), (0.05, 0.8), (0.9, 0.2), (0.9, 0.45))
+METAL_STARTS = ((0.9, 0.2), (0.9, 0.45))
+STARTS = ((0.05, 0.2), (0.05, 0.45), (0.05, 0.8), *METAL_STARTS)
 #: When trials search for metals, as shares of their steps.
 METAL_SEARCHES_AT = (0.4, 0.8)
 #: When the light of a mostly metallic object is scaled: metals are found with the light that they have.
 LIGHT_SCALED_AT = (0.6,)
 #: Start of a diffuse object, and without validation photos.
 DIFFUSE_START, DEFAULT_START = (0.05, 0.8), (0.05, 0.45)
+#: Without validation photos every so many photos are held out while metal is compared with the default start, where that makes so many.
+KIND_HOLDOUT, MIN_HELD_OUT = 4, 2
 #: Starts whose error is within this factor of the best one are continued as well, at most so many in all.
 CANDIDATE_FACTOR, MAX_CANDIDATES = 1.3, 3
 #: A metallic start must have less error than the best dielectric one, by this share; by more where the light moves, as such a light is an
@@ -76,37 +82,58 @@ def trial_schedule(steps: int, seed: int, diffuse: bool) -> FitSchedule:
     )
 
 
-def trial_fits(make: MakeFit, level: FitLevel, steps: int, seed: int, diffuse: bool, each: Each) -> Trials:
-    """Fits of `steps` steps on the coarse `level`: from all `STARTS`, or the default one for a `diffuse` object or without validation
-    photos. Those that start dielectric, under a light that stands, start without the shading in the projected colours."""
-    starts: tuple[Start, ...] = STARTS
-    if diffuse or not any(map(len, level.held_out)):
-        starts = (DIFFUSE_START if diffuse else DEFAULT_START,)
-    plan, found = trial_schedule(steps, seed, diffuse), {}
+def compared_starts(make: MakeFit, level: FitLevel, plan: FitSchedule, each: Each) -> tuple[tuple[Start, ...], str]:
+    """The starts to compare by trials of `plan` on the coarse `level`, and why, where that is one: of a diffuse object, or without
+    validation photos."""
+    if plan.diffuse:
+        return (DIFFUSE_START,), "diffuse object"
+    if any(map(len, level.held_out)):
+        return STARTS, ""
+    held_out = level.fitted[KIND_HOLDOUT // 2 :: KIND_HOLDOUT]
+    if len(held_out) < MIN_HELD_OUT:
+        return (DEFAULT_START,), "no validation photos"
+    kept = [photo for i, photo in enumerate(level.fitted) if i % KIND_HOLDOUT != KIND_HOLDOUT // 2]
+    trials = trial_fits(make, replace(level, fitted=kept, held_out=held_out), (DEFAULT_START, *METAL_STARTS), plan, each)
+    errors = {start: validation_error(fitted) for start, (_, fitted) in trials.items()}
+    metal = min(METAL_STARTS, key=lambda start: errors[start])
+    start = metal if errors[metal] < (1 - _metal_margin(trials)) * errors[DEFAULT_START] else DEFAULT_START
+    return (start,), f"no validation photos; by every {KIND_HOLDOUT}th photo, fitted afterwards: {_percent(errors)}"
+
+
+def trial_fits(make: MakeFit, level: FitLevel, starts: Sequence[Start], plan: FitSchedule, each: Each) -> Trials:
+    """Fits from `starts` on the coarse `level`. Those that start dielectric, under a light that stands, start without the shading in the
+    projected colours."""
+    found: Trials = {}
     stands, shading = all(photo.to_light is None for photo in level.fitted), None
     for metallic, roughness in starts:
         fit = make(metallic, roughness)
         if stands and fit.mostly_dielectric:
-            shading = fit.find_remaining_shading(seed) if shading is None else shading  # the same from every start
-            fit.move_to_light(shading, seed)
+            shading = fit.find_remaining_shading(plan.seed) if shading is None else shading  # the same from every start
+            fit.move_to_light(shading, plan.seed)
         found[metallic, roughness] = fit, fit.run(level.fitted, level.held_out, plan, each)
     return found
 
 
-def best_fit(trials: Trials, level: FitLevel, plan: FitSchedule, each: Each) -> ChosenFit:
-    """The fit with the least validation error on `level` of those that continue the best of the `trials` by `plan`."""
+def best_fit(trials: Trials, level: FitLevel, plan: FitSchedule, each: Each, reason: str = "") -> ChosenFit:
+    """The fit with the least validation error on `level` of those that continue the best of the `trials` by `plan`; `reason` is the
+    evidence for a single one."""
     errors = {start: validation_error(fitted) for start, (_, fitted) in trials.items()}
-    evidence = _percent(errors) if len(errors) > 1 else ("diffuse object" if plan.diffuse else "no validation photos")
+    evidence = _percent(errors) if len(errors) > 1 else reason
     found = {start: (trials[start][0], trials[start][0].run(level.fitted, level.held_out, plan, each)) for start in candidates(errors)}
     continued = {start: validation_error(fitted) for start, (_, fitted) in found.items()}
     weighed = {start: error * _prior_factor(found[start][0]) for start, error in continued.items()}
     kinds = [[start for start in weighed if (start[0] < 0.5) == dielectric] for dielectric in (True, False)]
     finalists = [min(kind, key=lambda start: weighed[start]) for kind in kinds if kind]
-    margin = MOVING_METAL_MARGIN if any(fit.moving_light for fit, _ in found.values()) else METAL_MARGIN
+    margin = _metal_margin(found)
     best = min(finalists, key=lambda start: continued[start] * (1 - margin if start[0] < 0.5 else 1))
     if len(continued) > 1:
         evidence += f"; continued: {_percent(continued)}; with the prior of the light: {_percent(weighed)}"
     return ChosenFit(*found[best], *best, len(continued), evidence)
+
+
+def _metal_margin(trials: Trials) -> float:
+    """Share by which a metallic start must have less error than a dielectric one."""
+    return MOVING_METAL_MARGIN if any(fit.moving_light for fit, _ in trials.values()) else METAL_MARGIN
 
 
 def _prior_factor(fit: MaterialFit) -> float:

@@ -9,9 +9,9 @@ and the pixels of all photos together determine more than one value per pixel. T
 simultaneous iterations (SIRT), within [0, 1] and near the initial values where no pixel constrains them.
 
 Holes are at the same places in all photos, unexplained reflections are not. So the problem is solved with all photos and with each half of
-them; where the full solution has holes and both halves show the same pattern, the metal is perforated. Other metal keeps its fitted values,
-which have less noise. So do dielectrics: their photos depend on diffuse shading, which the fit at pixel size determines as well, and
-residual reflections would become stains.
+them; where the full solution has dark texels beside bright ones and both halves show the same pattern, the metal is perforated. Other metal
+keeps its fitted values, which have less noise. So do dielectrics: their photos depend on diffuse shading, which the fit at pixel size
+determines as well, and residual reflections would become stains.
 
 Perforated metal is solved once more with a binary prior: one metal, and holes. From step to step every texel is drawn, finally as strongly
 as by the pixels, to metal or to black: the brightest texels to metal, as many as the local mean brightness implies (a threshold at half the
@@ -57,8 +57,9 @@ GAIN_RADIUS, MAX_GAIN, GAIN_REGULARISATION = 4.0, 8.0, 0.003
 REGION_RADIUS, MIN_METAL_SHARE = 2.0, 0.35
 #: Hue is averaged over about this many texels: patterns differ in brightness, while a misplaced reflection has a hue.
 HUE_RADIUS = 4.0
-#: Metal is perforated where the share of holes is between these bounds: others were fitted as well and have less noise.
-HOLE_SHARE = (0.1, 0.6)
+#: Metal is perforated where the share of texels darker than this share of the metal's brightness is between these bounds: others were
+#: fitted as well and have less noise. Photos blur holes of a pixel or two, so these are not black before the binary prior acts.
+DARK, HOLE_SHARE = 0.5, (0.1, 0.7)
 #: Radius in texels of local statistics, and of the smoothing below which detail begins.
 LOCAL_RADIUS, DETAIL_RADIUS = 12.0, 3.0
 #: Least correlation of the detail in the two halves of the photos.
@@ -125,10 +126,11 @@ def superresolved(values: Floats, texels: Texels, region: NDArray[np.bool_], pho
     """
     systems, initial = _photo_systems(photos, region), values[region, :3]
     everything, half, other_half = (
-        _with_local_hue(_solve(some, initial), texels, region).mean(1) for some in (systems, systems[::2], systems[1::2])
+        _with_local_hue(_solve(some, initial), texels, region) for some in (systems, systems[::2], systems[1::2])
     )
-    perforated = region.copy()
-    perforated[region] = _has_holes(texels, region, everything < MIN_METAL_ALBEDO) & _correlated(texels, region, half, other_half)
+    around, perforated = _metal_colour(everything, texels, region).mean(1), region.copy()
+    dark = everything.mean(1) < np.maximum(DARK * around, MIN_METAL_ALBEDO)
+    perforated[region] = _has_holes(texels, region, dark) & _correlated(texels, region, half.mean(1), other_half.mean(1))
     if not perforated.any():
         return values
 

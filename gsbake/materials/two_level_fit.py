@@ -12,7 +12,7 @@ from functools import partial
 
 from gsbake.materials.fit import MaterialFit
 from gsbake.materials.fit_surface import validation_error
-from gsbake.materials.initialisation import DEFAULT_START, ChosenFit, best_fit, trial_fits, trial_schedule
+from gsbake.materials.initialisation import DEFAULT_START, ChosenFit, best_fit, compared_starts, trial_fits, trial_schedule
 from gsbake.materials.levels import FitLevel
 from gsbake.materials.metal_trials import try_kinds
 from gsbake.materials.options import FitSchedule, Priors
@@ -90,9 +90,11 @@ def fit_two_levels(coarse: FitLevel, fine: FitLevel, texture: CoarseTexture, pla
     def make(metallic: float, roughness: float) -> MaterialFit:
         return MaterialFit(coarse.surface, plan.light_size, plan.priors, roughness, metallic)
 
-    trials = trial_fits(make, coarse, steps(TRIAL_SHARE), plan.seed, plan.diffuse, each("trial fits"))
+    trial = trial_schedule(steps(TRIAL_SHARE), plan.seed, plan.diffuse)
+    starts, reason = compared_starts(make, coarse, trial, each("trial fits"))
+    trials = trial_fits(make, coarse, starts, trial, each("trial fits"))
     schedule = FitSchedule(steps(COARSE_SHARE), plan.seed, diffuse=plan.diffuse, normals=False)
-    choice = best_fit(trials, coarse, schedule, each("material fit, coarse level"))
+    choice = best_fit(trials, coarse, schedule, each("material fit, coarse level"), reason)
     # Metals adapt to the errors of a moving light, which is an approximation, and changes of metals to theirs.
     metals = not (plan.diffuse or choice.fit.moving_light)
     if metals:

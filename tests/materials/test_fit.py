@@ -21,7 +21,7 @@ from gsbake.imaging.srgb import decode, encode
 from gsbake.materials.adjacency import neighbours
 from gsbake.materials.fit import MaterialFit
 from gsbake.materials.fit_surface import FitSurface
-from gsbake.materials.initialisation import trial_fits
+from gsbake.materials.initialisation import DEFAULT_START, METAL_STARTS, STARTS, compared_starts, trial_fits, trial_schedule
 from gsbake.materials.levels import FitLevel, InterpolatedTransport, coarse_pixels, coarse_surface, coarse_texels
 from gsbake.materials.options import FitSchedule, Priors
 from gsbake.materials.pixels import PixelReader, Pixels
@@ -208,7 +208,7 @@ def test_normal_offsets_reduce_normal_error(glossy: Scene) -> None:
 
 def trial_errors(scene: Scene) -> dict[tuple[float, float], float]:
     level = FitLevel(scene.surface(), scene.photos[2:], scene.photos[:2])
-    trials = trial_fits(lambda m, r: scene.fit(r, metallic=m), level, 100, 0, False, skip)
+    trials = trial_fits(lambda m, r: scene.fit(r, metallic=m), level, STARTS, trial_schedule(100, 0, False), skip)
     return {start: fitted.held_out_loss or 0.0 for start, (_, fitted) in trials.items()}
 
 
@@ -343,3 +343,11 @@ def test_coarse_texture_preserves_means_and_detail() -> None:
     stripes = smooth * np.where(np.arange(len(fine)) % 2, 1.2, 0.8)[:, None]
     restored = coarse.up(coarse.down(stripes)) * coarse.detail(stripes)
     assert np.abs(restored - stripes).mean() < 0.01
+
+
+@pytest.mark.parametrize("metallic", [0.0, 1.0])
+def test_a_few_photos_tell_a_metal_from_a_dielectric(metallic: float) -> None:
+    scene = Scene(0.35, reference=True, metallic=metallic)
+    level = FitLevel(scene.surface(), scene.photos, [])
+    starts, _ = compared_starts(lambda m, r: scene.fit(r, metallic=m), level, trial_schedule(100, 0, False), skip)
+    assert starts in ([(start,) for start in METAL_STARTS] if metallic else [(DEFAULT_START,)])

@@ -11,17 +11,23 @@ from gsbake.materials.initialisation import (
     CANDIDATE_FACTOR,
     DEFAULT_START,
     DIFFUSE_START,
+    KIND_HOLDOUT,
     MAX_CANDIDATES,
     METAL_MARGIN,
+    METAL_STARTS,
+    MIN_HELD_OUT,
     MOVING_METAL_MARGIN,
     STARTS,
     ChosenFit,
     Start,
     best_fit,
     candidates,
+    compared_starts,
     trial_fits,
+    trial_schedule,
 )
 from gsbake.materials.intensity_prior import RADIANCE, IntensityPrior
+from gsbake.materials.levels import FitLevel
 from gsbake.materials.options import FitSchedule
 
 
@@ -51,8 +57,20 @@ class Fit:
         return SimpleNamespace(held_out_loss=self._error if held_out else None)
 
 
-def level(held_out: bool = True, to_light: Any = None) -> Any:
-    return SimpleNamespace(fitted=[SimpleNamespace(to_light=to_light)], held_out=[[1]] if held_out else [])
+class Photo:
+    """Pixels of one photo under a light that is turned `to_light`."""
+
+    def __init__(self, to_light: Any = None) -> None:
+        self.to_light = to_light
+
+    def __len__(self) -> int:
+        return 1
+
+
+def level(held_out: bool = True, to_light: Any = None, photos: int = 1) -> FitLevel:
+    fitted: Any = [Photo(to_light) for _ in range(photos)]
+    surface: Any = None
+    return FitLevel(surface, fitted, [fitted[0]] if held_out else [])
 
 
 def nothing(done: int, total: int) -> None:
@@ -75,23 +93,60 @@ def chosen(
 
 def test_all_starts_are_tried_without_searches_for_the_light() -> None:
     runs: list[FitSchedule] = []
-    trials = trial_fits(lambda m, r: Fit(10 * m + r, runs), level(), 7, 1, False, nothing)  # type: ignore[arg-type,return-value]
-    assert tuple(trials) == STARTS and len(runs) == len(STARTS)
+    make: Any = lambda m, r: Fit(10 * m + r, runs)  # noqa: E731
+    starts, reason = compared_starts(make, level(), trial_schedule(7, 1, False), nothing)
+    trials = trial_fits(make, level(), starts, trial_schedule(7, 1, False), nothing)
+    assert tuple(trials) == starts == STARTS and len(runs) == len(STARTS) and not reason
     assert all(run.iterations == 7 and run.metal_searches_at and not run.light_searches_at and not run.emission for run in runs)
-    assert {m > 0.5 for m, _ in STARTS} == {True, False}
+    assert {m > 0.5 for m, _ in STARTS} == {True, False} and all(m > 0.5 for m, _ in METAL_STARTS)
 
 
 @pytest.mark.parametrize("moves", [False, True])
 def test_dielectric_starts_have_no_shading_where_the_light_stands(moves: bool) -> None:
     make: Any = lambda m, r: Fit(1.0, [], m < 0.5)  # noqa: E731
-    trials: Any = trial_fits(make, level(to_light="turned" if moves else None), 7, 0, False, nothing)
+    plan = trial_schedule(7, 0, False)
+    trials: Any = trial_fits(make, level(to_light="turned" if moves else None), STARTS, plan, nothing)
     assert [fit.without_shading for fit, _ in trials.values()] == [metallic < 0.5 and not moves for metallic, _ in STARTS]
 
 
-@pytest.mark.parametrize(("diffuse", "held_out", "start"), [(True, True, DIFFUSE_START), (False, False, DEFAULT_START)])
-def test_one_start_where_nothing_is_compared(diffuse: bool, held_out: bool, start: Start) -> None:
-    trials = trial_fits(lambda m, r: Fit(1.0, []), level(held_out), 7, 0, diffuse, nothing)  # type: ignore[arg-type,return-value]
-    assert tuple(trials) == (start,)
+@pytest.mark.parametrize(
+    ("diffuse", "held_out", "photos", "start"),
+    [(True, True, 40, DIFFUSE_START), (True, False, 40, DIFFUSE_START), (False, False, 6, DEFAULT_START)],
+)
+def test_one_start_where_nothing_is_compared(diffuse: bool, held_out: bool, photos: int, start: Start) -> None:
+    runs: list[FitSchedule] = []
+    make: Any = lambda m, r: Fit(1.0, runs)  # noqa: E731
+    starts, reason = compared_starts(make, level(held_out, photos=photos), trial_schedule(7, 0, diffuse), nothing)
+    assert starts == (start,) and not runs and reason
+
+
+def kind_by_few_photos(metal_error: float, moves: bool = False) -> tuple[Start, list[tuple[int, int]]]:
+    """The start chosen without validation photos, where metal of roughness .45 has `metal_error` and dielectric 1, with the number of
+    photos that each trial was fitted to and compared on."""
+    counts: list[tuple[int, int]] = []
+
+    class Counted(Fit):
+        moving_light = moves
+
+        def run(self, photos: Any, held_out: Any, schedule: FitSchedule, each: Any) -> Any:
+            assert not {*map(id, photos)} & {*map(id, held_out)}
+            counts.append((len(photos), len(held_out)))
+            return super().run(photos, held_out, schedule, each)
+
+    errors = {DEFAULT_START: 1.0, METAL_STARTS[0]: 1.5, METAL_STARTS[1]: metal_error}
+    make: Any = lambda m, r: Counted(errors[m, r], [], m < 0.5)  # noqa: E731
+    (start,), reason = compared_starts(make, level(False, photos=11), trial_schedule(7, 0, False), nothing)
+    assert "100.00% error from metallic 0.05" in reason
+    return start, counts
+
+
+def test_few_photos_distinguish_metal_from_dielectric_by_photos_held_out() -> None:
+    start, counts = kind_by_few_photos(1 - 2 * METAL_MARGIN)
+    held_out = 11 // KIND_HOLDOUT + 1
+    assert start == METAL_STARTS[1] and counts == 3 * [(11 - held_out, held_out)] and held_out >= MIN_HELD_OUT
+    assert kind_by_few_photos(1 - METAL_MARGIN / 2)[0] == DEFAULT_START  # not clearly better
+    assert kind_by_few_photos(1 - 2 * METAL_MARGIN, moves=True)[0] == DEFAULT_START
+    assert kind_by_few_photos(1 - 2 * MOVING_METAL_MARGIN, moves=True)[0] == METAL_STARTS[1]
 
 
 def test_close_starts_are_continued_and_compared() -> None:
