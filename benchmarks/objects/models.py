@@ -189,9 +189,9 @@ def copper_material(p: Array) -> Material:
 
 
 def lantern_material(p: Array) -> Material:
-    """Painted plastic around perforated steel: round holes of 0.013 in a hexagonal grid, .024 apart, as texture."""
+    """Lacquered plastic around perforated steel: round holes of 0.013 in a hexagonal grid, .024 apart, as texture."""
     n, pitch = len(p), 0.024
-    paint = Material.uniform(n, (0.03, 0.12, 0.20), 0.3).shaded(1 + 0.05 * noise(p, 8, 2))
+    lacquer = Material.uniform(n, (0.03, 0.12, 0.20), 0.3).shaded(1 + 0.05 * noise(p, 8, 2))
     steel = Material.uniform(n, STEEL, 0.32, 1.0).shaded(1 + 0.04 * noise(p, 10, 4))
     across = np.arctan2(p[:, 1], p[:, 0]) / (2 * np.pi) * round(np.pi / pitch)  # in holes, at the radius of .5
     height = pitch * np.sqrt(3) / 2
@@ -200,7 +200,7 @@ def lantern_material(p: Array) -> Material:
     holes = 1 - step(np.hypot(beside * pitch, above), 0.0065, 0.003)
     band = (p[:, 2] > 0.34) & (p[:, 2] < 1.2)
     perforated = steel.blend(Material.uniform(n, (0.01, 0.01, 0.01), 0.8), holes)
-    return paint.blend(perforated, band.astype(float))
+    return lacquer.blend(perforated, band.astype(float))
 
 
 def toy_material(p: Array) -> Material:

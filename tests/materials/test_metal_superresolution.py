@@ -75,6 +75,15 @@ def test_perforation_finer_than_pixels_is_recovered() -> None:
     assert (superresolved(values, texels, region, photos(PERFORATED, 60, 0.002))[:, 3] == values[:, 3]).all()
 
 
+@pytest.mark.parametrize("period", [4, 5])
+def test_small_holes_are_found_though_photos_blur_them_to_grey(period: int) -> None:
+    hole = (COLUMN % period < 2) & (ROW % period < 2)
+    base = np.where(hole[:, None], 0.0, GOLD).astype(np.float32)
+    values = np.concatenate([np.tile((1 - hole.mean()) * GOLD, (len(hole), 1)), np.full((len(hole), 1), 0.3), np.ones((len(hole), 1))], 1)
+    solved = superresolved(values.astype(np.float32), full_texture(), np.ones(len(hole), bool), photos(base, noise=0.01))
+    assert ((solved[:, 4] < 0.5) == hole)[INNER].mean() > 0.85
+
+
 def test_solver_approaches_bounded_least_squares() -> None:
     """One value per row of texels in the middle channel, against SciPy's solver."""
     rng = np.random.default_rng(0)
