@@ -27,9 +27,10 @@ ARGS ?=
 # Damaged files that `make stress` tries per parser.
 FUZZ_INPUTS ?= 10000
 
-# Processes that `make test` and `make coverage` share the tests between.
+# Processes that `make test` and `make coverage` share the tests between. The tests of a file stay in one of them, so that what they share,
+# a whole bake here and there, is made once.
 WORKERS ?= 2
-QUICK := -m "not slow and not stress" --numprocesses $(WORKERS)
+QUICK := -m "not slow and not stress" --numprocesses $(WORKERS) --dist loadfile --no-loadscope-reorder
 
 .PHONY: help setup node demo docs test coverage check bench stress score lock audit sbom clean
 

@@ -19,6 +19,7 @@ from pathlib import Path
 
 import numpy as np
 
+from gsbake.capture.photos.roles import test_photos
 from gsbake.capture.posed_photos import PosedPhotos, View
 from gsbake.geometry.cameras import Camera
 from gsbake.gltf.frame import read_transforms_json
@@ -27,7 +28,6 @@ from gsbake.report import compose
 from gsbake.report.asset import open_asset
 from gsbake.report.quality import compare, select_views
 from gsbake.report.render import RenderedImage, Renderer
-from gsbake.surfels.training.views import test_photos
 
 #: How far Blender's PSNR may lie below the report's, in dB.
 TOLERANCE = 1.0

@@ -34,13 +34,13 @@ from benchmarks.skip import CpuClock
 from benchmarks.timeline import BUILT_IN, CAPTURES, ROOT, manifests, names
 from benchmarks.truth import measure_stage, read_truth
 from gsbake.api import RunOptions, open_session
+from gsbake.capture.photos.roles import test_photos
 from gsbake.capture.posed_photos import PosedPhotos
 from gsbake.config.load import shipped
 from gsbake.config.schema import Profile
 from gsbake.errors import BadInputError, UsageError
 from gsbake.imaging.metrics import decibels
 from gsbake.surfels.raster.render import SurfelRenderer
-from gsbake.surfels.training.views import test_photos
 
 RESULTS = ROOT / "benchmarks" / "results" / "fields.csv"
 #: Profiles of the family, `default` first.

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from gsbake.capture.photos.roles import held_out, test_photos, validation_photos
 from gsbake.capture.posed_photos import PosedPhotos
 from gsbake.capture.view_dependence import is_diffuse
 from gsbake.config.schema import Bake
@@ -33,7 +34,6 @@ from gsbake.meshing.resolution import pixel_footprint
 from gsbake.monitor import Monitor, Rule, decide_skip, skips
 from gsbake.shading.environment import EnvironmentLight
 from gsbake.shading.light_motion import LightMotion, Motion, light_rotations
-from gsbake.surfels.training.views import held_out, test_photos, validation_photos
 from gsbake.texturing.normal_map import DenseSamples
 from gsbake.texturing.projection import ProjectedTexture
 from gsbake.texturing.resampling import MIN_SIZE, CoarseTexture

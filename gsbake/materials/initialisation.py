@@ -21,6 +21,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
+from gsbake.capture.photos.roles import held_out
 from gsbake.materials.fit import MaterialFit
 from gsbake.materials.fit_surface import Fitted, validation_error
 from gsbake.materials.levels import FitLevel
@@ -36,8 +37,8 @@ METAL_SEARCHES_AT = (0.4, 0.8)
 LIGHT_SCALED_AT = (0.6,)
 #: Start of a diffuse object, and without validation photos.
 DIFFUSE_START, DEFAULT_START = (0.05, 0.8), (0.05, 0.45)
-#: Without validation photos every so many photos are held out while metal is compared with the default start, where that makes so many.
-KIND_HOLDOUT, MIN_HELD_OUT = 4, 2
+#: Without validation photos every so many photos are held out while metal is compared with the default start.
+KIND_HOLDOUT = 4
 #: Starts whose error is within this factor of the best one are continued as well, at most so many in all.
 CANDIDATE_FACTOR, MAX_CANDIDATES = 1.3, 3
 #: A metallic start must have less error than the best dielectric one, by this share; by more where the light moves, as such a light is an
@@ -89,11 +90,11 @@ def compared_starts(make: MakeFit, level: FitLevel, plan: FitSchedule, each: Eac
         return (DIFFUSE_START,), "diffuse object"
     if any(map(len, level.held_out)):
         return STARTS, ""
-    held_out = level.fitted[KIND_HOLDOUT // 2 :: KIND_HOLDOUT]
-    if len(held_out) < MIN_HELD_OUT:
+    apart = set(held_out(len(level.fitted), KIND_HOLDOUT))
+    if not apart:
         return (DEFAULT_START,), "no validation photos"
-    kept = [photo for i, photo in enumerate(level.fitted) if i % KIND_HOLDOUT != KIND_HOLDOUT // 2]
-    trials = trial_fits(make, replace(level, fitted=kept, held_out=held_out), (DEFAULT_START, *METAL_STARTS), plan, each)
+    kept, chosen = ([photo for i, photo in enumerate(level.fitted) if (i in apart) == role] for role in (False, True))
+    trials = trial_fits(make, replace(level, fitted=kept, held_out=chosen), (DEFAULT_START, *METAL_STARTS), plan, each)
     errors = {start: validation_error(fitted) for start, (_, fitted) in trials.items()}
     metal = min(METAL_STARTS, key=lambda start: errors[start])
     start = metal if errors[metal] < (1 - _metal_margin(trials)) * errors[DEFAULT_START] else DEFAULT_START

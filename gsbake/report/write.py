@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from gsbake import __version__
+from gsbake.capture.photos.roles import test_photos
 from gsbake.capture.posed_photos import PosedPhotos
 from gsbake.config.schema import Report
 from gsbake.errors import BadInputError
@@ -25,7 +26,6 @@ from gsbake.report.quality import select_views
 from gsbake.report.render import Asset, Renderer
 from gsbake.report.sheets import map_panels
 from gsbake.shading.light_motion import LightMotion
-from gsbake.surfels.training.views import test_photos
 from gsbake.text import number
 
 #: Bytes of the page, which mail and messengers still take; the asset's images in it are stored in fewer where it would exceed them.

@@ -15,7 +15,6 @@ from gsbake.materials.initialisation import (
     MAX_CANDIDATES,
     METAL_MARGIN,
     METAL_STARTS,
-    MIN_HELD_OUT,
     MOVING_METAL_MARGIN,
     STARTS,
     ChosenFit,
@@ -142,8 +141,7 @@ def kind_by_few_photos(metal_error: float, moves: bool = False) -> tuple[Start, 
 
 def test_few_photos_distinguish_metal_from_dielectric_by_photos_held_out() -> None:
     start, counts = kind_by_few_photos(1 - 2 * METAL_MARGIN)
-    held_out = 11 // KIND_HOLDOUT + 1
-    assert start == METAL_STARTS[1] and counts == 3 * [(11 - held_out, held_out)] and held_out >= MIN_HELD_OUT
+    assert start == METAL_STARTS[1] and counts == 3 * [(8, 3)] and KIND_HOLDOUT == 4
     assert kind_by_few_photos(1 - METAL_MARGIN / 2)[0] == DEFAULT_START  # not clearly better
     assert kind_by_few_photos(1 - 2 * METAL_MARGIN, moves=True)[0] == DEFAULT_START
     assert kind_by_few_photos(1 - 2 * MOVING_METAL_MARGIN, moves=True)[0] == METAL_STARTS[1]

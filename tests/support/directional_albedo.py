@@ -15,14 +15,17 @@ from numpy.typing import NDArray
 
 #: Mean Fresnel reflectance over the hemisphere, cosine-weighted, of a dielectric of index of refraction 1.5 (d'Eon & Irving, 2011).
 MEAN_DIELECTRIC = 0.0918
+#: Half-vectors that integrals are summed over: the sums differ by 1e-4 from those over 2 000 rings of 720 sectors.
+RINGS, SECTORS = 500, 180
 
 
 def fresnel_of_dielectric(cosine: NDArray[np.float64]) -> NDArray[np.float64]:
     """Reflectance at the cosine of incidence, by Snell's law and Fresnel's two polarisations, index of refraction 1.5."""
-    outside = np.arccos(np.clip(cosine, 1e-9, 1 - 1e-12))
-    inside = np.arcsin(np.sin(outside) / 1.5)
-    across = np.sin(outside - inside) / np.sin(outside + inside)
-    return np.asarray(0.5 * (across**2 + (np.tan(outside - inside) / np.tan(outside + inside)) ** 2))
+    outside = np.clip(cosine, 0, 1)
+    inside = np.sqrt(1 - (1 - outside**2) / 1.5**2)
+    across = (outside - 1.5 * inside) / (outside + 1.5 * inside)
+    along = (1.5 * outside - inside) / (1.5 * outside + inside)
+    return np.asarray(0.5 * (across**2 + along**2))
 
 
 @lru_cache(maxsize=4096)
@@ -31,12 +34,12 @@ def single_scattering(cosine: float, roughness: float) -> tuple[float, float, fl
     Fc is Schlick's term, F a dielectric's reflectance by the two polarisations."""
     alpha = roughness**2
     # t = tan θ_h on a stretched grid, so that narrow and wide lobes are both resolved.
-    t = alpha * np.tan((np.arange(2000) + 0.5) / 2000 * math.pi / 2)
-    dt = alpha * (1 + (t / alpha) ** 2) * (math.pi / 2 / 2000)
-    phi = (np.arange(720) + 0.5) / 720 * math.pi
+    t = alpha * np.tan((np.arange(RINGS) + 0.5) / RINGS * math.pi / 2)
+    dt = alpha * (1 + (t / alpha) ** 2) * (math.pi / 2 / RINGS)
+    phi = (np.arange(SECTORS) + 0.5) / SECTORS * math.pi
     cos_h = 1 / np.sqrt(1 + t * t)[:, None]
     sin_h = t[:, None] * cos_h
-    dh = 2 * (cos_h**3 * t[:, None] * dt[:, None]) * (math.pi / 720)  # sinθ dθ dφ, both halves
+    dh = 2 * (cos_h**3 * t[:, None] * dt[:, None]) * (math.pi / SECTORS)  # sinθ dθ dφ, both halves
     vh = sin_h * np.cos(phi)[None] * math.sqrt(1 - cosine**2) + cos_h * cosine
     nl = 2 * vh * cos_h - cosine
     lit = (vh > 0) & (nl > 0)

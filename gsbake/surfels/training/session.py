@@ -12,6 +12,7 @@ from typing import Any
 
 import torch
 
+from gsbake.capture.photos.roles import test_photos, validation_photos
 from gsbake.capture.posed_photos import PosedPhotos
 from gsbake.checkpoint import DamagedCheckpointError, load_checkpoint, save_checkpoint
 from gsbake.config.schema import Coupling, DistanceField, Loss, Train
@@ -25,7 +26,7 @@ from gsbake.surfels.training.corrections import Correction
 from gsbake.surfels.training.pose_refinement import Aligner
 from gsbake.surfels.training.prior_maps import add_priors
 from gsbake.surfels.training.trainer import Plan, Trainer
-from gsbake.surfels.training.views import load_views, test_photos, validation_photos
+from gsbake.surfels.training.views import load_views
 
 #: Checkpoints of other versions are ignored.
 CHECKPOINT_VERSION = 5

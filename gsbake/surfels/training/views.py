@@ -1,4 +1,4 @@
-"""Training views: photos as 8-bit tensors at the working sizes, and the held-out views."""
+"""Training views: photos as 8-bit tensors at the working sizes."""
 
 from __future__ import annotations
 
@@ -12,23 +12,6 @@ from torch import Tensor
 from gsbake.capture.posed_photos import PosedPhotos
 from gsbake.geometry.cameras import Camera
 from gsbake.surfels.raster.projection import Pinhole
-
-
-def held_out(count: int, every: int) -> list[int]:
-    """Indices of the held-out photos: every n-th in the order of the camera set, none for 0 or tiny sets."""
-    if every <= 0 or count < 2 * every:
-        return []
-    return list(range(every // 2, count, every))
-
-
-def validation_photos(count: int, every: int) -> list[int]:
-    """The held-out photos that decisions look at: every second one, from the first."""
-    return held_out(count, every)[::2]
-
-
-def test_photos(count: int, every: int) -> list[int]:
-    """The held-out photos that no decision looks at: figures that are reported use these alone."""
-    return held_out(count, every)[1::2]
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
+from gsbake.capture.photos.roles import held_out
 from gsbake.capture.posed_photos import PosedPhotos
 from gsbake.checkpoint import load_checkpoint, save_checkpoint
 from gsbake.config.schema import Profile
@@ -39,7 +40,7 @@ from gsbake.surfels.training.pose_refinement import (
     trial_improves,
 )
 from gsbake.surfels.training.trainer import Plan, Trainer
-from gsbake.surfels.training.views import TrainView, held_out
+from gsbake.surfels.training.views import TrainView
 from tests.support.cameras import look_at_rotation
 
 SIZE = 96

@@ -11,6 +11,7 @@ import pytest
 import torch
 from scipy.spatial import cKDTree
 
+from gsbake.capture.photos.roles import held_out
 from gsbake.capture.posed_photos import PosedPhotos
 from gsbake.checkpoint import load_checkpoint, save_checkpoint
 from gsbake.config.schema import Profile
@@ -22,7 +23,7 @@ from gsbake.surfels.initialisation import fibonacci_sphere, initialise_surfels, 
 from gsbake.surfels.model import Surfels, create
 from gsbake.surfels.raster.render import SurfelRenderer
 from gsbake.surfels.training.trainer import Plan, Trainer
-from gsbake.surfels.training.views import held_out, load_views
+from gsbake.surfels.training.views import load_views
 from gsbake.surfels.transfer import TRANSFERS
 from tests.support.cameras import look_at
 
@@ -65,10 +66,6 @@ def trainer(posed: PosedPhotos, p: Profile) -> Trainer:
     full, half = load_views(posed, p.train.max_size)
     plan = Plan(p.train, p.surfels, p.loss, p.train.iterations, 0.5, True, 0)
     return Trainer(plan, surfels, None, full, half, held_out(len(full), p.train.holdout))
-
-
-def test_held_out() -> None:
-    assert held_out(12, 6) == [3, 9] and held_out(5, 8) == [] and held_out(10, 0) == []
 
 
 def test_training_converges(posed: PosedPhotos) -> None:
