@@ -70,7 +70,7 @@ def _boxes(corners: Doubles) -> tuple[Doubles, Doubles]:
     return lower, upper
 
 
-@nb.njit(cache=True, nogil=True, inline="always")
+@nb.njit(cache=True, nogil=True, forceinline=True)
 def _box_distance(x: Any, y: Any, z: Any, lower: Any, upper: Any) -> Any:
     """Squared distance to a box; inf for an empty one, whose lower corner is inf."""
     dx, dy, dz = max(lower[0] - x, 0.0, x - upper[0]), max(lower[1] - y, 0.0, y - upper[1]), max(lower[2] - z, 0.0, z - upper[2])

@@ -50,7 +50,7 @@ SHADING = 11
 TRANSPORT = 19
 
 
-@njit(inline="always", **_FLAGS)
+@njit(forceinline=True, **_FLAGS)
 def srgb_and_slope(linear: Any) -> Any:
     """sRGB of a linear value in [0, 1], and its derivative."""
     if linear > _THRESHOLD:
@@ -72,156 +72,168 @@ def shade_and_differentiate(
     as in `split_sum_kernel`. `factor` scales the gradients. Written: `gradient` (n, SHADING) of the pixels' interpolated parameters;
     added: `g_table` (CHUNKS, rows, 3); `sums` (CHUNKS, 3) loss, weighted mean squared error and weight.
     """
+    for chunk in prange(CHUNKS):
+        _shade_chunk(
+            np.int64(chunk), texel, bilinear, normal, view, colour, weight, reflected, values, transport, table, knots, sizes, offsets, lut,
+            residual_weight, robust, factor, gradient, g_table[chunk], sums[chunk],
+        )  # fmt: skip
+
+
+@njit(**_FLAGS)
+def _shade_chunk(
+    chunk: Any, texel: Any, bilinear: Any, normal: Any, view: Any, colour: Any, weight: Any, reflected: Any,
+    values: Any, transport: Any, table: Any, knots: Any, sizes: Any, offsets: Any, lut: Any,
+    residual_weight: Any, robust: Any, factor: Any, gradient: Any, table_grad: Any, sums: Any,
+) -> None:  # fmt: skip
+    """The same for the pixels of one chunk. A function of its own, as the analysis of parallel loops takes minutes on long ones."""
     n = texel.shape[0]
     last = sizes.shape[0] - 1
     half2 = _HALF * np.float32(sizes[last])
     third = factor * residual_weight / np.float32(3)  # errors are means over the channels
-    for chunk in prange(CHUNKS):
-        table_grad = g_table[chunk]
-        loss_sum = 0.0
-        square_sum = 0.0
-        weight_sum = 0.0
-        shading = np.empty(SHADING, np.float32)
-        local = np.empty(8, np.float32)
-        bounced = np.zeros(3, np.float32)
-        for pixel in range(chunk * n // CHUNKS, (chunk + 1) * n // CHUNKS):
-            i = np.uint64(pixel)
-            for c in range(SHADING):
-                shading[c] = _0
-            for c in range(8):
-                local[c] = _0
-            for k in range(4):
-                w = bilinear[i, k]
-                t = np.uint64(texel[i, k])
-                if w > _0:
-                    w_metal = w * values[t, 4]
-                    for c in range(3):
-                        shading[c] += (w - w_metal) * values[t, c]
-                        shading[3 + c] += w_metal * values[t, c]
-                        shading[7 + c] += w * values[t, 5 + c]
-                    shading[6] += w * values[t, 3]
-                    shading[10] += w_metal
-                    for c in range(8):
-                        local[c] += w * transport[t, c]
-            rough = shading[6]
-            visible = local[0]
-            occlusion = local[1]
+    loss_sum = 0.0
+    square_sum = 0.0
+    weight_sum = 0.0
+    shading = np.empty(SHADING, np.float32)
+    local = np.empty(8, np.float32)
+    bounced = np.zeros(3, np.float32)
+    for pixel in range(chunk * n // CHUNKS, (chunk + 1) * n // CHUNKS):
+        i = np.uint64(pixel)
+        for c in range(SHADING):
+            shading[c] = _0
+        for c in range(8):
+            local[c] = _0
+        for k in range(4):
+            w = bilinear[i, k]
+            t = np.uint64(texel[i, k])
+            if w > _0:
+                w_metal = w * values[t, 4]
+                for c in range(3):
+                    shading[c] += (w - w_metal) * values[t, c]
+                    shading[3 + c] += w_metal * values[t, c]
+                    shading[7 + c] += w * values[t, 5 + c]
+                shading[6] += w * values[t, 3]
+                shading[10] += w_metal
+                for c in range(8):
+                    local[c] += w * transport[t, c]
+        rough = shading[6]
+        visible = local[0]
+        occlusion = local[1]
 
-            # Geometry.
-            nx = normal[i, 0] + shading[7]
-            ny = normal[i, 1] + shading[8]
-            nz = normal[i, 2] + shading[9]
-            inverse = _1 / math.sqrt(max(nx * nx + ny * ny + nz * nz, MIN_SQUARED_LENGTH))
-            nx *= inverse
-            ny *= inverse
-            nz *= inverse
-            vx, vy, vz = view[i, 0], view[i, 1], view[i, 2]
-            c = nx * vx + ny * vy + nz * vz
-            soft_root = math.sqrt(c * c + _CLAMP_TERM)
-            soft = _HALF * (c + soft_root)
-            root = math.sqrt(soft)
-            row, col, fx, fy = _table_cell(root, rough, lut)
-            scale = _table_value(lut, row, col, fx, fy, 0)
-            bias = _table_value(lut, row, col, fx, fy, 1)
-            share = _table_value(lut, row, col, fx, fy, 2)
-            lobe_rough = _table_value(lut, row, col, fx, fy, 3)
-            mirror = _table_value(lut, row, col, fx, fy, 4)
-            dielectric = _table_value(lut, row, col, fx, fy, 5)
-            transmitted = _1 - dielectric
-            metal = shading[10]
-            coeff = _1 + mirror * (_2 * c - _1)
-            rx = coeff * nx - mirror * vx
-            ry = coeff * ny - mirror * vy
-            rz = coeff * nz - mirror * vz
-            u, v = _encode(rx, ry, rz)
-            level, t_level = _roughness_level(lobe_rough, knots)
-            base0, stride0, fx0, fy0 = _taps(u, v, sizes[level], offsets[level])
-            base1, stride1, fx1, fy1 = _taps(u, v, sizes[level + 1], offsets[level + 1])
-            u, v = _encode(nx, ny, nz)
-            base2, stride2, fx2, fy2 = _taps(u, v, sizes[last], offsets[last])
-            visible_s, blocked, incident, hit = specular_visibility(soft, rough, occlusion, reflected, i)
-            bounced[:] = _0
-            if incident > _0:
-                two = _2 * c
-                x, y, z = two * nx - vx, two * ny - vy, two * nz - vz
-                reflected_radiance(transport, hit, x, y, z, table, knots, sizes, offsets, lut, bounced)
+        # Geometry.
+        nx = normal[i, 0] + shading[7]
+        ny = normal[i, 1] + shading[8]
+        nz = normal[i, 2] + shading[9]
+        inverse = _1 / math.sqrt(max(nx * nx + ny * ny + nz * nz, MIN_SQUARED_LENGTH))
+        nx *= inverse
+        ny *= inverse
+        nz *= inverse
+        vx, vy, vz = view[i, 0], view[i, 1], view[i, 2]
+        c = nx * vx + ny * vy + nz * vz
+        soft_root = math.sqrt(c * c + _CLAMP_TERM)
+        soft = _HALF * (c + soft_root)
+        root = math.sqrt(soft)
+        row, col, fx, fy = _table_cell(root, rough, lut)
+        scale = _table_value(lut, row, col, fx, fy, 0)
+        bias = _table_value(lut, row, col, fx, fy, 1)
+        share = _table_value(lut, row, col, fx, fy, 2)
+        lobe_rough = _table_value(lut, row, col, fx, fy, 3)
+        mirror = _table_value(lut, row, col, fx, fy, 4)
+        dielectric = _table_value(lut, row, col, fx, fy, 5)
+        transmitted = _1 - dielectric
+        metal = shading[10]
+        coeff = _1 + mirror * (_2 * c - _1)
+        rx = coeff * nx - mirror * vx
+        ry = coeff * ny - mirror * vy
+        rz = coeff * nz - mirror * vz
+        u, v = _encode(rx, ry, rz)
+        level, t_level = _roughness_level(lobe_rough, knots)
+        base0, stride0, fx0, fy0 = _taps(u, v, sizes[level], offsets[level])
+        base1, stride1, fx1, fy1 = _taps(u, v, sizes[level + 1], offsets[level + 1])
+        u, v = _encode(nx, ny, nz)
+        base2, stride2, fx2, fy2 = _taps(u, v, sizes[last], offsets[last])
+        visible_s, blocked, incident, hit = specular_visibility(soft, rough, occlusion, reflected, i)
+        bounced[:] = _0
+        if incident > _0:
+            two = _2 * c
+            x, y, z = two * nx - vx, two * ny - vy, two * nz - vz
+            reflected_radiance(transport, hit, x, y, z, table, knots, sizes, offsets, lut, bounced)
 
-            # Shade, compare, differentiate; one channel at a time.
-            w = weight[i]
-            g_u = g_v = g_un = g_vn = g_t = g_scale = g_bias = g_share = g_metal = g_dielectric = _0
-            half0 = _HALF * np.float32(sizes[level])
-            half1 = _HALF * np.float32(sizes[level + 1])
-            squares = _0
-            loss = _0
-            for ch in range(3):
-                albedo = shading[ch]
-                metal_colour = shading[3 + ch]
-                lower = _bilinear(table, base0, stride0, fx0, fy0, ch)
-                upper = _bilinear(table, base1, stride1, fx1, fy1, ch)
-                irradiance = _bilinear(table, base2, stride2, fx2, fy2, ch)
-                narrow = lower + t_level * (upper - lower)
-                diffuse = visible * irradiance + local[2 + ch]
-                near = visible_s * narrow + incident * bounced[ch] + blocked * local[2 + ch]
-                light = near + share * (diffuse - near)
-                reflectance = metal_colour * scale + metal * bias + (_1 - metal) * dielectric
-                linear = albedo * transmitted * diffuse + light * reflectance + local[5 + ch]
-                encoded, slope = srgb_and_slope(min(max(linear, _0), _1))
-                error = encoded - colour[i, ch]
-                squares += error * error
-                length = math.sqrt(error * error + robust * robust)
-                loss += length - robust
-                g = _0
-                if _0 <= linear <= _1:
-                    g = third * w * error / length * slope
-                gradient[i, ch] = g * transmitted * diffuse
-                gradient[i, 3 + ch] = g * light * scale
-                g_metal += g * light * (bias - dielectric)
-                g_scale += g * light * metal_colour
-                g_bias += g * light * metal
-                g_dielectric += g * (light * (_1 - metal) - albedo * diffuse)
-                g_light = g * reflectance
-                g_share += g_light * (diffuse - near)
-                g_narrow = g_light * (_1 - share) * visible_s
-                g_t += g_narrow * (upper - lower)
-                du, dv = _bilinear_backward(table, table_grad, base0, stride0, fx0, fy0, ch, g_narrow * (_1 - t_level))
-                g_u += du * half0
-                g_v += dv * half0
-                du, dv = _bilinear_backward(table, table_grad, base1, stride1, fx1, fy1, ch, g_narrow * t_level)
-                g_u += du * half1
-                g_v += dv * half1
-                g_irradiance = visible * (g * albedo * transmitted + g_light * share)
-                du, dv = _bilinear_backward(table, table_grad, base2, stride2, fx2, fy2, ch, g_irradiance)
-                g_un += du * half2
-                g_vn += dv * half2
-            loss_sum += w * residual_weight * loss
-            square_sum += w * squares
-            weight_sum += w
+        # Shade, compare, differentiate; one channel at a time.
+        w = weight[i]
+        g_u = g_v = g_un = g_vn = g_t = g_scale = g_bias = g_share = g_metal = g_dielectric = _0
+        half0 = _HALF * np.float32(sizes[level])
+        half1 = _HALF * np.float32(sizes[level + 1])
+        squares = _0
+        loss = _0
+        for ch in range(3):
+            albedo = shading[ch]
+            metal_colour = shading[3 + ch]
+            lower = _bilinear(table, base0, stride0, fx0, fy0, ch)
+            upper = _bilinear(table, base1, stride1, fx1, fy1, ch)
+            irradiance = _bilinear(table, base2, stride2, fx2, fy2, ch)
+            narrow = lower + t_level * (upper - lower)
+            diffuse = visible * irradiance + local[2 + ch]
+            near = visible_s * narrow + incident * bounced[ch] + blocked * local[2 + ch]
+            light = near + share * (diffuse - near)
+            reflectance = metal_colour * scale + metal * bias + (_1 - metal) * dielectric
+            linear = albedo * transmitted * diffuse + light * reflectance + local[5 + ch]
+            encoded, slope = srgb_and_slope(min(max(linear, _0), _1))
+            error = encoded - colour[i, ch]
+            squares += error * error
+            length = math.sqrt(error * error + robust * robust)
+            loss += length - robust
+            g = _0
+            if _0 <= linear <= _1:
+                g = third * w * error / length * slope
+            gradient[i, ch] = g * transmitted * diffuse
+            gradient[i, 3 + ch] = g * light * scale
+            g_metal += g * light * (bias - dielectric)
+            g_scale += g * light * metal_colour
+            g_bias += g * light * metal
+            g_dielectric += g * (light * (_1 - metal) - albedo * diffuse)
+            g_light = g * reflectance
+            g_share += g_light * (diffuse - near)
+            g_narrow = g_light * (_1 - share) * visible_s
+            g_t += g_narrow * (upper - lower)
+            du, dv = _bilinear_backward(table, table_grad, base0, stride0, fx0, fy0, ch, g_narrow * (_1 - t_level))
+            g_u += du * half0
+            g_v += dv * half0
+            du, dv = _bilinear_backward(table, table_grad, base1, stride1, fx1, fy1, ch, g_narrow * t_level)
+            g_u += du * half1
+            g_v += dv * half1
+            g_irradiance = visible * (g * albedo * transmitted + g_light * share)
+            du, dv = _bilinear_backward(table, table_grad, base2, stride2, fx2, fy2, ch, g_irradiance)
+            g_un += du * half2
+            g_vn += dv * half2
+        loss_sum += w * residual_weight * loss
+        square_sum += w * squares
+        weight_sum += w
 
-            gx, gy, gz = _encode_backward(rx, ry, rz, g_u, g_v)
-            g_along = gx * nx + gy * ny + gz * nz
-            g_mirror = (_2 * c - _1) * g_along - (gx * vx + gy * vy + gz * vz)
-            # Split-sum table: derivatives along √(n·v) and roughness. Visibility and reflected radiance count as constants.
-            g_rough = g_t / (knots[level + 1] - knots[level])
-            d_root = d_row = _0
-            for k, g in ((0, g_scale), (1, g_bias), (2, g_share), (3, g_rough), (4, g_mirror), (5, g_dielectric)):
-                along_root, along_row = _table_slopes(lut, row, col, fx, fy, k)
-                d_root += g * along_root
-                d_row += g * along_row
-            g_c = d_root * np.float32(lut.shape[1] - 1) * _HALF / root * _HALF * (_1 + c / soft_root) + _2 * mirror * g_along
-            gradient[i, 6] = d_row * np.float32(lut.shape[0] - 1)
-            hx, hy, hz = _encode_backward(nx, ny, nz, g_un, g_vn)
-            hx += coeff * gx + g_c * vx
-            hy += coeff * gy + g_c * vy
-            hz += coeff * gz + g_c * vz
-            radial = hx * nx + hy * ny + hz * nz
-            keep = inverse if inverse * inverse * MIN_SQUARED_LENGTH < _1 else _0
-            gradient[i, 7] = keep * (hx - radial * nx)
-            gradient[i, 8] = keep * (hy - radial * ny)
-            gradient[i, 9] = keep * (hz - radial * nz)
-            gradient[i, 10] = g_metal
-        sums[chunk, 0] += loss_sum / 3
-        sums[chunk, 1] += square_sum / 3
-        sums[chunk, 2] += weight_sum
+        gx, gy, gz = _encode_backward(rx, ry, rz, g_u, g_v)
+        g_along = gx * nx + gy * ny + gz * nz
+        g_mirror = (_2 * c - _1) * g_along - (gx * vx + gy * vy + gz * vz)
+        # Split-sum table: derivatives along √(n·v) and roughness. Visibility and reflected radiance count as constants.
+        g_rough = g_t / (knots[level + 1] - knots[level])
+        d_root = d_row = _0
+        for k, g in ((0, g_scale), (1, g_bias), (2, g_share), (3, g_rough), (4, g_mirror), (5, g_dielectric)):
+            along_root, along_row = _table_slopes(lut, row, col, fx, fy, k)
+            d_root += g * along_root
+            d_row += g * along_row
+        g_c = d_root * np.float32(lut.shape[1] - 1) * _HALF / root * _HALF * (_1 + c / soft_root) + _2 * mirror * g_along
+        gradient[i, 6] = d_row * np.float32(lut.shape[0] - 1)
+        hx, hy, hz = _encode_backward(nx, ny, nz, g_un, g_vn)
+        hx += coeff * gx + g_c * vx
+        hy += coeff * gy + g_c * vy
+        hz += coeff * gz + g_c * vz
+        radial = hx * nx + hy * ny + hz * nz
+        keep = inverse if inverse * inverse * MIN_SQUARED_LENGTH < _1 else _0
+        gradient[i, 7] = keep * (hx - radial * nx)
+        gradient[i, 8] = keep * (hy - radial * ny)
+        gradient[i, 9] = keep * (hz - radial * nz)
+        gradient[i, 10] = g_metal
+    sums[0] += loss_sum / 3
+    sums[1] += square_sum / 3
+    sums[2] += weight_sum
 
 
 @njit(parallel=True, **_FLAGS)
@@ -260,7 +272,7 @@ def gather_gradient(touched: Any, start: Any, pixel: Any, share: Any, gradient: 
         out[t, 7] = z
 
 
-@njit(inline="always", **_FLAGS)
+@njit(forceinline=True, **_FLAGS)
 def _sign(x: Any) -> Any:
     return np.float32(x > _0) - np.float32(x < _0)
 

@@ -33,14 +33,14 @@ MIN_BLOCKED = 0.1
 _MIN_BLOCKED = np.float32(MIN_BLOCKED)
 
 
-@njit(inline="always", **_FLAGS)
+@njit(forceinline=True, **_FLAGS)
 def specular_occlusion(cosine: Any, roughness: Any, occlusion: Any) -> Any:
     """Specular occlusion of Lagarde & de Rousiers for a positive `cosine`."""
     exponent = np.float32(2) ** (-_16 * roughness - _1)
     return min(max(max(min(cosine, _1) + occlusion, _MIN_OCCLUSION_BASE) ** exponent - _1 + occlusion, _0), _1)
 
 
-@njit(inline="always", **_FLAGS)
+@njit(forceinline=True, **_FLAGS)
 def specular_visibility(cosine: Any, roughness: Any, occlusion: Any, reflected: Any, i: Any) -> Any:
     """Visible share of the specular lobe of pixel i; what the indirect irradiance / π is multiplied by for the light of the rest; weight of
     the radiance that a traced ray meets, and the texel where it does.
@@ -62,7 +62,7 @@ def specular_visibility(cosine: Any, roughness: Any, occlusion: Any, reflected: 
     return visible, blocked, incident, hit
 
 
-@njit(inline="always", **_FLAGS)
+@njit(forceinline=True, **_FLAGS)
 def reflected_radiance(
     transport: Any, hit: Any, x: Any, y: Any, z: Any, table: Any, knots: Any, sizes: Any, offsets: Any, lut: Any, out: Any
 ) -> None:

@@ -42,7 +42,7 @@ def max_depth_tiles(inverse_depth: Any, mask_distance: Any, truncation: Any) -> 
     return out
 
 
-@nb.njit(cache=True, nogil=True, inline="always")
+@nb.njit(cache=True, nogil=True, forceinline=True)
 def _classify_block(
     x0: Any,
     y0: Any,

@@ -76,7 +76,7 @@ def _run_kernel(kernel: Any, arguments: tuple[Any, ...], start: int, stop: int) 
     kernel(start, stop, *arguments)
 
 
-@nb.njit(cache=True, nogil=True, inline="always")
+@nb.njit(cache=True, nogil=True, forceinline=True)
 def _block_of_sample(index: Any, coords: Any, row: int, i: int, j: int, k: int) -> Any:
     """Row of the block of the sample at local (i, j, k) of block `row`, at most one step outside it; -1 when not allocated."""
     if 0 <= i < EDGE and 0 <= j < EDGE and 0 <= k < EDGE:

@@ -18,7 +18,8 @@ from numba import njit, prange
 from gsbake.shading.octahedral import MIN_L1_NORM
 
 #: No fast-math flags: Numba optimises the body of a parallel loop once for the process that compiles it and once more for the copy on the
-#: disk, so with them a first run would round differently from all later ones.
+#: disk, so with them a first run would round differently from all later ones. Small functions are inlined by LLVM (`forceinline`): inlined
+#: by Numba, before it infers types and analyses parallel loops, they make the compilation of a kernel ten times as long.
 _FLAGS: Any = {"error_model": "numpy", "cache": True}
 
 #: Pixel chunks with separate gradient tables; fixed, for results that do not depend on the number of threads.
@@ -39,12 +40,12 @@ COSINE_CLAMP_WIDTH = np.float32(0.01)
 _CLAMP_TERM = np.float32(4.0) * COSINE_CLAMP_WIDTH * COSINE_CLAMP_WIDTH
 
 
-@njit(inline="always", **_FLAGS)
+@njit(forceinline=True, **_FLAGS)
 def _sign(x: Any) -> Any:
     return _1 if x > _0 else (-_1 if x < _0 else _0)
 
 
-@njit(inline="always", **_FLAGS)
+@njit(forceinline=True, **_FLAGS)
 def _encode(x: Any, y: Any, z: Any) -> Any:
     """Octahedral coordinates u, v in [−1, 1] of a direction."""
     inverse = _1 / max(abs(x) + abs(y) + abs(z), _MIN_L1_NORM)
@@ -55,7 +56,7 @@ def _encode(x: Any, y: Any, z: Any) -> Any:
     return p, q
 
 
-@njit(inline="always", **_FLAGS)
+@njit(forceinline=True, **_FLAGS)
 def _encode_backward(x: Any, y: Any, z: Any, gu: Any, gv: Any) -> Any:
     """Gradient of `_encode` with respect to x, y, z."""
     inverse = _1 / max(abs(x) + abs(y) + abs(z), _MIN_L1_NORM)
@@ -68,13 +69,13 @@ def _encode_backward(x: Any, y: Any, z: Any, gu: Any, gv: Any) -> Any:
     return gp * inverse + norm * _sign(x), gq * inverse + norm * _sign(y), norm * _sign(z)
 
 
-@njit(inline="always", **_FLAGS)
+@njit(forceinline=True, **_FLAGS)
 def _cell(x: Any, last: Any) -> Any:
     """Index of the cell that contains x, clamped to 0…last; 0 for NaN. Unsigned, so that Numba omits the wrap-around test."""
     return np.uint64(np.int64(min(x, np.float32(last)))) if x >= _0 else np.uint64(0)
 
 
-@njit(inline="always", **_FLAGS)
+@njit(forceinline=True, **_FLAGS)
 def _taps(u: Any, v: Any, size: Any, start: Any) -> Any:
     """Index of the first texel, row stride and fractions of the bilinear interpolation in one level."""
     half = _HALF * np.float32(size)
@@ -86,14 +87,14 @@ def _taps(u: Any, v: Any, size: Any, start: Any) -> Any:
     return np.uint64(start) + row * stride + col, stride, x - np.float32(np.int64(col)), y - np.float32(np.int64(row))
 
 
-@njit(inline="always", **_FLAGS)
+@njit(forceinline=True, **_FLAGS)
 def _bilinear(table: Any, base: Any, stride: Any, fx: Any, fy: Any, c: Any) -> Any:
     top = table[base, c] + fx * (table[base + _U1, c] - table[base, c])
     bottom = table[base + stride, c] + fx * (table[base + stride + _U1, c] - table[base + stride, c])
     return top + fy * (bottom - top)
 
 
-@njit(inline="always", **_FLAGS)
+@njit(forceinline=True, **_FLAGS)
 def _bilinear_backward(table: Any, out: Any, base: Any, stride: Any, fx: Any, fy: Any, c: Any, g: Any) -> Any:
     """Add the gradient g to the four texels of `out`; returns the gradients of fx and fy."""
     a = table[base, c]
@@ -109,7 +110,7 @@ def _bilinear_backward(table: Any, out: Any, base: Any, stride: Any, fx: Any, fy
     return gx * (b - a) + gy * (e - d), g * ((d - a) + fx * ((e - d) - (b - a)))
 
 
-@njit(inline="always", **_FLAGS)
+@njit(forceinline=True, **_FLAGS)
 def _roughness_level(roughness: Any, knots: Any) -> Any:
     """Lower roughness level and interpolation weight of the next one, both clamped."""
     last = knots.shape[0] - 2
@@ -120,7 +121,7 @@ def _roughness_level(roughness: Any, knots: Any) -> Any:
     return k, min(max(t, _0), _1)
 
 
-@njit(inline="always", **_FLAGS)
+@njit(forceinline=True, **_FLAGS)
 def _mirror_weight(roughness: Any) -> Any:
     """Share of the lobe that follows the mirror direction, as in `split_sum`."""
     alpha = min(max(roughness, _0), _1)
@@ -129,7 +130,7 @@ def _mirror_weight(roughness: Any) -> Any:
     return smoothness * (math.sqrt(smoothness) + alpha)
 
 
-@njit(inline="always", **_FLAGS)
+@njit(forceinline=True, **_FLAGS)
 def _geometry(normal: Any, view: Any, i: Any) -> Any:
     """Inverse length of the normal, unit normal, and its cosine with the view direction."""
     x, y, z = normal[i, 0], normal[i, 1], normal[i, 2]
@@ -140,7 +141,7 @@ def _geometry(normal: Any, view: Any, i: Any) -> Any:
     return inverse, x, y, z, x * view[i, 0] + y * view[i, 1] + z * view[i, 2]
 
 
-@njit(inline="always", **_FLAGS)
+@njit(forceinline=True, **_FLAGS)
 def _table_cell(root: Any, roughness: Any, lut: Any) -> Any:
     """Cell and interpolation weights of the split-sum table at √(n·v) and roughness."""
     x = root * np.float32(lut.shape[1] - 1)
@@ -150,7 +151,7 @@ def _table_cell(root: Any, roughness: Any, lut: Any) -> Any:
     return row, col, x - np.float32(np.int64(col)), y - np.float32(np.int64(row))
 
 
-@njit(inline="always", **_FLAGS)
+@njit(forceinline=True, **_FLAGS)
 def _table_value(lut: Any, row: Any, col: Any, fx: Any, fy: Any, k: Any) -> Any:
     """Column k of the split-sum table between its nodes."""
     top = lut[row, col, k] + fx * (lut[row, col + _U1, k] - lut[row, col, k])
@@ -158,7 +159,7 @@ def _table_value(lut: Any, row: Any, col: Any, fx: Any, fy: Any, k: Any) -> Any:
     return top + fy * (bottom - top)
 
 
-@njit(inline="always", **_FLAGS)
+@njit(forceinline=True, **_FLAGS)
 def _table_slopes(lut: Any, row: Any, col: Any, fx: Any, fy: Any, k: Any) -> Any:
     """Derivatives of `_table_value` in fx and fy."""
     a, b = lut[row, col, k], lut[row, col + _U1, k]

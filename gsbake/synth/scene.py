@@ -41,7 +41,7 @@ MARKER_NUMBER, MARKER_SIZE, MARKER_CENTRE, MARKER_MARGIN = 7, 0.2, (0.33, 0.48),
 NO_MARKER = np.zeros((0, 0), np.uint8)
 
 _compiled: Any = njit(cache=True, nogil=True, error_model="numpy")
-_inlined: Any = njit(cache=True, nogil=True, error_model="numpy", inline="always")
+_inlined: Any = njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 
 
 @_inlined

@@ -26,7 +26,7 @@ Array = NDArray[np.float64]
 #: Interleaved subsets of the light and hemisphere points, one per sample of a pixel.
 SAMPLE_SUBSETS = 4
 _compiled: Any = njit(cache=True, nogil=True, error_model="numpy")
-_inlined: Any = njit(cache=True, nogil=True, error_model="numpy", inline="always")
+_inlined: Any = njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 
 
 class LightRig(NamedTuple):
