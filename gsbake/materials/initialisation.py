@@ -11,8 +11,8 @@ be, so that the PSNR prefers materials that are too rough. Fits that started wit
 brighter or a dimmer light: there its prior decides (`intensity_prior`), but not between metal and dielectric. Where both kinds explain the
 photos, the object is dielectric, as most are.
 
-A capture too small for validation photos distinguishes metals from dielectrics all the same, but not roughnesses: every fourth photo is
-held out while the two kinds are compared, and all are fitted from the start that is chosen.
+A capture too small for validation photos distinguishes metals from dielectrics all the same, but not the roughness of dielectrics: every
+fourth photo is held out while the best starts of the two kinds are compared, and all are fitted from the start that is chosen.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ METAL_SEARCHES_AT = (0.4, 0.8)
 LIGHT_SCALED_AT = (0.6,)
 #: Start of a diffuse object, and without validation photos.
 DIFFUSE_START, DEFAULT_START = (0.05, 0.8), (0.05, 0.45)
-#: Without validation photos every so many photos are held out while metal is compared with the default start.
+#: Without validation photos every so many photos are held out while metal is compared with dielectric.
 KIND_HOLDOUT = 4
 #: Starts whose error is within this factor of the best one are continued as well, at most so many in all.
 CANDIDATE_FACTOR, MAX_CANDIDATES = 1.3, 3
@@ -94,10 +94,10 @@ def compared_starts(make: MakeFit, level: FitLevel, plan: FitSchedule, each: Eac
     if not apart:
         return (DEFAULT_START,), "no validation photos"
     kept, chosen = ([photo for i, photo in enumerate(level.fitted) if (i in apart) == role] for role in (False, True))
-    trials = trial_fits(make, replace(level, fitted=kept, held_out=chosen), (DEFAULT_START, *METAL_STARTS), plan, each)
+    trials = trial_fits(make, replace(level, fitted=kept, held_out=chosen), STARTS, plan, each)
     errors = {start: validation_error(fitted) for start, (_, fitted) in trials.items()}
-    metal = min(METAL_STARTS, key=lambda start: errors[start])
-    start = metal if errors[metal] < (1 - _metal_margin(trials)) * errors[DEFAULT_START] else DEFAULT_START
+    metal, dielectric = (min((s for s in STARTS if (s in METAL_STARTS) == kind), key=lambda s: errors[s]) for kind in (True, False))
+    start = metal if errors[metal] < (1 - _metal_margin(trials)) * errors[dielectric] else DEFAULT_START
     return (start,), f"no validation photos; by every {KIND_HOLDOUT}th photo, fitted afterwards: {_percent(errors)}"
 
 

@@ -119,9 +119,9 @@ def test_one_start_where_nothing_is_compared(diffuse: bool, held_out: bool, phot
     assert starts == (start,) and not runs and reason
 
 
-def kind_by_few_photos(metal_error: float, moves: bool = False) -> tuple[Start, list[tuple[int, int]]]:
-    """The start chosen without validation photos, where metal of roughness .45 has `metal_error` and dielectric 1, with the number of
-    photos that each trial was fitted to and compared on."""
+def kind_by_few_photos(metal_error: float, moves: bool = False, smooth_error: float = 1.2) -> tuple[Start, list[tuple[int, int]]]:
+    """The start chosen without validation photos, where metal of roughness .45 has `metal_error`, the default dielectric 1 and a smooth one
+    `smooth_error`, with the number of photos that each trial was fitted to and compared on."""
     counts: list[tuple[int, int]] = []
 
     class Counted(Fit):
@@ -132,7 +132,7 @@ def kind_by_few_photos(metal_error: float, moves: bool = False) -> tuple[Start, 
             counts.append((len(photos), len(held_out)))
             return super().run(photos, held_out, schedule, each)
 
-    errors = {DEFAULT_START: 1.0, METAL_STARTS[0]: 1.5, METAL_STARTS[1]: metal_error}
+    errors = {STARTS[0]: smooth_error, DEFAULT_START: 1.0, STARTS[2]: 1.4, METAL_STARTS[0]: 1.5, METAL_STARTS[1]: metal_error}
     make: Any = lambda m, r: Counted(errors[m, r], [], m < 0.5)  # noqa: E731
     (start,), reason = compared_starts(make, level(False, photos=11), trial_schedule(7, 0, False), nothing)
     assert "100.00% error from metallic 0.05" in reason
@@ -141,8 +141,9 @@ def kind_by_few_photos(metal_error: float, moves: bool = False) -> tuple[Start, 
 
 def test_few_photos_distinguish_metal_from_dielectric_by_photos_held_out() -> None:
     start, counts = kind_by_few_photos(1 - 2 * METAL_MARGIN)
-    assert start == METAL_STARTS[1] and counts == 3 * [(8, 3)] and KIND_HOLDOUT == 4
+    assert start == METAL_STARTS[1] and counts == len(STARTS) * [(8, 3)] and KIND_HOLDOUT == 4
     assert kind_by_few_photos(1 - METAL_MARGIN / 2)[0] == DEFAULT_START  # not clearly better
+    assert kind_by_few_photos(0.9, smooth_error=0.9)[0] == DEFAULT_START  # than the best dielectric one
     assert kind_by_few_photos(1 - 2 * METAL_MARGIN, moves=True)[0] == DEFAULT_START
     assert kind_by_few_photos(1 - 2 * MOVING_METAL_MARGIN, moves=True)[0] == METAL_STARTS[1]
 
