@@ -85,7 +85,7 @@ def _shade_chunk(
     values: Any, transport: Any, table: Any, knots: Any, sizes: Any, offsets: Any, lut: Any,
     residual_weight: Any, robust: Any, factor: Any, gradient: Any, table_grad: Any, sums: Any,
 ) -> None:  # fmt: skip
-    """The same for the pixels of one chunk. A function of its own, as the analysis of parallel loops takes minutes on long ones."""
+    """The same for the pixels of one chunk. A function of its own, as Numba analyses parallel loops longer."""
     n = texel.shape[0]
     last = sizes.shape[0] - 1
     half2 = _HALF * np.float32(sizes[last])
