@@ -31,7 +31,6 @@ import torch
 from numpy.typing import NDArray
 
 from gsbake.imaging.metrics import decibels
-from gsbake.materials.bilateral import Neighbourhoods
 from gsbake.materials.emission import find_emission
 from gsbake.materials.fit_model import FitModel
 from gsbake.materials.fit_surface import FitSurface, Fitted
@@ -76,7 +75,6 @@ class MaterialFit(FitModel):
         """`light_size` is the edge of the environment map's faces in texels; `roughness`, `metallic` the initial values of all texels."""
         super().__init__(surface, light_size, priors, roughness, metallic, options or FitOptions())
         self._priors = priors
-        self._neighbourhoods = Neighbourhoods(surface.texels, surface.pairs, surface.base_color)
         self._metal_start, self.emissive_regions = metallic > self._options.max_dielectric_metallic, 0
         self._adjustments: list[LightAdjustment] = []
         self._common = np.zeros((0, 4), np.float32)
@@ -215,8 +213,8 @@ class MaterialFit(FitModel):
     def _search_metals(self, batches: list[PhotoBatch]) -> None:
         """Reinitialise texels that are detected as metal, and from a metallic start those that are dielectric."""
         o = self._options
-        wide = self._neighbourhoods.wide  # errors of a moving light, which is an approximation, are similar all over a near one
-        near = wide if self.moving_light else self._neighbourhoods.near(self._values)
+        wide = self._surface.neighbourhoods.wide  # errors of a moving light, which is an approximation, are similar all over a near one
+        near = wide if self.moving_light else self._surface.neighbourhoods.near(self._values)
         found = find_metals(self._metal_samples(batches), self._values[:, 3].copy(), near, wide)
         kinds = [(found.texel, found.base, found.roughness, o.detected_metallic)]
         if self._metal_start:

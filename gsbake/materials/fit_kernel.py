@@ -327,19 +327,42 @@ def adam_step(
 
 
 @njit(parallel=True, **_FLAGS)
-def linear_shading(
-    texel: Any, normal: Any, view: Any, reflected: Any, local: Any, transport: Any, rough: Any, table: Any, knots: Any, sizes: Any,
-    offsets: Any, lut: Any, diffuse: Any, specular: Any, scaled: Any, edge: Any, constant: Any,
+def incident_light(
+    normal: Any, view: Any, reflected: Any, local: Any, transport: Any, table: Any, knots: Any, sizes: Any, offsets: Any, lut: Any,
+    diffuse: Any, bounced: Any,
 ) -> None:  # fmt: skip
-    """Shading of n pixels as a linear function of base colour b.
+    """Of the light of n pixels what does not depend on their roughness, (n, 3) each: the `diffuse` light, and the radiance `bounced` of the
+    texel that the reflected ray meets.
 
-    A dielectric shows b · `diffuse` + `specular` + `constant`, a metal b · `scaled` + `edge` + `constant`; (n, 3) each. `texel` (n,) is the
-    texel whose roughness `rough` (texels,) counts; `local` (n, 8) the light transport of pixels, `transport` (texels, TRANSPORT) that of
-    the texels that they reflect.
+    `local` (n, 8) is the light transport of pixels, `transport` (texels, TRANSPORT) that of the texels that they reflect.
     """
-    n = normal.shape[0]
     last = sizes.shape[0] - 1
-    for pixel in prange(n):
+    for pixel in prange(normal.shape[0]):
+        i = np.uint64(pixel)
+        _, nx, ny, nz, c = _geometry(normal, view, i)
+        u, v = _encode(nx, ny, nz)
+        base, stride, fx, fy = _taps(u, v, sizes[last], offsets[last])
+        for ch in range(3):
+            diffuse[i, ch] = local[i, 0] * _bilinear(table, base, stride, fx, fy, ch) + local[i, 2 + ch]
+            bounced[i, ch] = _0
+        if reflected.shape[0] > 0 and reflected[i] >= 0:
+            two = _2 * c
+            x, y, z = two * nx - view[i, 0], two * ny - view[i, 1], two * nz - view[i, 2]
+            reflected_radiance(transport, np.uint64(reflected[i]), x, y, z, table, knots, sizes, offsets, lut, bounced[i])
+
+
+@njit(parallel=True, **_FLAGS)
+def linear_shading(
+    texel: Any, normal: Any, view: Any, reflected: Any, local: Any, wide: Any, bounced: Any, rough: Any, table: Any, knots: Any,
+    sizes: Any, offsets: Any, lut: Any, diffuse: Any, specular: Any, scaled: Any, edge: Any,
+) -> None:  # fmt: skip
+    """Shading of n pixels as a linear function of base colour b, without what they emit.
+
+    A dielectric shows b · `diffuse` + `specular`, a metal b · `scaled` + `edge`; (n, 3) each. `texel` (n,) is the texel whose roughness
+    `rough` (texels,) counts; `local` (n, 8) the light transport of pixels; `wide`, `bounced` (n, 3) their diffuse light and the radiance
+    that they reflect, of `incident_light`.
+    """
+    for pixel in prange(normal.shape[0]):
         i = np.uint64(pixel)
         roughness = rough[texel[i]]
         _, nx, ny, nz, c = _geometry(normal, view, i)
@@ -357,27 +380,17 @@ def linear_shading(
         level, t = _roughness_level(_table_value(lut, row, col, fx, fy, 3), knots)
         base0, stride0, fx0, fy0 = _taps(u, v, sizes[level], offsets[level])
         base1, stride1, fx1, fy1 = _taps(u, v, sizes[level + 1], offsets[level + 1])
-        u, v = _encode(nx, ny, nz)
-        base2, stride2, fx2, fy2 = _taps(u, v, sizes[last], offsets[last])
-        visible_s, blocked, incident, hit = specular_visibility(soft, roughness, local[i, 1], reflected, i)
-        bounced = np.zeros(3, np.float32)
-        if incident > _0:
-            two = _2 * c
-            x, y, z = two * nx - vx, two * ny - vy, two * nz - vz
-            reflected_radiance(transport, hit, x, y, z, table, knots, sizes, offsets, lut, bounced)
+        visible_s, blocked, incident, _ = specular_visibility(soft, roughness, local[i, 1], reflected, i)
         for ch in range(3):
             lower = _bilinear(table, base0, stride0, fx0, fy0, ch)
             upper = _bilinear(table, base1, stride1, fx1, fy1, ch)
-            irradiance = _bilinear(table, base2, stride2, fx2, fy2, ch)
             narrow = lower + t * (upper - lower)
-            wide = local[i, 0] * irradiance + local[i, 2 + ch]
-            near = visible_s * narrow + incident * bounced[ch] + blocked * local[i, 2 + ch]
-            light = near + share * (wide - near)
-            diffuse[i, ch] = transmitted * wide
+            near = visible_s * narrow + incident * bounced[i, ch] + blocked * local[i, 2 + ch]
+            light = near + share * (wide[i, ch] - near)
+            diffuse[i, ch] = transmitted * wide[i, ch]
             specular[i, ch] = light * dielectric
             scaled[i, ch] = light * scale
             edge[i, ch] = light * bias
-            constant[i, ch] = local[i, 5 + ch]
 
 
 @njit(parallel=True, **_FLAGS)

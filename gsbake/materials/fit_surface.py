@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from gsbake.materials.bilateral import Neighbourhoods
 from gsbake.materials.light_intensity import LightAdjustment
 from gsbake.shading.environment import EnvironmentLight
 from gsbake.texturing.texels import Texels
@@ -68,3 +70,8 @@ class FitSurface:
     base_color: NDArray[Any]
     transport: Transport | None = None
     indirect: bool = True
+
+    @cached_property
+    def neighbourhoods(self) -> Neighbourhoods:
+        """The neighbourhoods of texels that decide together; kept, as all trials on a level use the same wide one."""
+        return Neighbourhoods(self.texels, self.pairs, self.base_color)

@@ -26,7 +26,7 @@ from gsbake.materials.fit import MaterialFit
 from gsbake.materials.fit_surface import Fitted, validation_error
 from gsbake.materials.levels import FitLevel
 from gsbake.materials.linear_shading import BaseColourSolver, observed_weight
-from gsbake.materials.metallic import TRIED_ROUGHNESS, candidate_models
+from gsbake.materials.metallic import TRIED_ROUGHNESS, candidate_model
 from gsbake.materials.options import FitSchedule
 
 Floats = NDArray[np.float64]
@@ -152,7 +152,8 @@ class _Models:
         photos, texels = fit.metal_samples(level.fitted), len(level.surface.texels)
         self._weight = observed_weight(photos, texels)
         solver, tried = BaseColourSolver(photos, texels), [np.full(texels, r, np.float32) for r in TRIED_ROUGHNESS]
-        self._found = [[*candidate_models(photos, solver, metallic, tried)] for metallic in (0.0, 1.0)]
+        at_each = [[candidate_model(photos, solver, roughness, metallic) for metallic in (0.0, 1.0)] for roughness in tried]
+        self._found = [*zip(*at_each, strict=True)]
 
     def _costs(self, metal: bool, group: NDArray[np.int64]) -> list[float]:
         """Negative log-likelihood of all pixels of a `group` (m,) at each roughness."""

@@ -22,7 +22,7 @@ wider neighbourhood of similar photos does, in which narrow metal between wood o
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -129,17 +129,15 @@ class _BestModel:
         self.cost[better], self.base[better], self.roughness[better] = cost[better], base[better], roughness[better]
 
 
-def candidate_models(
-    photos: Sequence[PhotoSamples], solver: BaseColourSolver, metallic: float, roughnesses: Iterable[NDArray[np.float32]]
-) -> Iterator[tuple[Floats, Floats, NDArray[np.float32]]]:
-    """For each of the `roughnesses` (texels,) the best models at `metallic` 0 or 1: costs (texels,), which are negative log-likelihoods up
-    to a constant, base colours (texels, 3) and the roughness."""
-    lowest = MIN_METAL_ALBEDO if metallic else 0.0
-    for roughness in roughnesses:
-        models = [ShadingModel.of(samples, roughness, metallic) for samples in photos]
-        base = solver.solve([model.shading for model in models], lowest)
-        costs = [model.negative_log_likelihood(samples, base) for samples, model in zip(photos, models, strict=True)]
-        yield sum(costs, np.zeros(len(base))), base, roughness
+def candidate_model(
+    photos: Sequence[PhotoSamples], solver: BaseColourSolver, roughness: NDArray[np.float32], metallic: float
+) -> tuple[Floats, Floats]:
+    """The best model at a `roughness` (texels,) and `metallic` 0 or 1: costs (texels,), which are negative log-likelihoods up to a
+    constant, and base colours (texels, 3)."""
+    models = [ShadingModel.of(samples, roughness, metallic) for samples in photos]
+    base = solver.solve([model.shading for model in models], MIN_METAL_ALBEDO if metallic else 0.0)
+    costs = [model.negative_log_likelihood(samples, base) for samples, model in zip(photos, models, strict=True)]
+    return sum(costs, np.zeros(len(base))), base
 
 
 def _compare_models(photos: Sequence[PhotoSamples], own: NDArray[np.float32]) -> tuple[_BestModel, _BestModel]:
@@ -147,8 +145,8 @@ def _compare_models(photos: Sequence[PhotoSamples], own: NDArray[np.float32]) ->
     texels = len(own)
     solver, tried = BaseColourSolver(photos, texels), [np.full(texels, r, np.float32) for r in TRIED_ROUGHNESS]
     found = _BestModel(texels), _BestModel(texels)
-    for metallic, best in enumerate(found):
-        first = np.minimum(own, np.float32(MAX_METAL_ROUGHNESS)) if metallic else own
-        for cost, base, roughness in candidate_models(photos, solver, metallic, (first, *tried)):
-            best.offer(cost, base, roughness)
+    smooth = own if own.max(initial=0) <= MAX_METAL_ROUGHNESS else np.minimum(own, np.float32(MAX_METAL_ROUGHNESS))
+    for pair in ((own, smooth), *zip(tried, tried, strict=True)):  # both kinds at one roughness: they share the reflections
+        for metallic, roughness in enumerate(pair):
+            found[metallic].offer(*candidate_model(photos, solver, roughness, metallic), roughness)
     return found

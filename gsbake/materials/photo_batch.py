@@ -150,22 +150,27 @@ class PhotoBatch:
 
     def _shader(self, normal: Floats, tables: KernelTables, local: Floats, transport: Floats) -> Shader:
         """The function that shades the pixels with the `normal` (n, 3), their light transport `local` (n, 8), and that of the texels."""
+        emission = local[:, EMISSION]
+        light: list[tuple[Floats, Floats]] = []
         last: list[tuple[NDArray[np.float32], tuple[Floats, ...]]] = []
 
         def parts(roughness: NDArray[np.float32]) -> tuple[Floats, ...]:
+            if not light:
+                light.append((np.empty_like(normal), np.empty_like(normal)))
+                fit_kernel.incident_light(normal, self.view, self.reflected, local, transport, *tables.arrays, *light[0])
             if not last or last[0][0] is not roughness:
-                out = tuple(np.empty_like(normal) for _ in range(5))
+                out = tuple(np.empty_like(normal) for _ in range(4))
                 fit_kernel.linear_shading(
-                    self.dominant_texel, normal, self.view, self.reflected, local, transport, np.ascontiguousarray(roughness, np.float32),
+                    self.dominant_texel, normal, self.view, self.reflected, local, *light[0], np.ascontiguousarray(roughness, np.float32),
                     *tables.arrays, *out,
                 )  # fmt: skip
                 last[:] = [(roughness, out)]
             return last[0][1]
 
         def shaded(base: float, roughness: NDArray[np.float32], metallic: float) -> Floats:
-            diffuse, specular, scaled, edge, constant = parts(roughness)
-            b, m = np.float32(base), np.float32(metallic)
-            return (1 - m) * (b * diffuse + specular) + m * (b * scaled + edge) + constant
+            diffuse, specular, scaled, edge = parts(roughness)
+            slope, offset = (scaled, edge) if metallic else (diffuse, specular)
+            return (np.float32(base) * slope if base else 0) + offset + emission
 
         return shaded
 

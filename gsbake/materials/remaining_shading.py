@@ -22,7 +22,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit, prange
@@ -44,10 +44,37 @@ RIDGE, ROUNDS, DAMPING = 1e-3, 25, 0.7
 #: Factor on all scales and on the noise floor where they start wide, the share of the rounds in which it falls to 1, and by how much the
 #: agreement must then be larger.
 WIDENING, WIDENED_SHARE, MIN_AGREEMENT_GAIN = 20.0, 0.6, 0.01
-#: Partial sums of the pairs: a fixed number, so that results do not depend on threads.
-CHUNKS = 16
+#: Partial sums of the pairs: a fixed number, so that results do not depend on threads; and pairs that are summed at a time.
+CHUNKS, BLOCK = 16, 128
 #: Points at which the irradiance of a changed light is matched, Gauss-Newton steps, their ridge weight and largest exponent.
 MATCHED_POINTS, MATCHING_STEPS, MATCHING_RIDGE, MAX_EXPONENT = 4000, 4, 1e-3, 1.0
+
+_0, _1, _THIRD = np.float32(0), np.float32(1), np.float32(1 / 3)
+#: Where pairs differ so much that they count e⁻³⁰; smaller float32 numbers are denormal and slow.
+_MAX_CHROMATICITY = np.float32(30)
+
+
+class _Pairs(NamedTuple):
+    """m pairs of the `points` (n, 11), eight harmonics and three log base colours each: their indices `first` and `second` (m,), the
+    `share` (m,) that each weighs, and the `scale` (m,) of its brightness difference."""
+
+    first: NDArray[np.int32]
+    second: NDArray[np.int32]
+    points: NDArray[np.float32]
+    share: NDArray[np.float32]
+    scale: NDArray[np.float32]
+
+    @classmethod
+    def of(cls, points: NDArray[np.float32], position: Doubles, generator: np.random.Generator) -> _Pairs:
+        """Pairs of points at `position` (n, 3); nearby ones weigh as much together as those anywhere."""
+        count = len(position)
+        far = np.repeat(np.arange(count), PARTNERS), generator.integers(0, count, count * PARTNERS)
+        near = nearby_pairs(position, NEIGHBOURS, NEIGHBOUR_RADIUS)
+        sizes = (len(far[0]), len(near[0]))
+        share = np.repeat([1 / max(1, n) for n in sizes], sizes)
+        scale = np.repeat([BRIGHTNESS_SCALE, NEARBY_BRIGHTNESS_SCALE], sizes)
+        first, second = (np.concatenate([f, n]).astype(np.int32) for f, n in zip(far, near, strict=True))
+        return cls(first, second, points, share.astype(np.float32), scale.astype(np.float32))
 
 
 def remaining_shading(base_color: NDArray[Any], normal: NDArray[Any], position: NDArray[Any], generator: np.random.Generator) -> Doubles:
@@ -57,89 +84,106 @@ def remaining_shading(base_color: NDArray[Any], normal: NDArray[Any], position: 
         return np.zeros((8, 3))
     chosen = generator.choice(len(base_color), min(POINTS, len(base_color)), replace=False)
     logs = np.log(np.maximum(np.asarray(base_color[chosen], np.float64), 0) + LOG_OFFSET)
-    basis = harmonics(normal[chosen])
-    pairs = *_pairs(np.asarray(position[chosen], np.float64), generator), basis, logs
+    points = np.column_stack([harmonics(normal[chosen]), logs]).astype(np.float32)
+    pairs = _Pairs.of(points, np.asarray(position[chosen], np.float64), generator)
     (plain, agreement), (widened, widened_agreement) = (_solve(pairs, widening) for widening in (1.0, WIDENING))
     return widened if widened_agreement > (1 + MIN_AGREEMENT_GAIN) * agreement else plain
 
 
-def _solve(pairs: tuple[NDArray[Any], ...], widening: float) -> tuple[Doubles, float]:
+def _solve(pairs: _Pairs, widening: float) -> tuple[Doubles, float]:
     """The coefficients (8, 3) found from none, with all scales multiplied by a factor that falls from `widening` to 1, and the agreement of
     the pairs with them."""
-    first, second, share, scale, basis, logs = pairs
     found = np.zeros((8, 3))
     matrices, rights, weights = (np.zeros((CHUNKS, 3, *shape)) for shape in ((8, 8), (8,), ()))
     agreement = np.zeros(CHUNKS)
     sums = matrices, rights, weights, agreement
     for turn in range(ROUNDS):
         wider = max(1.0, widening ** (1 - turn / (WIDENED_SHARE * ROUNDS)))
-        normal_equations(first, second, basis, logs, share, scale, found, wider, *sums)
+        normal_equations(*pairs, found.astype(np.float32), wider, *sums)
         for channel in range(3):
             ridge = RIDGE * max(float(weights[:, channel].sum()), 1e-12)
             step = rights[:, channel].sum(0) - ridge * found[:, channel]
             found[:, channel] += DAMPING * np.linalg.solve(matrices[:, channel].sum(0) + ridge * np.eye(8), step)
-    normal_equations(first, second, basis, logs, share, scale, found, 1.0, *sums)
+    normal_equations(*pairs, found.astype(np.float32), 1.0, *sums)
     return found, float(agreement.sum())
 
 
-@njit(parallel=True, cache=True, error_model="numpy")
+@njit(parallel=True, cache=True)
 def normal_equations(
-    first: Any, second: Any, basis: Any, logs: Any, share: Any, scale: Any, found: Any, wider: Any, matrices: Any, rights: Any,
-    weights: Any, agreement: Any,
+    first: Any, second: Any, points: Any, share: Any, scale: Any, found: Any, wider: Any, matrices: Any, rights: Any, weights: Any,
+    agreement: Any,
 ) -> None:  # fmt: skip
     """Matrix, right side and sum of weights of one round's least squares for each channel, in a fixed number of partial sums.
 
-    The pairs (`first`, `second`) (m,) of points with harmonics `basis` (n, 8) and log base colours `logs` (n, 3) count as `share` (m,),
-    less where brightness differs by `scale` (m,) after the shading of the coefficients `found` (8, 3); all scales are multiplied by
-    `wider`. `matrices` (CHUNKS, 3, 8, 8), `rights` (CHUNKS, 3, 8), `weights` (CHUNKS, 3) and `agreement` (CHUNKS,), the sum of what pairs
-    count, are overwritten.
+    The pairs (`first`, `second`) (m,) of `points` (n, 11), eight harmonics and three log base colours each, count as `share` (m,), less
+    where brightness differs by `scale` (m,) after the shading of the coefficients `found` (8, 3); all scales are multiplied by `wider`.
+    `matrices` (CHUNKS, 3, 8, 8), `rights` (CHUNKS, 3, 8), `weights` (CHUNKS, 3) and `agreement` (CHUNKS,), the sum of what pairs count, are
+    overwritten.
     """
-    chunks = matrices.shape[0]
-    size = -(-len(first) // chunks)
-    for chunk in prange(chunks):
-        matrix, right, total = np.zeros((3, 8, 8)), np.zeros((3, 8)), np.zeros(3)
-        slope, rest = np.empty(8), np.empty(3)
-        counted = 0.0
-        for pair in range(chunk * size, min(len(first), (chunk + 1) * size)):
-            i, j = first[pair], second[pair]
-            for k in range(8):
-                slope[k] = basis[i, k] - basis[j, k]
-            for c in range(3):
-                rest[c] = logs[i, c] - logs[j, c]
-                for k in range(8):
-                    rest[c] -= slope[k] * found[k, c]
-            brightness = (rest[0] + rest[1] + rest[2]) / 3
-            chromaticity = (rest[0] - brightness) ** 2 + (rest[1] - brightness) ** 2 + (rest[2] - brightness) ** 2
-            similar = share[pair] * math.exp(-chromaticity / (wider * CHROMATICITY_SCALE) ** 2)
-            similar /= 1 + (brightness / (wider * scale[pair])) ** 2
-            counted += similar
-            for c in range(3):
-                weight = similar / max(abs(rest[c]), wider * NOISE_FLOOR)
-                total[c] += weight
-                for k in range(8):
-                    weighted = weight * slope[k]
-                    right[c, k] += weighted * rest[c]
-                    for m in range(k + 1):
-                        matrix[c, k, m] += weighted * slope[m]
+    size = -(-len(first) // CHUNKS)
+    for chunk in prange(CHUNKS):
+        start, end = chunk * size, min(len(first), (chunk + 1) * size)
+        sums = matrices[chunk], rights[chunk], weights[chunk]
+        agreement[chunk] = _sum_pairs(start, end, first, second, points, share, scale, found, wider, *sums)
+
+
+@njit(cache=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz"})
+def _sum_pairs(
+    start: Any, end: Any, first: Any, second: Any, points: Any, share: Any, scale: Any, found: Any, wider: Any, matrix: Any, right: Any,
+    total: Any,
+) -> Any:  # fmt: skip
+    """The same for the pairs from `start` to `end`; what they count together.
+
+    Pairs are float32, `BLOCK` at a time, so that loops over them are vector instructions; sums of blocks are float64. A function of its
+    own, as Numba analyses parallel loops longer.
+    """
+    floor, per_scale = np.float32(wider * NOISE_FLOOR), np.float32(1 / wider)
+    per_chromaticity = np.float32(1 / (wider * CHROMATICITY_SCALE) ** 2)
+    slope, similar = np.zeros((11, BLOCK), np.float32), np.zeros(BLOCK, np.float32)
+    weight, weighted = np.zeros(BLOCK, np.float32), np.zeros(BLOCK, np.float32)
+    rest = slope[8:]
+    counted = 0.0
+    matrix[:], right[:], total[:] = 0, 0, 0
+    for block in range(start, end, BLOCK):
+        n = min(BLOCK, end - block)
+        similar[:] = 0
+        for p in range(n):
+            i, j = np.uint64(first[block + p]), np.uint64(second[block + p])
+            for k in range(11):
+                slope[k, p] = points[i, k] - points[j, k]
         for c in range(3):
             for k in range(8):
-                for m in range(k):
-                    matrix[c, m, k] = matrix[c, k, m]
-        matrices[chunk], rights[chunk], weights[chunk], agreement[chunk] = matrix, right, total, counted
-
-
-def _pairs(position: Doubles, generator: np.random.Generator) -> tuple[NDArray[np.int64], NDArray[np.int64], Doubles, Doubles]:
-    """Indices (m,), (m,) of pairs of points at `position` (n, 3), the weight (m,) of each, and the scale (m,) of its brightness difference.
-
-    Nearby pairs weigh as much together as those anywhere.
-    """
-    count = len(position)
-    far = np.repeat(np.arange(count), PARTNERS), generator.integers(0, count, count * PARTNERS)
-    near = nearby_pairs(position, NEIGHBOURS, NEIGHBOUR_RADIUS)
-    sizes = (len(far[0]), len(near[0]))
-    share = np.repeat([1 / max(1, n) for n in sizes], sizes)
-    scale = np.repeat([BRIGHTNESS_SCALE, NEARBY_BRIGHTNESS_SCALE], sizes)
-    return np.concatenate([far[0], near[0]]), np.concatenate([far[1], near[1]]), share, scale
+                for p in range(BLOCK):
+                    rest[c, p] -= slope[k, p] * found[k, c]
+        for p in range(n):
+            brightness = (rest[0, p] + rest[1, p] + rest[2, p]) * _THIRD
+            red, green, blue = rest[0, p] - brightness, rest[1, p] - brightness, rest[2, p] - brightness
+            chromaticity = min((red * red + green * green + blue * blue) * per_chromaticity, _MAX_CHROMATICITY)
+            brightness *= per_scale / scale[block + p]
+            similar[p] = share[block + p] * math.exp(-chromaticity) / (_1 + brightness * brightness)
+            counted += similar[p]
+        for c in range(3):
+            weights = _0
+            for p in range(BLOCK):
+                weight[p] = similar[p] / max(abs(rest[c, p]), floor)
+                weights += weight[p]
+            total[c] += weights
+            for k in range(8):
+                product = _0
+                for p in range(BLOCK):
+                    weighted[p] = weight[p] * slope[k, p]
+                    product += weighted[p] * rest[c, p]
+                right[c, k] += product
+                for m in range(k + 1):
+                    product = _0
+                    for p in range(BLOCK):
+                        product += weighted[p] * slope[m, p]
+                    matrix[c, k, m] += product
+    for c in range(3):
+        for k in range(8):
+            for m in range(k):
+                matrix[c, m, k] = matrix[c, k, m]
+    return counted
 
 
 def with_irradiance_factor(

@@ -93,9 +93,10 @@ def test_normal_equations_equal_sums_of_arrays(wider: float) -> None:
     first, second = rng.integers(points, size=(2, pairs))
     basis, logs = rng.normal(size=(points, 8)), rng.normal(scale=0.1, size=(points, 3))
     share, scale, found = rng.uniform(size=pairs), rng.uniform(0.1, 0.2, pairs), rng.normal(scale=0.01, size=(8, 3))
+    arrays = np.column_stack([basis, logs]), share, scale, found
     matrices, rights, weights = (np.ones((CHUNKS, 3, *shape)) for shape in ((8, 8), (8,), ()))
     agreement = np.ones(CHUNKS)
-    normal_equations(first, second, basis, logs, share, scale, found, wider, matrices, rights, weights, agreement)
+    normal_equations(first, second, *(a.astype(np.float32) for a in arrays), wider, matrices, rights, weights, agreement)
 
     slope = basis[first] - basis[second]
     rest = logs[first] - logs[second] - slope @ found
@@ -105,6 +106,7 @@ def test_normal_equations_equal_sums_of_arrays(wider: float) -> None:
     assert np.isclose(agreement.sum(), similar.sum())
     for channel in range(3):
         weight = similar / np.maximum(np.abs(rest[:, channel]), wider * NOISE_FLOOR)
-        assert np.allclose(matrices[:, channel].sum(0), (slope * weight[:, None]).T @ slope)
-        assert np.allclose(rights[:, channel].sum(0), slope.T @ (weight * rest[:, channel]))
+        matrix, right = (slope * weight[:, None]).T @ slope, slope.T @ (weight * rest[:, channel])
+        assert np.allclose(matrices[:, channel].sum(0), matrix, atol=1e-6 * np.abs(matrix).max())  # float32 pairs
+        assert np.allclose(rights[:, channel].sum(0), right, atol=1e-6 * np.abs(right).max())
         assert np.isclose(weights[:, channel].sum(), weight.sum())
