@@ -20,8 +20,10 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 from gsbake.capture.photos.roles import held_out
+from gsbake.materials.concurrent_fits import Each, run_concurrently
 from gsbake.materials.fit import MaterialFit
 from gsbake.materials.fit_surface import Fitted, validation_error
 from gsbake.materials.levels import FitLevel
@@ -51,8 +53,6 @@ Start = tuple[float, float]
 Trials = dict[Start, tuple[MaterialFit, Fitted]]
 #: Builds a fit on the coarse level from a start.
 MakeFit = Callable[[float, float], MaterialFit]
-#: Called after every step with the number of steps done and their total.
-Each = Callable[[int, int], None]
 
 
 @dataclass(frozen=True)
@@ -104,15 +104,20 @@ def compared_starts(make: MakeFit, level: FitLevel, plan: FitSchedule, each: Eac
 def trial_fits(make: MakeFit, level: FitLevel, starts: Sequence[Start], plan: FitSchedule, each: Each) -> Trials:
     """Fits from `starts` on the coarse `level`. Those that start dielectric, under a light that stands, start without the shading in the
     projected colours."""
-    found: Trials = {}
+    fits: dict[Start, MaterialFit] = {}
     stands, shading = all(photo.to_light is None for photo in level.fitted), None
     for metallic, roughness in starts:
-        fit = make(metallic, roughness)
+        fit = fits[metallic, roughness] = make(metallic, roughness)
         if stands and fit.mostly_dielectric:
             shading = fit.find_remaining_shading(plan.seed) if shading is None else shading  # the same from every start
             fit.move_to_light(shading, plan.seed)
-        found[metallic, roughness] = fit, fit.run(level.fitted, level.held_out, plan, each)
-    return found
+    return _run(fits, level, plan, each)
+
+
+def _run(fits: dict[Start, MaterialFit], level: FitLevel, plan: FitSchedule, each: Each) -> Trials:
+    """The `fits` with their results on `level`, several at a time."""
+    results = run_concurrently([partial(fit.run, level.fitted, level.held_out, plan) for fit in fits.values()], each)
+    return dict(zip(fits, zip(fits.values(), results, strict=True), strict=True))
 
 
 def best_fit(trials: Trials, level: FitLevel, plan: FitSchedule, each: Each, reason: str = "") -> ChosenFit:
@@ -120,7 +125,7 @@ def best_fit(trials: Trials, level: FitLevel, plan: FitSchedule, each: Each, rea
     evidence for a single one."""
     errors = {start: validation_error(fitted) for start, (_, fitted) in trials.items()}
     evidence = _percent(errors) if len(errors) > 1 else reason
-    found = {start: (trials[start][0], trials[start][0].run(level.fitted, level.held_out, plan, each)) for start in candidates(errors)}
+    found = _run({start: trials[start][0] for start in candidates(errors)}, level, plan, each)
     continued = {start: validation_error(fitted) for start, (_, fitted) in found.items()}
     weighed = {start: error * _prior_factor(found[start][0]) for start, error in continued.items()}
     kinds = [[start for start in weighed if (start[0] < 0.5) == dielectric] for dielectric in (True, False)]

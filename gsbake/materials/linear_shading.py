@@ -114,7 +114,7 @@ class BaseColourSolver:
         return base
 
 
-@njit(parallel=True, cache=True, error_model="numpy")
+@njit(parallel=True, nogil=True, cache=True, error_model="numpy")
 def solve_base_colours(
     texel: Any, slope: Any, offset: Any, colour: Any, weight: Any, curve: Any, lowest: Any, rounds: Any, robust: Any, base: Any
 ) -> None:

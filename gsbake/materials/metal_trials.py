@@ -14,7 +14,6 @@ Then groups are tried one at a time, also those that are a little less likely as
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -22,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.cluster.vq import kmeans2
 
+from gsbake.materials.concurrent_fits import Each
 from gsbake.materials.fit import MaterialFit
 from gsbake.materials.fit_surface import Fitted, validation_error
 from gsbake.materials.levels import FitLevel
@@ -43,8 +43,6 @@ MAX_EVIDENCE = 2.0
 #: much of their own error if that is as large as elsewhere; a single one becomes dielectric when the error does not rise: most things are.
 MIN_DECREASE, MIN_OWN_DECREASE = 0.005, 0.5
 
-#: Called after every step with the number of steps done and their total.
-Each = Callable[[int, int], None]
 #: A trial: the mean log-likelihood ratio per pixel of a group for its present kind, whether it is to be metal, and its texels (m,).
 Trial = tuple[float, bool, NDArray[np.int64]]
 

@@ -45,11 +45,11 @@ RIDGE, ROUNDS, DAMPING = 1e-3, 25, 0.7
 #: agreement must then be larger.
 WIDENING, WIDENED_SHARE, MIN_AGREEMENT_GAIN = 20.0, 0.6, 0.01
 #: Partial sums of the pairs: a fixed number, so that results do not depend on threads; and pairs that are summed at a time.
-CHUNKS, BLOCK = 16, 128
+CHUNKS, BLOCK = 16, 64
 #: Points at which the irradiance of a changed light is matched, Gauss-Newton steps, their ridge weight and largest exponent.
 MATCHED_POINTS, MATCHING_STEPS, MATCHING_RIDGE, MAX_EXPONENT = 4000, 4, 1e-3, 1.0
 
-_0, _1, _THIRD = np.float32(0), np.float32(1), np.float32(1 / 3)
+_1, _THIRD = np.float32(1), np.float32(1 / 3)
 #: Where pairs differ so much that they count e⁻³⁰; smaller float32 numbers are denormal and slow.
 _MAX_CHROMATICITY = np.float32(30)
 
@@ -108,7 +108,7 @@ def _solve(pairs: _Pairs, widening: float) -> tuple[Doubles, float]:
     return found, float(agreement.sum())
 
 
-@njit(parallel=True, cache=True)
+@njit(parallel=True, nogil=True, cache=True)
 def normal_equations(
     first: Any, second: Any, points: Any, share: Any, scale: Any, found: Any, wider: Any, matrices: Any, rights: Any, weights: Any,
     agreement: Any,
@@ -127,26 +127,27 @@ def normal_equations(
         agreement[chunk] = _sum_pairs(start, end, first, second, points, share, scale, found, wider, *sums)
 
 
-@njit(cache=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz"})
+@njit(cache=True, nogil=True, error_model="numpy")
 def _sum_pairs(
     start: Any, end: Any, first: Any, second: Any, points: Any, share: Any, scale: Any, found: Any, wider: Any, matrix: Any, right: Any,
     total: Any,
 ) -> Any:  # fmt: skip
     """The same for the pairs from `start` to `end`; what they count together.
 
-    Pairs are float32, `BLOCK` at a time, so that loops over them are vector instructions; sums of blocks are float64. A function of its
-    own, as Numba analyses parallel loops longer.
+    Pairs are float32 and go through in blocks; sums have an element for each place in a block, so that loops over these are vector
+    instructions without a change of the order of sums. A function of its own, as Numba analyses parallel loops longer.
     """
     floor, per_scale = np.float32(wider * NOISE_FLOOR), np.float32(1 / wider)
     per_chromaticity = np.float32(1 / (wider * CHROMATICITY_SCALE) ** 2)
     slope, similar = np.zeros((11, BLOCK), np.float32), np.zeros(BLOCK, np.float32)
     weight, weighted = np.zeros(BLOCK, np.float32), np.zeros(BLOCK, np.float32)
     rest = slope[8:]
+    products, rights = np.zeros((3, 36, BLOCK), np.float32), np.zeros((3, 8, BLOCK), np.float32)
+    weights = np.zeros((3, BLOCK), np.float32)
     counted = 0.0
-    matrix[:], right[:], total[:] = 0, 0, 0
     for block in range(start, end, BLOCK):
         n = min(BLOCK, end - block)
-        similar[:] = 0
+        similar[n:] = 0
         for p in range(n):
             i, j = np.uint64(first[block + p]), np.uint64(second[block + p])
             for k in range(11):
@@ -163,26 +164,26 @@ def _sum_pairs(
             similar[p] = share[block + p] * math.exp(-chromaticity) / (_1 + brightness * brightness)
             counted += similar[p]
         for c in range(3):
-            weights = _0
             for p in range(BLOCK):
                 weight[p] = similar[p] / max(abs(rest[c, p]), floor)
-                weights += weight[p]
-            total[c] += weights
+                weights[c, p] += weight[p]
+            entry = 0
             for k in range(8):
-                product = _0
                 for p in range(BLOCK):
                     weighted[p] = weight[p] * slope[k, p]
-                    product += weighted[p] * rest[c, p]
-                right[c, k] += product
+                    rights[c, k, p] += weighted[p] * rest[c, p]
                 for m in range(k + 1):
-                    product = _0
                     for p in range(BLOCK):
-                        product += weighted[p] * slope[m, p]
-                    matrix[c, k, m] += product
+                        products[c, entry, p] += weighted[p] * slope[m, p]
+                    entry += 1
     for c in range(3):
+        total[c] = weights[c].sum()
+        entry = 0
         for k in range(8):
-            for m in range(k):
-                matrix[c, m, k] = matrix[c, k, m]
+            right[c, k] = rights[c, k].sum()
+            for m in range(k + 1):
+                matrix[c, k, m] = matrix[c, m, k] = products[c, entry].sum()
+                entry += 1
     return counted
 
 

@@ -10,6 +10,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 
+from gsbake.materials.concurrent_fits import Each, run_concurrently
 from gsbake.materials.fit import MaterialFit
 from gsbake.materials.fit_surface import validation_error
 from gsbake.materials.initialisation import DEFAULT_START, ChosenFit, best_fit, compared_starts, trial_fits, trial_schedule
@@ -59,15 +60,16 @@ def compare_light_motions(levels: Mapping[Motion, FitLevel], plan: FitPlan, prog
     """
     steps, (metallic, roughness) = plan.steps(TRIAL_SHARE), DEFAULT_START
     schedule = replace(trial_schedule(steps, plan.seed, plan.diffuse), metal_searches_at=())
-    found: dict[Motion, float] = {}
-    for motion, level in levels.items():
+
+    def run(level: FitLevel, each: Each) -> float:
         fit = MaterialFit(level.surface, plan.light_size, plan.priors, roughness, metallic)
-        each: Callable[[int, int], None] = partial(progress, "trial fits of moving lights")
-        found[motion] = validation_error(fit.run(level.fitted, level.held_out, schedule, each))
-    return found
+        return validation_error(fit.run(level.fitted, level.held_out, schedule, each))
+
+    errors = run_concurrently([partial(run, level) for level in levels.values()], partial(progress, "trial fits of moving lights"))
+    return dict(zip(levels, errors, strict=True))
 
 
-def _with_better_metals(choice: ChosenFit, level: FitLevel, plan: FitPlan, each: Callable[[int, int], None]) -> ChosenFit:
+def _with_better_metals(choice: ChosenFit, level: FitLevel, plan: FitPlan, each: Each) -> ChosenFit:
     """The choice after metals' base colours had their noise removed, to which the light adapted, with those groups of texels turned into
     the other kind that validation photos prefer as such; where there are any, the light's intensity is searched for again."""
     quiet = FitSchedule(plan.steps(ADAPT_SHARE), plan.seed, (), emission=False, light_searches_at=(), sparsity=False, normals=False)
@@ -87,7 +89,7 @@ def fit_two_levels(coarse: FitLevel, fine: FitLevel, texture: CoarseTexture, pla
     """The fit on the `fine` level, whose texels `texture` reduces to those of `coarse`."""
     steps = plan.steps
 
-    def each(name: str) -> Callable[[int, int], None]:
+    def each(name: str) -> Each:
         return lambda done, total: progress(name, done, total)
 
     def make(metallic: float, roughness: float) -> MaterialFit:

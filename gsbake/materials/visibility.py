@@ -67,7 +67,7 @@ def _cells(count: int, size: int) -> scipy.sparse.csr_matrix:
     return scipy.sparse.csr_matrix((weight.astype(np.float32), (rows, np.tile(column, ROTATIONS))), shape=(ROTATIONS * count, len(centre)))
 
 
-@njit(parallel=True, cache=True, error_model="numpy")
+@njit(parallel=True, nogil=True, cache=True, error_model="numpy")
 def unoccluded_irradiance(normal: Any, rotation: Any, copies: Any, cells: Any, out: Any) -> None:
     """`out` (n,): irradiance / π of surfaces with unit `normal` (n, 3) under `cells` (ROTATIONS, count), each summed over the directions
     `copies` (ROTATIONS, count, 3) of its own `rotation` (n,)."""
