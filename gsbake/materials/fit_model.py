@@ -75,7 +75,6 @@ class FitModel:
         self._transport[:, :2] = surface.occlusion[:, None]
         self._transport[:, NORMAL] = self._unit_normals
         self._step_buffers = FitStep(n)
-        self._known_batches: dict[int, tuple[list[Pixels], list[PhotoBatch]]] = {}
 
     @property
     def _values(self) -> Floats:
@@ -225,11 +224,7 @@ class FitModel:
         return self._options.detected_metallic if metal else self._options.detected_dielectric
 
     def _batches(self, photos: list[Pixels]) -> list[PhotoBatch]:
-        """The photos as the kernels read them; kept, as fits, trials and searches use the same ones."""
-        known = self._known_batches.get(id(photos))
-        if known is None or known[0] is not photos:
-            known = self._known_batches[id(photos)] = photos, [PhotoBatch.of(p, self._normal) for p in photos if len(p)]
-        return known[1]
+        return self._surface.batches(photos)
 
     def _samples(self, batches: list[PhotoBatch], tilted: bool = False) -> list[PhotoSamples]:
         """All pixels under the present light, with `tilted` normals as well."""

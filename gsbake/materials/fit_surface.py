@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 
 from gsbake.materials.bilateral import Neighbourhoods
 from gsbake.materials.light_intensity import LightAdjustment
+from gsbake.materials.photo_batch import PhotoBatch
+from gsbake.materials.pixels import Pixels
 from gsbake.shading.environment import EnvironmentLight
 from gsbake.texturing.texels import Texels
 
@@ -75,3 +77,15 @@ class FitSurface:
     def neighbourhoods(self) -> Neighbourhoods:
         """The neighbourhoods of texels that decide together; kept, as all trials on a level use the same wide one."""
         return Neighbourhoods(self.texels, self.pairs, self.base_color)
+
+    def batches(self, photos: list[Pixels]) -> list[PhotoBatch]:
+        """The `photos` that show something as the kernels read them; kept, as all fits to them and all searches use the same."""
+        if id(photos) not in self._batches:
+            normal = np.ascontiguousarray(self.normal, np.float32)
+            self._batches[id(photos)] = photos, [PhotoBatch.of(pixels, normal) for pixels in photos if len(pixels)]
+        return self._batches[id(photos)][1]
+
+    @cached_property
+    def _batches(self) -> dict[int, tuple[list[Pixels], list[PhotoBatch]]]:
+        """By the identity of the list of photos, which is kept as well, so that no other list gets its identity."""
+        return {}
