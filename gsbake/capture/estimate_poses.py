@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -17,6 +17,7 @@ import numpy as np
 from gsbake.capture.hull.visual_hull import visual_hull
 from gsbake.capture.masks.completion import complete_masks
 from gsbake.capture.masks.consensus import MIN_CERTAIN_OVERLAP, MIN_OVERLAP, MIN_USED_AGREEMENT, correct_mask, distorted, find_consensus
+from gsbake.capture.masks.hull_correction import apply_correction, correct_by_hull
 from gsbake.capture.masks.support_plane import plane_masks
 from gsbake.capture.photos.redundancy import find_redundant_photos
 from gsbake.capture.photos.undistortion import intrinsics_key, pinhole_camera, remap_tables, resample
@@ -38,6 +39,8 @@ CERTAIN_AGREEMENT = 0.95
 MIN_POINTS = 30
 #: Surface points at which the coverage of photos is measured.
 SURFACE_POINTS = 1000
+#: Share of a mask's area whose correction by the visual hull is worth a line.
+LARGE_CORRECTION = 0.01
 #: Longer side in pixels of the masks that visual hulls are carved from.
 HULL_MASK_SIZE = 512
 
@@ -149,8 +152,8 @@ class _Estimation:
         found = find_consensus(cameras, files)
         agreement = 0.0 if found is None else found.agreement
         evidence = f"the guesses of the network agree with the cameras to {agreement:.2f}"
+        photos = {c.name: self.ingest / by_name[c.name]["file"] for c in cameras}
         if agreement < CERTAIN_AGREEMENT and len(guessed) == len(cameras) and points is not None:
-            photos = {c.name: self.ingest / by_name[c.name]["file"] for c in cameras}
             sets = plane_masks(cameras, photos, files, points, self.scratch / "plane_masks", self.seed, self.threads)
             for masks, kind in zip(sets, ("", ", with the plane below it in question,"), strict=False):
                 if (other := find_consensus(cameras, masks)) is not None:
@@ -170,6 +173,8 @@ class _Estimation:
             full = cv2.resize(read_grey(files[camera.name]), (camera.width, camera.height), interpolation=cv2.INTER_CUBIC)
             mask = correct_mask(np.asarray(full, np.uint8), distorted(silhouette, camera), overlap)
             write_png(self.out / "photo_masks" / f"{camera.name}.png", np.where(mask > 127, 255, 0).astype(np.uint8))
+        made = {name: self.out / "photo_masks" / f"{name}.png" for name in overlaps}
+        self._correct_by_hull(cameras, photos, {**files, **made}, sorted(overlaps))
         doubtful = sorted((name for name in overlaps if overlaps[name] < MIN_CERTAIN_OVERLAP), key=lambda name: overlaps[name])
         corrected = sum(overlap < MIN_OVERLAP for overlap in overlaps.values())
         counts = f"{corrected} of {len(guessed)} were corrected, {len(doubtful)} are doubtful"
@@ -179,6 +184,24 @@ class _Estimation:
                 f"{len(doubtful)} of {len(guessed)} automatic masks are doubtful ({shortlist(doubtful)}); edit them (`gsbake masks`)."
             )
         return {"automatic_masks": len(guessed), "mask_agreement": agreement, "corrected_masks": corrected, "doubtful_masks": doubtful}
+
+    def _correct_by_hull(
+        self, cameras: Sequence[Camera], photos: Mapping[str, Path], masks: Mapping[str, Path], guessed: Sequence[str]
+    ) -> None:
+        """Correct the `masks` that were `guessed`, files by photo name, by the visual hull of all of them."""
+        changes: list[tuple[float, str]] = []
+        for name, (missing, possible) in correct_by_hull(cameras, masks).items():
+            if name in guessed:
+                mask = read_grey(masks[name])
+                photo: Any = cv2.imread(str(photos[name]), cv2.IMREAD_COLOR)
+                corrected = apply_correction(mask, np.ascontiguousarray(photo[..., ::-1], np.uint8), missing, possible)
+                area = max(int((mask > 127).sum()), 1)
+                changes.append((float(((corrected > 127) != (mask > 127)).sum()) / area, name))
+                write_png(masks[name], np.where(corrected > 127, 255, 0).astype(np.uint8))
+        large = sorted(name for share, name in changes if share >= LARGE_CORRECTION)
+        if large:
+            evidence = f"at least {100 * LARGE_CORRECTION:g} % of the object was missing or too much, {100 * max(changes)[0]:.1f} % at most"
+            self.monitor.decide("masks corrected by the visual hull", f"{len(large)} of {len(guessed)}: {shortlist(large)}", evidence)
 
     def _undistort(self, cameras: Sequence[Camera]) -> list[Camera]:
         """Write photos and masks undistorted, and return their pinhole cameras; photos without distortion are copied."""

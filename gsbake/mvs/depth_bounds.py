@@ -8,6 +8,7 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from gsbake.capture.hull.rays import trilinear
 from gsbake.capture.hull.visual_hull import Hull
 from gsbake.geometry.cameras import Array, Camera
 from gsbake.mvs.ncc import FASTMATH
@@ -21,30 +22,13 @@ MARGIN = 1.0
 
 
 @nb.njit(fastmath=FASTMATH, error_model="numpy", nogil=True, cache=True)
-def _field(field: Any, x: Any, y: Any, z: Any) -> Any:
-    """Trilinear value at lattice coordinates; 1000 beyond the grid."""
-    n0, n1, n2 = field.shape
-    if not (x >= 0 and y >= 0 and z >= 0 and x < n0 - 1 and y < n1 - 1 and z < n2 - 1):
-        return np.float32(1e3)
-    i, j, k = int(x), int(y), int(z)
-    a, b, c = np.float32(x - i), np.float32(y - j), np.float32(z - k)
-    one = np.float32(1)
-    p = (field[i, j, k] * (one - c) + field[i, j, k + 1] * c) * (one - b) + (
-        field[i, j + 1, k] * (one - c) + field[i, j + 1, k + 1] * c
-    ) * b
-    q = (field[i + 1, j, k] * (one - c) + field[i + 1, j, k + 1] * c) * (one - b)
-    q += (field[i + 1, j + 1, k] * (one - c) + field[i + 1, j + 1, k + 1] * c) * b
-    return p * (one - a) + q * a
-
-
-@nb.njit(fastmath=FASTMATH, error_model="numpy", nogil=True, cache=True)
 def _crossing(field: Any, origin: Any, direction: Any, start: float, stop: float, margin: float) -> float:
     """First parameter from `start` towards `stop` where the field, in cells, falls below `margin`; −1 when it never does."""
     t = start
     sign = 1.0 if stop > start else -1.0
     speed = np.sqrt(direction[0] ** 2 + direction[1] ** 2 + direction[2] ** 2)
     while (stop - t) * sign > 0:
-        value = _field(field, origin[0] + t * direction[0], origin[1] + t * direction[1], origin[2] + t * direction[2])
+        value = trilinear(field, origin[0] + t * direction[0], origin[1] + t * direction[1], origin[2] + t * direction[2])
         if value < margin:
             return t
         # The field is a lower bound of the distance; beyond the grid it is unknown, so steps are limited there too.

@@ -42,6 +42,23 @@ def half_steps_inside(solid: Any, i: float, j: float, k: float, dx: float, dy: f
     return count
 
 
+@nb.njit(error_model="numpy", nogil=True, cache=True)
+def trilinear(field: Any, x: Any, y: Any, z: Any) -> Any:
+    """Value of a `field` (n0, n1, n2) at lattice coordinates; 1000 beyond the grid."""
+    n0, n1, n2 = field.shape
+    if not (x >= 0 and y >= 0 and z >= 0 and x < n0 - 1 and y < n1 - 1 and z < n2 - 1):
+        return np.float32(1e3)
+    i, j, k = int(x), int(y), int(z)
+    a, b, c = np.float32(x - i), np.float32(y - j), np.float32(z - k)
+    one = np.float32(1)
+    p = (field[i, j, k] * (one - c) + field[i, j, k + 1] * c) * (one - b) + (
+        field[i, j + 1, k] * (one - c) + field[i, j + 1, k + 1] * c
+    ) * b
+    q = (field[i + 1, j, k] * (one - c) + field[i + 1, j, k + 1] * c) * (one - b)
+    q += (field[i + 1, j + 1, k] * (one - c) + field[i + 1, j + 1, k + 1] * c) * b
+    return p * (one - a) + q * a
+
+
 def camera_arrays(cameras: Sequence[Camera]) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Sizes (v, 2) as width, height, intrinsics (v, 4) as fx, fy, cx, cy, poses (v, 3, 4), world → camera, and centres (v, 3)."""
     sizes = np.array([(c.width, c.height) for c in cameras], np.int64).reshape(-1, 2)

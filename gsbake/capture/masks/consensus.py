@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +24,7 @@ from numpy.typing import NDArray
 from gsbake.capture.hull.visual_hull import Hull
 from gsbake.capture.masks.completion import render_silhouette
 from gsbake.capture.photos.decode import Bytes
-from gsbake.capture.photos.undistortion import pinhole_camera, remap_tables, resample, undistort_points
+from gsbake.capture.photos.undistortion import intrinsics_key, pinhole_camera, remap_tables, resample, undistort_points
 from gsbake.capture.poses.normalisation import bounding_sphere_from_masks
 from gsbake.errors import BadInputError
 from gsbake.geometry.cameras import Camera
@@ -120,30 +121,37 @@ def correct_mask(guess: Bytes, silhouette: NDArray[np.bool_], overlap: float) ->
     return np.where(inner > 127, 255, np.where(outer > 127, guess, 0)).astype(np.uint8)
 
 
-def distorted(silhouette: NDArray[np.bool_], camera: Camera) -> NDArray[np.bool_]:
-    """The `silhouette` (h, w) of a consensus as the photo of `camera` shows it, with the lens's distortion, at VOTE_SIZE."""
-    small = camera.downscaled_to(VOTE_SIZE)
+def distorted(silhouette: NDArray[np.bool_], camera: Camera, size: int = VOTE_SIZE) -> NDArray[np.bool_]:
+    """The `silhouette` (h, w) of the pinhole of a small view as the photo of `camera` shows it, with the lens's distortion, at `size`."""
+    small = camera.downscaled_to(size)
     if not any(camera.distortion):
         return silhouette
-    pinhole = pinhole_camera(small)
-    x = (np.arange(small.width) + 0.5 - small.cx) / small.fx
-    y = (np.arange(small.height) + 0.5 - small.cy) / small.fy
-    plane = undistort_points(np.stack(np.meshgrid(x, y), -1).reshape(-1, 2), camera.distortion).reshape(small.height, small.width, 2)
-    tables = plane * (pinhole.fx, pinhole.fy) + (pinhole.cx - 0.5, pinhole.cy - 0.5)
-    columns, rows = (np.ascontiguousarray(np.nan_to_num(tables[..., k], nan=-1.0), np.float32) for k in (0, 1))
-    shape = resample(255 * silhouette.astype(np.uint8), (columns, rows), mask=True)
+    shape = resample(255 * silhouette.astype(np.uint8), _distorted_positions(intrinsics_key(small)), mask=True)
     return np.asarray(shape > 127)
 
 
-def small_views(cameras: Sequence[Camera], masks: Mapping[str, Path]) -> tuple[list[Camera], list[Bytes]]:
-    """Pinhole cameras reduced to VOTE_SIZE and their undistorted masks (h, w). Raises BadInputError as `pinhole_camera` does."""
-    views = [_small_view(camera, masks[camera.name]) for camera in cameras]
+@lru_cache(maxsize=4)
+def _distorted_positions(intrinsics: tuple[float, ...]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Where the pinhole image shows each pixel of the photo (h, w) with these `intrinsics` (of `intrinsics_key`); −1 where it does not."""
+    width, height, fx, fy, cx, cy, *distortion = intrinsics
+    camera = Camera("", int(width), int(height), fx, fy, cx, cy, np.eye(3), np.zeros(3), tuple(distortion))
+    pinhole = pinhole_camera(camera)
+    x, y = (np.arange(camera.width) + 0.5 - cx) / fx, (np.arange(camera.height) + 0.5 - cy) / fy
+    plane = undistort_points(np.stack(np.meshgrid(x, y), -1).reshape(-1, 2), camera.distortion).reshape(camera.height, camera.width, 2)
+    positions = plane * (pinhole.fx, pinhole.fy) + (pinhole.cx - 0.5, pinhole.cy - 0.5)
+    columns, rows = (np.ascontiguousarray(np.nan_to_num(positions[..., k], nan=-1.0), np.float32) for k in (0, 1))
+    return columns, rows
+
+
+def small_views(cameras: Sequence[Camera], masks: Mapping[str, Path], size: int = VOTE_SIZE) -> tuple[list[Camera], list[Bytes]]:
+    """Pinhole cameras reduced to `size` and their undistorted masks (h, w). Raises BadInputError as `pinhole_camera` does."""
+    views = [_small_view(camera, masks[camera.name], size) for camera in cameras]
     return [camera for camera, _ in views], [mask for _, mask in views]
 
 
-def _small_view(camera: Camera, file: Path) -> tuple[Camera, Bytes]:
-    """The pinhole camera reduced to VOTE_SIZE and its undistorted mask (h, w). Raises BadInputError as `pinhole_camera` does."""
-    small = camera.downscaled_to(VOTE_SIZE)
+def _small_view(camera: Camera, file: Path, size: int) -> tuple[Camera, Bytes]:
+    """The pinhole camera reduced to `size` and its undistorted mask (h, w). Raises BadInputError as `pinhole_camera` does."""
+    small = camera.downscaled_to(size)
     mask: Any = cv2.resize(read_grey(file), (small.width, small.height), interpolation=cv2.INTER_AREA)
     pinhole = pinhole_camera(small)
     if any(camera.distortion):
