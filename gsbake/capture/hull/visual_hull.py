@@ -111,11 +111,12 @@ def silhouette_distance(mask: Bytes) -> Floats:
 
 def carve(
     cameras: Sequence[Camera], masks: Sequence[Bytes], centre: Array, radius: float, resolution: int,
-    max_inconsistent_share: float = MAX_INCONSISTENT_SHARE,
+    max_inconsistent_share: float = MAX_INCONSISTENT_SHARE, min_visible_share: float = MIN_VISIBLE_SHARE,
 ) -> Floats:  # fmt: skip
     """Signed distance (n, n, n) of the hull on the cube of half edge `radius` around `centre` (3,), negative inside; axes x, y, z.
 
-    `cameras` are pinholes of the masks' sizes; n = `resolution`. Where too few views see a cell, the value is one cell (outside).
+    `cameras` are pinholes of the masks' sizes; n = `resolution`. Where less than `min_visible_share` of the views (or fewer than 2) see a
+    cell, the value is one cell (outside).
     The occupancy is `carve(...) < 0`. `max_inconsistent_share` of a point's views may exclude it; above the default there is no bound on
     their number, which costs time in large captures.
     """
@@ -126,7 +127,7 @@ def carve(
     # A low-discrepancy order of the views: empty cells are excluded after a few.
     order = np.argsort(np.arange(len(fields)) * 0.6180339887498949 % 1.0)
     cell = 2.0 * radius / resolution
-    min_visible = max(2, int(np.ceil(MIN_VISIBLE_SHARE * len(fields))))
+    min_visible = max(2, int(np.ceil(min_visible_share * len(fields))))
     wide = max_inconsistent_share > MAX_INCONSISTENT_SHARE
     ranked = max(_MAX_RANKED, int(max_inconsistent_share * len(fields) + 0.5) + 1) if wide else _MAX_RANKED
     return _carve(
@@ -162,10 +163,10 @@ class Hull:
     @staticmethod
     def from_masks(
         cameras: Sequence[Camera], masks: Sequence[Bytes], centre: Array, radius: float, resolution: int,
-        max_inconsistent_share: float = MAX_INCONSISTENT_SHARE,
+        max_inconsistent_share: float = MAX_INCONSISTENT_SHARE, min_visible_share: float = MIN_VISIBLE_SHARE,
     ) -> Hull:  # fmt: skip
         """Carve the cube of half edge `radius` around `centre`; small components are removed."""
-        field = carve(cameras, masks, centre, radius, resolution, max_inconsistent_share)
+        field = carve(cameras, masks, centre, radius, resolution, max_inconsistent_share, min_visible_share)
         cell = 2.0 * radius / resolution
         inside = field < 0
         kept = _large_components(inside)

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsbake.capture.hull.ray_distance import ray_distance
-from gsbake.capture.hull.visual_hull import MAX_INCONSISTENT_SHARE, Hull
+from gsbake.capture.hull.visual_hull import Hull
 from gsbake.capture.masks.completion import disc
 from gsbake.capture.masks.consensus import MAX_OUTVOTED_SHARE, distorted, small_views
 from gsbake.capture.masks.saliency import INPUT_SIZE
@@ -55,8 +55,9 @@ def correct_by_hull(cameras: Sequence[Camera], masks: Mapping[str, Path]) -> dic
     sphere = bounding_sphere_from_masks(pinholes, views, MAX_OUTVOTED_SHARE)
     if sphere is None:
         return {}
-    shares = MAX_INCONSISTENT_SHARE, MAX_OUTVOTED_SHARE
-    small, large = (Hull.from_masks(pinholes, views, sphere.centre, 1.05 * sphere.radius, CELLS, share) for share in shares)
+    small = Hull.from_masks(pinholes, views, sphere.centre, 1.05 * sphere.radius, CELLS)
+    # What few photos have in their frames is no surplus.
+    large = Hull.from_masks(pinholes, views, sphere.centre, 1.05 * sphere.radius, CELLS, MAX_OUTVOTED_SHARE, min_visible_share=0.0)
     out = {}
     for camera, pinhole, mask in zip(cameras, pinholes, views, strict=True):
         depth = max(float(np.linalg.norm(pinhole.centre - sphere.centre)), 1e-9)
