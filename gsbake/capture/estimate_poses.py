@@ -190,11 +190,11 @@ class _Estimation:
     ) -> None:
         """Correct the `masks` that were `guessed`, files by photo name, by the visual hull of all of them."""
         changes: list[tuple[float, str]] = []
-        for name, (missing, possible) in correct_by_hull(cameras, masks).items():
+        for name, (certain, possible) in correct_by_hull(cameras, masks).items():
             if name in guessed:
                 mask = read_grey(masks[name])
                 photo: Any = cv2.imread(str(photos[name]), cv2.IMREAD_COLOR)
-                corrected = apply_correction(mask, np.ascontiguousarray(photo[..., ::-1], np.uint8), missing, possible)
+                corrected = apply_correction(mask, np.ascontiguousarray(photo[..., ::-1], np.uint8), certain, possible)
                 area = max(int((mask > 127).sum()), 1)
                 changes.append((float(((corrected > 127) != (mask > 127)).sum()) / area, name))
                 write_png(masks[name], np.where(corrected > 127, 255, 0).astype(np.uint8))

@@ -6,9 +6,8 @@ concept*, PAMI 1994) lets a few photos be wrong at each point. A pixel whose ray
 photos say so. A pixel whose ray passes at a distance even the hull that lets more photos be wrong does not: many photos exclude everything
 on its ray. Between these the guess stays, which is finer than a cell of the hull.
 
-Few photos may also be right against all others: they alone look through a hole or past the lowest part. What the lowest or the highest
-photo alone excludes is a shallow rim of the hull, missing pieces go deep into it; and through a hole a photo shows the background's
-colours.
+Few photos may also be right against all others: they alone look through a hole or past the lowest part. There they show the background's
+colours, so that regions with these stay empty.
 """
 
 from __future__ import annotations
@@ -34,16 +33,13 @@ from gsbake.geometry.cameras import Camera
 SIZE, CELLS = 512, 128
 #: A guess stays where the ray passes less than this many pixels of the network's input, or this many cells, inside or outside the surface.
 MIN_PIXELS, MIN_CELLS = 1.0, 0.5
-#: A piece is missing where some ray goes this deep, as a share of the root of the mask's area. Tangents 36° apart, such as those of every
-#: second of 20 photos on a ring around a ball, meet .029 of that above it.
-MIN_DEPTH = 0.03
 #: A piece is background where its colours are, in the geometric mean, this many times (natural logarithm) likelier around the object than
 #: on it; around is up to this share of the root of the mask's area from it; bins of the histograms along each axis of CIELAB.
 MAX_LOG_RATIO, SURROUNDINGS, BINS = 2.0, 0.15, 24
 
 
 def correct_by_hull(cameras: Sequence[Camera], masks: Mapping[str, Path]) -> dict[str, tuple[NDArray[np.bool_], NDArray[np.bool_]]]:
-    """By photo name the missing pieces, and where the photo may show the object (h, w): with the lens's distortion, at SIZE.
+    """By photo name where nearly all others see the object, and where the photo may show it (h, w): with the lens's distortion, at SIZE.
 
     `masks` are files by photo name, 255 = object, of any size with the photo's aspect ratio. Empty where the masks have no common object or
     the distortion cannot be inverted.
@@ -59,34 +55,22 @@ def correct_by_hull(cameras: Sequence[Camera], masks: Mapping[str, Path]) -> dic
     # What few photos have in their frames is no surplus.
     large = Hull.from_masks(pinholes, views, sphere.centre, 1.05 * sphere.radius, CELLS, MAX_OUTVOTED_SHARE, min_visible_share=0.0)
     out = {}
-    for camera, pinhole, mask in zip(cameras, pinholes, views, strict=True):
+    for camera, pinhole in zip(cameras, pinholes, strict=True):
         depth = max(float(np.linalg.norm(pinhole.centre - sphere.centre)), 1e-9)
-        margin = max(MIN_PIXELS * max(mask.shape) / INPUT_SIZE, MIN_CELLS * small.cell * pinhole.fx / depth)
-        deep = max(margin, MIN_DEPTH * float(np.sqrt(np.count_nonzero(mask > 127))))
-        missing = _missing(ray_distance(small, pinhole, deep), mask, margin, deep)
-        possible = ray_distance(large, pinhole, margin) < margin
-        out[camera.name] = distorted(missing, camera, SIZE), distorted(possible, camera, SIZE)
+        margin = max(MIN_PIXELS * max(pinhole.width, pinhole.height) / INPUT_SIZE, MIN_CELLS * small.cell * pinhole.fx / depth)
+        certain, possible = ray_distance(small, pinhole, margin) < -margin, ray_distance(large, pinhole, margin) < margin
+        out[camera.name] = distorted(certain, camera, SIZE), distorted(possible, camera, SIZE)
     return out
 
 
-def _missing(distance: NDArray[np.float32], mask: Bytes, margin: float, deep: float) -> NDArray[np.bool_]:
-    """Regions (h, w) outside the `mask` whose rays go `margin` pixels into the hull, and `deep` pixels somewhere."""
-    outside = mask <= 127
-    count, region = cv2.connectedComponents((outside & (distance < -margin)).astype(np.uint8))
-    chosen = np.zeros(count, bool)
-    chosen[region[outside & (distance < -deep)]] = True
-    chosen[0] = False
-    return np.asarray(chosen[region])
+def apply_correction(mask: Bytes, photo: Bytes, certain: NDArray[np.bool_], possible: NDArray[np.bool_]) -> Bytes:
+    """The `mask` (h, w) filled where it lacks what is `certain`, unless in the background's colours, without what is not `possible`.
 
-
-def apply_correction(mask: Bytes, photo: Bytes, missing: NDArray[np.bool_], possible: NDArray[np.bool_]) -> Bytes:
-    """The `mask` (h, w) with its `missing` pieces, but for those that have the background's colours, and without what is not `possible`.
-
-    `photo` (h, w, 3), of any size, is 8-bit sRGB; `missing` and `possible` (h', w') are those of `correct_by_hull`.
+    `photo` (h, w, 3), of any size, is 8-bit sRGB; `certain` and `possible` (h', w') are those of `correct_by_hull`.
     """
-    size = missing.shape[::-1]
+    size = certain.shape[::-1]
     inside = (cv2.resize(mask, size, interpolation=cv2.INTER_AREA) > 127) & possible
-    filled = missing & ~inside
+    filled = certain & ~inside
     if filled.any():
         small = np.asarray(cv2.resize(photo, size, interpolation=cv2.INTER_AREA), np.uint8)
         filled = _without_background(small, inside, filled)

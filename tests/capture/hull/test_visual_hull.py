@@ -166,3 +166,14 @@ def test_visual_hull_of_a_poses_folder(tmp_path: Path) -> None:
     points, _ = hull.surface_points(500, 0)
     assert np.median(np.linalg.norm(points, axis=1)) == pytest.approx(0.9, abs=0.02)
     assert hull.lower.tolist() == [-1, -1, -1]
+
+
+def test_what_few_frames_hold_is_outside_unless_asked_for() -> None:
+    """Close-ups show the middle of the ball, four photos all of it: its rim is in few frames."""
+    whole, close = ring(4), [replace(c, name=f"n{c.name}", fx=14 * c.fx, fy=14 * c.fy) for c in ring(24)]
+    cameras = [*whole, *close]
+    masks = [ball_mask(c) for c in cameras]
+    assert all((mask > 127).all() for mask in masks[4:])
+    rim = Hull.from_masks(cameras, masks, CENTRE, 1.0, 64, min_visible_share=0.0).occupancy.sum()
+    middle = Hull.from_masks(cameras, masks, CENTRE, 1.0, 64).occupancy.sum()
+    assert middle * (2 / 64) ** 3 < 0.25 * 4 / 3 * np.pi * RADIUS**3 < rim * (2 / 64) ** 3

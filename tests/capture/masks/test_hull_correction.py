@@ -80,9 +80,9 @@ def test_a_piece_with_the_colours_of_the_background_is_a_hole() -> None:
     cv2.circle(disc, (100, 100), 60, 255, -1)
     pierced = disc.copy()
     cv2.circle(pierced, (110, 90), 15, 0, -1)
-    missing, possible = (disc > 127) & (pierced < 128), np.ones((SIZE, SIZE), bool)
-    assert (apply_correction(pierced, photo_of(disc), missing, possible) == disc).mean() > 0.999
-    assert (apply_correction(pierced, photo_of(pierced), missing, possible) == pierced).all()
+    certain, possible = disc > 127, np.ones((SIZE, SIZE), bool)
+    assert (apply_correction(pierced, photo_of(disc), certain, possible) == disc).mean() > 0.999
+    assert (apply_correction(pierced, photo_of(pierced), certain, possible) == pierced).all()
 
 
 def test_the_correction_is_distorted_as_the_photo(tmp_path: Path) -> None:
