@@ -18,7 +18,7 @@ def run(ctx: Context) -> dict[str, Any]:
 
 STAGE = Stage(
     name="stereo",
-    version=10,
+    version=11,
     title="Multi-view stereo",
     run=run,
     summary="{points} points, {confirmed_share:%} of the object confirmed",
