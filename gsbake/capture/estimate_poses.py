@@ -8,11 +8,13 @@ import tempfile
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from gsbake.capture.hull.visual_hull import visual_hull
 from gsbake.capture.masks.completion import complete_masks
@@ -193,8 +195,7 @@ class _Estimation:
         for name, (certain, possible) in correct_by_hull(cameras, masks).items():
             if name in guessed:
                 mask = read_grey(masks[name])
-                photo: Any = cv2.imread(str(photos[name]), cv2.IMREAD_COLOR)
-                corrected = apply_correction(mask, np.ascontiguousarray(photo[..., ::-1], np.uint8), certain, possible)
+                corrected = apply_correction(mask, partial(_read_rgb, photos[name]), certain, possible)
                 area = max(int((mask > 127).sum()), 1)
                 changes.append((float(((corrected > 127) != (mask > 127)).sum()) / area, name))
                 write_png(masks[name], np.where(corrected > 127, 255, 0).astype(np.uint8))
@@ -308,3 +309,11 @@ class _Estimation:
             for sub in ("photos", "masks"):
                 (self.out / sub / f"{name}.png").unlink(missing_ok=True)
         return [c for c in cameras if c.name not in set(names)], names
+
+
+def _read_rgb(path: Path) -> NDArray[np.uint8]:
+    """The photo (h, w, 3) of a file. Raises FileNotFoundError where it cannot be read."""
+    image = cv2.imread(str(path), cv2.IMREAD_COLOR)
+    if image is None:
+        raise FileNotFoundError(path)
+    return np.ascontiguousarray(image[..., ::-1], np.uint8)

@@ -12,7 +12,7 @@ colours, so that regions with these stay empty.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import cv2
@@ -63,16 +63,16 @@ def correct_by_hull(cameras: Sequence[Camera], masks: Mapping[str, Path]) -> dic
     return out
 
 
-def apply_correction(mask: Bytes, photo: Bytes, certain: NDArray[np.bool_], possible: NDArray[np.bool_]) -> Bytes:
+def apply_correction(mask: Bytes, photo: Callable[[], Bytes], certain: NDArray[np.bool_], possible: NDArray[np.bool_]) -> Bytes:
     """The `mask` (h, w) filled where it lacks what is `certain`, unless in the background's colours, without what is not `possible`.
 
-    `photo` (h, w, 3), of any size, is 8-bit sRGB; `certain` and `possible` (h', w') are those of `correct_by_hull`.
+    `photo` reads the photo (h, w, 3), 8-bit sRGB of any size; only masks that lack something need it. `certain` and `possible` (h', w') are those of `correct_by_hull`.
     """
     size = certain.shape[::-1]
     inside = (cv2.resize(mask, size, interpolation=cv2.INTER_AREA) > 127) & possible
     filled = certain & ~inside
     if filled.any():
-        small = np.asarray(cv2.resize(photo, size, interpolation=cv2.INTER_AREA), np.uint8)
+        small = np.asarray(cv2.resize(photo(), size, interpolation=cv2.INTER_AREA), np.uint8)
         filled = _without_background(small, inside, filled)
     full = mask.shape[::-1]
     inner, outer = (cv2.resize(255 * part.astype(np.uint8), full, interpolation=cv2.INTER_LINEAR) for part in (filled, possible))

@@ -1,7 +1,8 @@
-"""Pieces that single masks lack or have too much are mended by the hull of all; what two photos show empty stays empty."""
+"""Pieces that single masks lack or have too much are mended by the hull of all; what has the background's colours stays empty."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -41,10 +42,11 @@ def torus_mask(camera: Camera) -> np.ndarray:
     return np.where(inside, 255, 0).astype(np.uint8)
 
 
-def photo_of(truth: np.ndarray) -> np.ndarray:
-    """A photo: a reddish object with noise before a grey background."""
+def photo_of(truth: np.ndarray) -> Callable[[], np.ndarray]:
+    """Reads a photo: a reddish object with noise before a grey background."""
     noise = np.random.default_rng(0).integers(0, 30, (*truth.shape, 3))
-    return (np.where(truth[..., None] > 127, [150, 70, 50], [120, 120, 120]) + noise).astype(np.uint8)
+    photo = (np.where(truth[..., None] > 127, [150, 70, 50], [120, 120, 120]) + noise).astype(np.uint8)
+    return lambda: photo
 
 
 def written(folder: Path, masks: dict[str, np.ndarray]) -> dict[str, Path]:
