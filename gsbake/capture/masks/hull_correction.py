@@ -66,7 +66,8 @@ def correct_by_hull(cameras: Sequence[Camera], masks: Mapping[str, Path]) -> dic
 def apply_correction(mask: Bytes, photo: Callable[[], Bytes], certain: NDArray[np.bool_], possible: NDArray[np.bool_]) -> Bytes:
     """The `mask` (h, w) filled where it lacks what is `certain`, unless in the background's colours, without what is not `possible`.
 
-    `photo` reads the photo (h, w, 3), 8-bit sRGB of any size; only masks that lack something need it. `certain` and `possible` (h', w') are those of `correct_by_hull`.
+    `photo` reads the photo (h, w, 3), 8-bit sRGB of any size; only masks that lack something need it. `certain` and `possible` (h', w') are
+    those of `correct_by_hull`.
     """
     size = certain.shape[::-1]
     inside = (cv2.resize(mask, size, interpolation=cv2.INTER_AREA) > 127) & possible
