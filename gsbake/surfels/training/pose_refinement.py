@@ -3,7 +3,8 @@
 Held-out photos are aligned to the surfels on half of their pixels (squares of a checkerboard). This measures pose and exposure errors and,
 on the other half, how well surfels fit the photos once aligned (PSNR). Large errors start a trial: the same steps with and without
 corrected photos; the run with the higher PSNR continues. Corrections alternate with training (block coordinate descent); `align`
-computes each of them with the surfels frozen.
+computes each of them with the surfels frozen. Poses of structure from motion are kept: thousands of tie points place photos more exactly
+than surfels do, whose reflections move on glossy objects as if the cameras were wrong.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from gsbake.monitor import Rule
 from gsbake.surfels.training import alignment as align
 from gsbake.surfels.training.corrections import Correction, CorrectionKinds, remove_gauge
 from gsbake.surfels.training.trainer import Trainer
@@ -60,6 +62,14 @@ def trial_improves(before: Tensor, after: Tensor) -> tuple[bool, str]:
     gain = after - before
     holds = float(gain.mean()) >= MIN_PSNR_GAIN and float((gain > 0).double().mean()) >= MIN_IMPROVED_SHARE
     return holds, f"a trial gained {float(gain.mean()):+.2f} dB on validation photos; {MIN_PSNR_GAIN:g} dB are needed"
+
+
+def pose_rule(rule: Rule, origin: str) -> tuple[Rule, str]:
+    """The `rule` of pose refinement for poses of an `origin` ("given" or "solved"), and the reason where it differs: structure from motion
+    has minimised its poses' errors already."""
+    if rule == "auto" and origin == "solved":
+        return "always", "the poses are those of structure from motion"
+    return rule, ""
 
 
 class Aligner:

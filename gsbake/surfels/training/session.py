@@ -23,7 +23,7 @@ from gsbake.surfels.fields.registry import save_field
 from gsbake.surfels.model import Surfels
 from gsbake.surfels.raster.threads import configure
 from gsbake.surfels.training.corrections import Correction
-from gsbake.surfels.training.pose_refinement import Aligner
+from gsbake.surfels.training.pose_refinement import Aligner, pose_rule
 from gsbake.surfels.training.prior_maps import add_priors
 from gsbake.surfels.training.trainer import Plan, Trainer
 from gsbake.surfels.training.views import load_views
@@ -113,7 +113,8 @@ class Session:
         )
         light = None if light is None else light.to(run.device)
         self.trainer = Trainer(plan, surfels.to(run.device), light, full, half, validation, test, field)
-        self.aligner = None if trained else Aligner(self.trainer, options.pose_refinement, options.exposure_refinement)
+        rule, self.poses_kept = pose_rule(options.pose_refinement, posed.cameras.poses)
+        self.aligner = None if trained else Aligner(self.trainer, rule, options.exposure_refinement)
         self.before = len(surfels)
         self.step_seconds = 0.0  # measured by `run`, evaluations included
         self._resume()
@@ -185,7 +186,8 @@ class Session:
         if self.aligner is None:
             return
         kinds, evidence = self.aligner.decision, self.aligner.evidence
-        decide_skip(self.monitor, "pose_refinement", options.pose_refinement, not kinds.poses, evidence, "poses kept", "poses refined")
+        reason = self.poses_kept or evidence
+        decide_skip(self.monitor, "pose_refinement", options.pose_refinement, not kinds.poses, reason, "poses kept", "poses refined")
         constant, learnt = "constant exposure", "exposure gains learnt"
         decide_skip(self.monitor, "exposure_refinement", options.exposure_refinement, not kinds.gains, evidence, constant, learnt)
 

@@ -16,6 +16,7 @@ from gsbake.capture.posed_photos import PosedPhotos
 from gsbake.checkpoint import load_checkpoint, save_checkpoint
 from gsbake.config.schema import Profile
 from gsbake.geometry.cameras import Camera, CameraSet
+from gsbake.monitor import Rule
 from gsbake.surfels.initialisation import fibonacci_sphere, spacing
 from gsbake.surfels.model import Surfels, create
 from gsbake.surfels.raster.gbuffer import rasterise, rendered_image
@@ -37,6 +38,7 @@ from gsbake.surfels.training.pose_refinement import (
     Aligner,
     AlignmentResult,
     needs_trial,
+    pose_rule,
     trial_improves,
 )
 from gsbake.surfels.training.trainer import Plan, Trainer
@@ -289,6 +291,15 @@ def test_exact_photos_are_not_corrected() -> None:
     assert aligner.decided == CorrectionKinds(False, False) and "a trial needs" in aligner.evidence and "gained" not in aligner.evidence
     untouched, _ = trained(given, "always", "always")
     assert all(torch.equal(a, b) for a, b in zip(t.surfels.tensors().values(), untouched.surfels.tensors().values(), strict=True))
+
+
+@pytest.mark.parametrize(
+    ("rule", "origin", "expected"),
+    [("auto", "solved", "always"), ("auto", "given", "auto"), ("never", "solved", "never"), ("always", "given", "always")],
+)
+def test_poses_of_structure_from_motion_are_kept_unless_asked(rule: Rule, origin: str, expected: Rule) -> None:
+    found, reason = pose_rule(rule, origin)
+    assert found == expected and bool(reason) == (found != rule)
 
 
 def measure(motion: float, gain: float) -> AlignmentResult:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -22,10 +23,13 @@ from gsbake.surfels.fields.samples import SamplesField
 from gsbake.surfels.initialisation import fibonacci_sphere, initialise_surfels, spacing
 from gsbake.surfels.model import Surfels, create
 from gsbake.surfels.raster.render import SurfelRenderer
+from gsbake.surfels.training.run import train_surfels
+from gsbake.surfels.training.session import TrainOptions
 from gsbake.surfels.training.trainer import Plan, Trainer
 from gsbake.surfels.training.views import load_views
 from gsbake.surfels.transfer import TRANSFERS
 from tests.support.cameras import look_at
+from tests.support.recorder import Recorder
 
 SIZE = 48
 
@@ -109,6 +113,17 @@ def test_resumed_run_is_bit_identical(posed: PosedPhotos, tmp_path: Path) -> Non
     while second.done < second.end:
         second.step()
     assert all(torch.equal(v, second.surfels.tensors()[k]) for k, v in whole.surfels.tensors().items())
+
+
+@pytest.mark.parametrize(("origin", "evidence"), [("given", "a trial needs"), ("solved", "structure from motion")])
+def test_solved_poses_are_not_measured(posed: PosedPhotos, tmp_path: Path, origin: str, evidence: str) -> None:
+    folder, p, recorder = tmp_path / "posed", profile(iterations=20), Recorder()
+    shutil.copytree(posed.folder, folder)
+    replace(posed.cameras, poses=origin).save(folder / "cameras.json")
+    train_surfels(folder, tmp_path, TrainOptions(p.train, p.surfels, p.loss), monitor=recorder)
+    choice, reason = recorder.decisions["skip.pose_refinement"]
+    assert choice == "poses kept" and evidence in reason
+    assert "a trial needs" in recorder.decisions["skip.exposure_refinement"][1]  # exposures are measured either way
 
 
 def test_refinement_raises_when_all_surfels_are_pruned(posed: PosedPhotos) -> None:
