@@ -20,7 +20,7 @@ def run(ctx: Context) -> dict[str, Any]:
 
 STAGE = Stage(
     name="poses",
-    version=13,
+    version=14,
     title="Camera poses",
     run=run,
     summary="{registered} photos registered, {points} tie points, {reprojection_px:px} reprojection error",

@@ -122,7 +122,7 @@ class _Estimation:
             self._complete_masks([(camera.moved(to_unit), mask) for camera, mask in masks], cloud)
         with monitor.part("redundant photos"):
             cameras, dropped = self._drop_redundant(entries, cameras, cloud)
-        CameraSet(tuple(cameras), to_world, origin).save(self.out / "cameras.json")
+        CameraSet(tuple(cameras), to_world, origin, epipolar_px=solved.figures.get("epipolar_px")).save(self.out / "cameras.json")
         if (solver.folder / "sparse").exists():
             shutil.copytree(solver.folder / "sparse", self.out / "sparse")
         monitor.decide("unit frame", f"radius {sphere.radius:.4g} in world units", sphere.evidence)

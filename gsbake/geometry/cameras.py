@@ -146,19 +146,22 @@ class CameraSet:
     """Cameras of one capture in one frame.
 
     `to_world` maps that frame to the Z-up world frame; `poses` is the origin of the poses ("given" or "solved");
-    `metric` is True when world units are metres.
+    `metric` is True when world units are metres; `epipolar_px` is the median distance in pixels of matched features from the epipolar lines
+    of given poses, None where it was not measured or too few features match.
     """
 
     cameras: tuple[Camera, ...]
     to_world: Similarity = Similarity()
     poses: str = "given"
     metric: bool = False
+    epipolar_px: float | None = None
 
     def save(self, path: Path) -> None:
         """Write as JSON."""
         body = {
             "poses": self.poses,
             "metric": self.metric,
+            "epipolar_px": self.epipolar_px,
             "to_world": {
                 "scale": self.to_world.scale,
                 "rotation": self.to_world.rotation.tolist(),
@@ -190,4 +193,5 @@ class CameraSet:
             to_world=Similarity(similarity["scale"], np.array(similarity["rotation"], float), np.array(similarity["translation"], float)),
             poses=body["poses"],
             metric=body["metric"],
+            epipolar_px=body.get("epipolar_px"),
         )

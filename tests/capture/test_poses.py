@@ -123,7 +123,7 @@ def test_given_poses_keep_their_frame_and_points_are_triangulated(tmp_path: Path
         back = camera.moved(world)
         assert np.allclose(back.R, wanted.R, atol=1e-9) and np.allclose(back.t, wanted.t, atol=1e-9)
         assert (back.fx, back.cx, back.width) == (190, 80, 160)
-    assert results["points"] > 50
+    assert results["points"] > 50 and posed.cameras.epipolar_px == results["epipolar_px"] < 0.4
     cloud = posed.points()
     assert cloud is not None
     height = world.apply(cloud[0])[:, 2]

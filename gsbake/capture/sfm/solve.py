@@ -213,7 +213,7 @@ class PoseSolver:
         limit = max(MIN_SECONDS, SECONDS_PER_PHOTO * len(cameras))
         cloud = self.folder / "points.ply"
         solved = self._run(job, self.folder, limit)
-        figures |= {k: solved[k] for k in ("points", "reprojection_px", "track_length", "seconds")}
+        figures |= {k: solved[k] for k in ("points", "reprojection_px", "track_length", "epipolar_px", "seconds")}
         self.monitor.decide("tie points", f"{solved['points']} triangulated", "with the given poses")
         return Solved(cameras, cloud, figures)
 

@@ -22,6 +22,7 @@ import numpy as np
 from gsbake.capture.poses.colmap_model import camera_of, cloud
 from gsbake.capture.poses.up_axis import up_direction, upright_rotation
 from gsbake.capture.sfm.colmap import pycolmap, repeatable_mapping
+from gsbake.capture.sfm.epipolar import epipolar_error
 from gsbake.capture.sfm.feature_cache import FeatureCache
 from gsbake.capture.sfm.pairs import exhaustive, neighbouring_views
 from gsbake.capture.sfm.reconstruction import FeatureOptions, Lens, SfmPipeline, registered_names
@@ -144,7 +145,8 @@ def triangulate(job: Mapping[str, Any]) -> dict[str, Any]:
     _report_progress("triangulation", 0, 1)
     model = pycolmap.triangulate_points(model, str(pipeline.database), str(pipeline.folder), str(out / "sparse"), True, options)
     pipeline.seconds["triangulation"] = time.perf_counter() - start
-    return _write(model, out, pipeline, False) | {"seconds": pipeline.seconds}
+    figures = {"seconds": pipeline.seconds, "epipolar_px": epipolar_error(pipeline.database, cameras)}
+    return _write(model, out, pipeline, False) | figures
 
 
 def main() -> None:

@@ -3,8 +3,8 @@
 Held-out photos are aligned to the surfels on half of their pixels (squares of a checkerboard). This measures pose and exposure errors and,
 on the other half, how well surfels fit the photos once aligned (PSNR). Large errors start a trial: the same steps with and without
 corrected photos; the run with the higher PSNR continues. Corrections alternate with training (block coordinate descent); `align`
-computes each of them with the surfels frozen. Poses of structure from motion are kept: thousands of tie points place photos more exactly
-than surfels do, whose reflections move on glossy objects as if the cameras were wrong.
+computes each of them with the surfels frozen. Poses are tried only where matched features contradict them: surfels cannot tell a wrong
+camera from reflections that move over a glossy object.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from gsbake.geometry.cameras import CameraSet
 from gsbake.monitor import Rule
 from gsbake.surfels.training import alignment as align
 from gsbake.surfels.training.corrections import Correction, CorrectionKinds, remove_gauge
@@ -29,6 +30,8 @@ TRIAL_SHARE = 0.3
 #: Minimum pose error for a trial in pixels and as a share of the longer side (median over held-out photos): with exact poses, unfinished
 #: surfels measure .2 to .9 pixels of 400.
 MIN_MOTION, MIN_MOTION_SHARE = 1.5, 1.5 / 400
+#: Median Sampson distance of matches by the root mean square error in pixels of both photos' poses, where these are normally distributed.
+EPIPOLAR_SHARE = 0.48
 #: Minimum exposure error for a trial: root mean square of the log gains.
 MIN_LOG_GAIN = 0.08
 #: A trial succeeds with this mean gain of held-out PSNR (dB) and this share of improved photos.
@@ -64,12 +67,22 @@ def trial_improves(before: Tensor, after: Tensor) -> tuple[bool, str]:
     return holds, f"a trial gained {float(gain.mean()):+.2f} dB on validation photos; {MIN_PSNR_GAIN:g} dB are needed"
 
 
-def pose_rule(rule: Rule, origin: str) -> tuple[Rule, str]:
-    """The `rule` of pose refinement for poses of an `origin` ("given" or "solved"), and the reason where it differs: structure from motion
-    has minimised its poses' errors already."""
-    if rule == "auto" and origin == "solved":
+def pose_rule(rule: Rule, cameras: CameraSet, size: int) -> tuple[Rule, str]:
+    """The `rule` of pose refinement for these `cameras`, and the reason where it differs; `size` is the longer side of training photos.
+
+    Structure from motion has minimised its poses' errors already; given poses are kept unless matched features contradict them.
+    """
+    if rule != "auto":
+        return rule, ""
+    if cameras.poses == "solved":
         return "always", "the poses are those of structure from motion"
-    return rule, ""
+    if cameras.epipolar_px is None:
+        return "always", "too few features match to tell whether the given poses are wrong"
+    error = cameras.epipolar_px * size / max(max(camera.width, camera.height) for camera in cameras.cameras)
+    limit = EPIPOLAR_SHARE * max(MIN_MOTION, MIN_MOTION_SHARE * size)
+    if error < limit:
+        return "always", f"matched features are {error:.2f} px from the epipolar lines of the given poses; a trial needs {limit:.2g} px"
+    return "auto", ""
 
 
 class Aligner:

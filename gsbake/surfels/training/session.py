@@ -113,7 +113,7 @@ class Session:
         )
         light = None if light is None else light.to(run.device)
         self.trainer = Trainer(plan, surfels.to(run.device), light, full, half, validation, test, field)
-        rule, self.poses_kept = pose_rule(options.pose_refinement, posed.cameras.poses)
+        rule, self.poses_kept = pose_rule(options.pose_refinement, posed.cameras, max(full[0].rgb.shape[1:]))
         self.aligner = None if trained else Aligner(self.trainer, rule, options.exposure_refinement)
         self.before = len(surfels)
         self.step_seconds = 0.0  # measured by `run`, evaluations included

@@ -218,9 +218,9 @@ def test_camera_set_round_trip_and_moves(tmp_path: Path) -> None:
     turn = np.asarray(cv2.Rodrigues(np.array([0.1, 0.7, -0.3]))[0], float)
     camera = Camera("a", 200, 100, 150.0, 151.0, 99.0, 52.0, turn, np.array([0.1, -0.2, 5.0]), (0.1, 0.0, 0.0, 0.0))
     frame = Similarity(2.5, np.asarray(cv2.Rodrigues(np.array([0.3, 0.0, 0.2]))[0], float), np.array([1.0, 2.0, 3.0]))
-    CameraSet((camera,), frame, "solved", True).save(tmp_path / "c.json")
+    CameraSet((camera,), frame, "solved", True, 0.25).save(tmp_path / "c.json")
     back = CameraSet.load(tmp_path / "c.json")
-    assert back.poses == "solved" and back.metric and back.cameras[0].distortion == camera.distortion
+    assert back.poses == "solved" and back.metric and back.epipolar_px == 0.25 and back.cameras[0].distortion == camera.distortion
     assert np.allclose(back.cameras[0].R, camera.R) and back.to_world.matrix() == pytest.approx(frame.matrix())
     points = np.random.default_rng(0).normal(size=(5, 3))
     here, depth = camera.project(points)

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from gsbake.capture.photos.roles import held_out
 from gsbake.capture.posed_photos import PosedPhotos
+from gsbake.capture.sfm.epipolar import sampson_distances
 from gsbake.checkpoint import load_checkpoint, save_checkpoint
 from gsbake.config.schema import Profile
 from gsbake.geometry.cameras import Camera, CameraSet
@@ -32,6 +33,7 @@ from gsbake.surfels.training.corrections import (
     rotation_vector,
 )
 from gsbake.surfels.training.pose_refinement import (
+    EPIPOLAR_SHARE,
     MIN_LOG_GAIN,
     MIN_MOTION,
     MIN_PSNR_GAIN,
@@ -294,12 +296,37 @@ def test_exact_photos_are_not_corrected() -> None:
 
 
 @pytest.mark.parametrize(
-    ("rule", "origin", "expected"),
-    [("auto", "solved", "always"), ("auto", "given", "auto"), ("never", "solved", "never"), ("always", "given", "always")],
+    ("rule", "origin", "error", "expected"),
+    [
+        ("auto", "solved", None, "always"),
+        ("auto", "given", None, "always"),  # nothing tells that they are wrong
+        ("auto", "given", 0.9 * 2 * EPIPOLAR_SHARE * MIN_MOTION, "always"),
+        ("auto", "given", 1.1 * 2 * EPIPOLAR_SHARE * MIN_MOTION, "auto"),
+        ("never", "solved", None, "never"),
+        ("always", "given", 9.0, "always"),
+    ],
 )
-def test_poses_of_structure_from_motion_are_kept_unless_asked(rule: Rule, origin: str, expected: Rule) -> None:
-    found, reason = pose_rule(rule, origin)
+def test_poses_are_tried_where_matched_features_contradict_them(rule: Rule, origin: str, error: float | None, expected: Rule) -> None:
+    camera = Camera("a", 800, 600, 900.0, 900.0, 400.0, 300.0, np.eye(3), np.array([0.0, 0.0, 3.0]))
+    found, reason = pose_rule(rule, CameraSet((camera,), poses=origin, epipolar_px=error), 400)  # trained at half the size
     assert found == expected and bool(reason) == (found != rule)
+
+
+def test_epipolar_share_is_that_of_normal_errors() -> None:
+    rng = np.random.default_rng(0)
+    eyes = [torch.tensor([3.0, 0.2, 0.4]), torch.tensor([2.6, 1.5, 0.4])]
+    lens, points, errors, distances = view_from(eyes[0]).pinhole, 0.7 * fibonacci_sphere(200), [], []
+    for _ in range(300):
+        true = [view_from(eye) for eye in eyes]
+        wrong = [Correction(torch.tensor(rng.normal(0, [4e-3] * 3 + [0.012] * 3)), torch.zeros(3).double()).apply(view) for view in true]
+        errors.append([pixels_apart(a, b) for a, b in zip(true, wrong, strict=True)])
+        a, b = (Camera("", SIZE, SIZE, lens.fx, lens.fy, lens.cx, lens.cy, v.R.double().numpy(), v.t.double().numpy()) for v in wrong)
+        pixels = [
+            Camera("", SIZE, SIZE, lens.fx, lens.fy, lens.cx, lens.cy, v.R.double().numpy(), v.t.double().numpy()).project(points)[0]
+            for v in true
+        ]
+        distances.append(np.median(sampson_distances(a, b, *pixels)))
+    assert np.median(distances) == pytest.approx(EPIPOLAR_SHARE * np.sqrt(np.mean(np.square(errors))), rel=0.25)
 
 
 def measure(motion: float, gain: float) -> AlignmentResult:

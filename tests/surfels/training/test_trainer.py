@@ -115,11 +115,21 @@ def test_resumed_run_is_bit_identical(posed: PosedPhotos, tmp_path: Path) -> Non
     assert all(torch.equal(v, second.surfels.tensors()[k]) for k, v in whole.surfels.tensors().items())
 
 
-@pytest.mark.parametrize(("origin", "evidence"), [("given", "a trial needs"), ("solved", "structure from motion")])
-def test_solved_poses_are_not_measured(posed: PosedPhotos, tmp_path: Path, origin: str, evidence: str) -> None:
+@pytest.mark.parametrize(
+    ("origin", "error", "evidence"),
+    [
+        ("given", 3.0, "a trial needs 1.5 px"),
+        ("given", 0.1, "epipolar lines"),
+        ("given", None, "too few"),
+        ("solved", None, "structure from motion"),
+    ],
+)
+def test_poses_are_measured_where_matched_features_contradict_them(
+    posed: PosedPhotos, tmp_path: Path, origin: str, error: float | None, evidence: str
+) -> None:
     folder, p, recorder = tmp_path / "posed", profile(iterations=20), Recorder()
     shutil.copytree(posed.folder, folder)
-    replace(posed.cameras, poses=origin).save(folder / "cameras.json")
+    replace(posed.cameras, poses=origin, epipolar_px=error).save(folder / "cameras.json")
     train_surfels(folder, tmp_path, TrainOptions(p.train, p.surfels, p.loss), monitor=recorder)
     choice, reason = recorder.decisions["skip.pose_refinement"]
     assert choice == "poses kept" and evidence in reason

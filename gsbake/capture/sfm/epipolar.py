@@ -1,0 +1,60 @@
+"""Agreement of given poses with matched features: Sampson distances (Hartley & Zisserman, *Multiple View Geometry*, 11.4.3).
+
+Matches are verified by a geometry of their own for each pair of photos, which knows nothing of the given poses. So they tell errors of poses
+where surfels cannot: reflections that move on a glossy object match badly, and look like an error of the cameras to anything that is
+fitted to whole photos.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from contextlib import closing
+from pathlib import Path
+
+import numpy as np
+
+from gsbake.capture.photos.undistortion import undistort_points
+from gsbake.capture.sfm.colmap import pycolmap
+from gsbake.geometry.cameras import Array, Camera
+
+#: Smallest number of verified matches per photo, in the mean, that poses are judged by.
+MIN_MATCHES = 20
+
+
+def sampson_distances(first: Camera, second: Camera, points: Array, others: Array) -> Array:
+    """Sampson distances (n,) in pixels of matched `points` (n, 2) of the `first` and `others` of the `second` photo, with distortion."""
+    rotation = second.R @ first.R.T
+    x, y, z = second.t - rotation @ first.t
+    essential = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ rotation
+    a, b = _rays(first, points), _rays(second, others)
+    line_b, line_a = a @ essential.T, b @ essential
+    slope = (line_b[:, :2] ** 2).sum(1) + (line_a[:, :2] ** 2).sum(1)
+    focal = (first.fx + first.fy + second.fx + second.fy) / 4
+    return np.asarray(focal * np.abs((b * line_b).sum(1)) / np.sqrt(np.maximum(slope, 1e-24)))
+
+
+def epipolar_error(database: Path, cameras: Mapping[str, Camera]) -> float | None:
+    """Median over the pairs of photos of the median Sampson distance in pixels of their verified matches; `cameras` by photo name.
+
+    None where there are fewer than `MIN_MATCHES` matches per photo: too few to tell.
+    """
+    medians, count = [], 0
+    with closing(pycolmap.Database.open(str(database))) as base:
+        images = {image.image_id: cameras[image.name.rsplit(".", 1)[0]] for image in base.read_all_images()}
+        points = {number: np.asarray(base.read_keypoints(number), float)[:, :2] for number in images}
+        for i, first in images.items():
+            for j, second in images.items():
+                if i < j and base.exists_two_view_geometry(i, j):
+                    matches = np.asarray(base.read_two_view_geometry(i, j).inlier_matches, np.int64).reshape(-1, 2)
+                    if len(matches):
+                        medians.append(np.nanmedian(sampson_distances(first, second, points[i][matches[:, 0]], points[j][matches[:, 1]])))
+                        count += len(matches)
+    return float(np.median(medians)) if count >= MIN_MATCHES * len(cameras) else None
+
+
+def _rays(camera: Camera, pixels: Array) -> Array:
+    """Rays (n, 3) at z = 1 in camera axes of pixels (n, 2) of the photo before undistortion."""
+    plane = (pixels - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
+    if any(camera.distortion):
+        plane = undistort_points(plane, camera.distortion)
+    return np.concatenate([plane, np.ones((len(plane), 1))], 1)
