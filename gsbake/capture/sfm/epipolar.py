@@ -1,6 +1,6 @@
-"""Agreement of given poses with matched features: Sampson distances (Hartley & Zisserman, *Multiple View Geometry*, 11.4.3).
+"""Agreement of given poses with matches: Sampson distances (Hartley & Zisserman, *Multiple View Geometry*, 11.4.3).
 
-Matches are verified by a geometry of their own for each pair of photos, which knows nothing of the given poses. So they tell errors of poses
+Matches are verified by a geometry of their own for each pair of photos, which knows nothing of the given poses. They tell errors of poses
 where surfels cannot: reflections that move on a glossy object match badly, and look like an error of the cameras to anything that is
 fitted to whole photos.
 """
