@@ -9,6 +9,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from contextlib import closing
+from functools import cache
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -41,15 +43,20 @@ def epipolar_error(database: Path, cameras: Mapping[str, Camera]) -> float | Non
     medians, count = [], 0
     with closing(pycolmap.Database.open(str(database))) as base:
         images = {image.image_id: cameras[image.name.rsplit(".", 1)[0]] for image in base.read_all_images()}
-        points = {number: np.asarray(base.read_keypoints(number), float)[:, :2] for number in images}
-        for i, first in images.items():
-            for j, second in images.items():
-                if i < j and base.exists_two_view_geometry(i, j):
-                    matches = np.asarray(base.read_two_view_geometry(i, j).inlier_matches, np.int64).reshape(-1, 2)
-                    if len(matches):
-                        medians.append(np.nanmedian(sampson_distances(first, second, points[i][matches[:, 0]], points[j][matches[:, 1]])))
-                        count += len(matches)
-    return float(np.median(medians)) if count >= MIN_MATCHES * len(cameras) else None
+
+        @cache
+        def points(image: int) -> Array:
+            return np.asarray(base.read_keypoints(image), float)[:, :2]
+
+        for i, j in combinations(sorted(images), 2):
+            if base.exists_two_view_geometry(i, j):
+                matches = np.asarray(base.read_two_view_geometry(i, j).inlier_matches, np.int64).reshape(-1, 2)
+                if len(matches):
+                    found = sampson_distances(images[i], images[j], points(i)[matches[:, 0]], points(j)[matches[:, 1]])
+                    found = found[np.isfinite(found)]  # the lens of a given camera may not reach the edge of its photo
+                    medians += [np.median(found)] if len(found) else []
+                    count += len(found)
+    return float(np.median(medians)) if medians and count >= MIN_MATCHES * len(cameras) else None
 
 
 def _rays(camera: Camera, pixels: Array) -> Array:

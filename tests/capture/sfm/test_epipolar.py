@@ -58,3 +58,13 @@ def test_error_of_a_database(tmp_path: Path, count: int, found: bool) -> None:
     base.close()
     error = epipolar_error(path, {view.name: view for view in (a, b, c)})
     assert error == pytest.approx(2 / np.sqrt(2), abs=1e-3) if found else error is None
+
+
+def test_photos_without_features(tmp_path: Path) -> None:
+    path = tmp_path / "database.db"
+    base = pycolmap.Database.open(str(path))
+    lens = base.write_camera(pycolmap.Camera(model="PINHOLE", width=640, height=480, params=[800, 800, 320, 240]))
+    for name in "ab":
+        base.write_image(pycolmap.Image(name=f"{name}.png", camera_id=lens))
+    base.close()
+    assert epipolar_error(path, {name: camera(name, (0, 0, 0), (0.0, 0.0, 3.0)) for name in "ab"}) is None
