@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from gsbake.capture.photos.undistortion import undistort_points
+from gsbake.capture.photos.undistortion import image_plane
 from gsbake.config.lengths import PixelPosition
 from gsbake.errors import BadInputError
 from gsbake.geometry.cameras import Array, Camera
@@ -44,9 +44,7 @@ def camera_rays(camera: Camera, pixels: Array) -> list[Ray]:
 
     Raises BadInputError where the distortion has no inverse.
     """
-    plane = (np.asarray(pixels, np.float64) - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
-    if any(camera.distortion):
-        plane = undistort_points(plane, camera.distortion)
+    plane = image_plane(camera, pixels)
     if not np.isfinite(plane).all():
         raise BadInputError(f"The lens distortion of photo {camera.name} cannot be inverted at a point that is measured there.")
     directions = np.column_stack([plane, np.ones(len(plane))]) @ camera.R

@@ -46,6 +46,12 @@ def undistort_points(points: Array, coefficients: tuple[float, ...], steps: int 
     return np.where((off < 1e-6)[:, None], guess, np.nan)
 
 
+def image_plane(camera: Camera, pixels: Array) -> Array:
+    """Undistorted image plane coordinates (n, 2) at z = 1 of `pixels` (n, 2) of the photo; NaN where the distortion has no inverse."""
+    plane = (np.asarray(pixels, np.float64) - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
+    return undistort_points(plane, camera.distortion) if any(camera.distortion) else plane
+
+
 def pinhole_camera(camera: Camera) -> Camera:
     """The pinhole camera of the same pose and focal lengths whose pixels the distorted photo all covers.
 

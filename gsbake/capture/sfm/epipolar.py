@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gsbake.capture.photos.undistortion import undistort_points
+from gsbake.capture.photos.undistortion import image_plane
 from gsbake.capture.sfm.colmap import pycolmap
 from gsbake.geometry.cameras import Array, Camera
 
@@ -24,11 +24,12 @@ MIN_MATCHES = 20
 
 
 def sampson_distances(first: Camera, second: Camera, points: Array, others: Array) -> Array:
-    """Sampson distances (n,) in pixels of matched `points` (n, 2) of the `first` and `others` of the `second` photo, with distortion."""
+    """Sampson distances (n,) in pixels of matched `points` (n, 2) of the `first` and `others` of the `second` photo, both given in the
+    undistorted image plane (`image_plane`)."""
     rotation = second.R @ first.R.T
     x, y, z = second.t - rotation @ first.t
     essential = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ rotation
-    a, b = _rays(first, points), _rays(second, others)
+    a, b = (np.column_stack([plane, np.ones(len(plane))]) for plane in (points, others))
     line_b, line_a = a @ essential.T, b @ essential
     slope = (line_b[:, :2] ** 2).sum(1) + (line_a[:, :2] ** 2).sum(1)
     focal = (first.fx + first.fy + second.fx + second.fy) / 4
@@ -46,7 +47,7 @@ def epipolar_error(database: Path, cameras: Mapping[str, Camera]) -> float | Non
 
         @cache
         def points(image: int) -> Array:
-            return np.asarray(base.read_keypoints(image), float)[:, :2]
+            return image_plane(images[image], np.asarray(base.read_keypoints(image), float)[:, :2])
 
         for i, j in combinations(sorted(images), 2):
             if base.exists_two_view_geometry(i, j):
@@ -57,11 +58,3 @@ def epipolar_error(database: Path, cameras: Mapping[str, Camera]) -> float | Non
                     medians += [np.median(found)] if len(found) else []
                     count += len(found)
     return float(np.median(medians)) if medians and count >= MIN_MATCHES * len(cameras) else None
-
-
-def _rays(camera: Camera, pixels: Array) -> Array:
-    """Rays (n, 3) at z = 1 in camera axes of pixels (n, 2) of the photo before undistortion."""
-    plane = (pixels - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
-    if any(camera.distortion):
-        plane = undistort_points(plane, camera.distortion)
-    return np.concatenate([plane, np.ones((len(plane), 1))], 1)

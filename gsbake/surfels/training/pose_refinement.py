@@ -51,9 +51,14 @@ class AlignmentResult:
     gain: Tensor
 
 
+def motion_bound(size: int) -> float:
+    """Minimum pose error for a trial in pixels of photos whose longer side is `size`."""
+    return max(MIN_MOTION, MIN_MOTION_SHARE * size)
+
+
 def needs_trial(measured: AlignmentResult, size: int) -> tuple[CorrectionKinds, str]:
     """Which corrections need a trial, and the evidence; `size` is the photos' longer side in pixels."""
-    motion, threshold = float(measured.motion.median()), max(MIN_MOTION, MIN_MOTION_SHARE * size)
+    motion, threshold = float(measured.motion.median()), motion_bound(size)
     gain = float((measured.gain - measured.gain.mean(0)).square().mean().sqrt())
     errors = f"pose error {motion:.1f} px, exposure error {100 * gain:.0f} %"
     evidence = f"{errors}; a trial needs {threshold:.2g} px or {100 * MIN_LOG_GAIN:g} %"
@@ -77,9 +82,9 @@ def pose_rule(rule: Rule, cameras: CameraSet, size: int) -> tuple[Rule, str]:
     if cameras.poses == "solved":
         return "always", "the poses are those of structure from motion"
     if cameras.epipolar_px is None:
-        return "always", "too few features match to tell whether the given poses are wrong"
+        return "always", "too few features were matched to tell whether the given poses are wrong"
     error = cameras.epipolar_px * size / max(max(camera.width, camera.height) for camera in cameras.cameras)
-    limit = EPIPOLAR_SHARE * max(MIN_MOTION, MIN_MOTION_SHARE * size)
+    limit = EPIPOLAR_SHARE * motion_bound(size)
     if error < limit:
         return "always", f"matched features are {error:.2f} px from the epipolar lines of the given poses; a trial needs {limit:.2g} px"
     return "auto", ""

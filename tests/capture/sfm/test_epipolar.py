@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from gsbake.capture.photos.undistortion import distort
+from gsbake.capture.photos.undistortion import distort, image_plane
 from gsbake.capture.sfm.colmap import pycolmap
 from gsbake.capture.sfm.epipolar import MIN_MATCHES, epipolar_error, sampson_distances
 from gsbake.geometry.cameras import Array, Camera
@@ -27,16 +27,20 @@ def pixels(view: Camera, points: Array = POINTS) -> Array:
     return distort(plane, view.distortion or (0.0,) * 4) * (view.fx, view.fy) + (view.cx, view.cy)
 
 
+def distances(a: Camera, b: Camera, points: Array, others: Array) -> Array:
+    return sampson_distances(a, b, image_plane(a, points), image_plane(b, others))
+
+
 def test_exact_matches_lie_on_the_lines_of_distorted_photos() -> None:
     a, b = camera("a", (0.1, 0.2, 0.0), (0.0, 0.1, 3.0), LENS), camera("b", (-0.2, 0.5, 0.3), (0.4, 0.0, 2.5), LENS)
-    assert sampson_distances(a, b, pixels(a), pixels(b)) == pytest.approx(np.zeros(40), abs=1e-6)
+    assert distances(a, b, pixels(a), pixels(b)) == pytest.approx(np.zeros(40), abs=1e-6)
 
 
 def test_distance_across_the_rows_of_a_rectified_pair() -> None:
     """Epipolar lines are the rows; two photos share a shift of dy, so either point moves by dy / 2: dy / sqrt(2) in both together."""
     a, b = camera("a", (0, 0, 0), (0.0, 0.0, 3.0)), camera("b", (0, 0, 0), (-0.4, 0.0, 3.0))
     moved = pixels(b) + (5.0, 2.0)
-    assert sampson_distances(a, b, pixels(a), moved) == pytest.approx(np.full(40, 2 / np.sqrt(2)))
+    assert distances(a, b, pixels(a), moved) == pytest.approx(np.full(40, 2 / np.sqrt(2)))
 
 
 @pytest.mark.parametrize(("count", "found"), [(MIN_MATCHES + 1, True), (MIN_MATCHES - 1, False)])

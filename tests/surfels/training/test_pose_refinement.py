@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from gsbake.capture.photos.roles import held_out
+from gsbake.capture.photos.undistortion import image_plane
 from gsbake.capture.posed_photos import PosedPhotos
 from gsbake.capture.sfm.epipolar import sampson_distances
 from gsbake.checkpoint import load_checkpoint, save_checkpoint
@@ -76,11 +77,16 @@ def photographed(surfels: Surfels, view: TrainView) -> TrainView:
     return replace(view, rgb=rgb, mask=mask)
 
 
+def camera_of(view: TrainView) -> Camera:
+    """The view's camera in double precision."""
+    lens = view.pinhole
+    return Camera("a", SIZE, SIZE, lens.fx, lens.fy, lens.cx, lens.cy, view.R.double().numpy(), view.t.double().numpy())
+
+
 def pixels_apart(a: TrainView, b: TrainView) -> float:
     """Root mean square distance in pixels between the projections of a sphere by two cameras."""
     points = 0.7 * fibonacci_sphere(200)
-    lens = a.pinhole
-    measured = [Camera("", SIZE, SIZE, lens.fx, lens.fy, lens.cx, lens.cy, v.R.numpy(), v.t.numpy()).project(points)[0] for v in (a, b)]
+    measured = [camera_of(view).project(points)[0] for view in (a, b)]
     return float(np.sqrt(((measured[0] - measured[1]) ** 2).sum(1).mean()))
 
 
@@ -110,8 +116,7 @@ def test_rotation_keeps_the_objects_centre() -> None:
 
 def test_corrected_camera_matches_the_corrected_view() -> None:
     view = view_from(torch.tensor([2.5, 1.0, 0.7]))
-    lens = view.pinhole
-    camera = Camera("a", SIZE, SIZE, lens.fx, lens.fy, lens.cx, lens.cy, view.R.double().numpy(), view.t.double().numpy())
+    camera = camera_of(view)
     correction = Correction(TWIST, torch.zeros(3).double())
     moved, measured = correction.apply_to_camera(camera), correction.apply(view)
     assert np.allclose(moved.R, measured.R.numpy(), atol=1e-6) and np.allclose(moved.centre, measured.centre.numpy(), atol=1e-6)
@@ -315,17 +320,14 @@ def test_poses_are_tried_where_matched_features_contradict_them(rule: Rule, orig
 def test_epipolar_share_is_that_of_normal_errors() -> None:
     rng = np.random.default_rng(0)
     eyes = [torch.tensor([3.0, 0.2, 0.4]), torch.tensor([2.6, 1.5, 0.4])]
-    lens, points, errors, distances = view_from(eyes[0]).pinhole, 0.7 * fibonacci_sphere(200), [], []
+    points, errors, distances = 0.7 * fibonacci_sphere(200), [], []
     for _ in range(300):
         true = [view_from(eye) for eye in eyes]
         wrong = [Correction(torch.tensor(rng.normal(0, [4e-3] * 3 + [0.012] * 3)), torch.zeros(3).double()).apply(view) for view in true]
         errors.append([pixels_apart(a, b) for a, b in zip(true, wrong, strict=True)])
-        a, b = (Camera("", SIZE, SIZE, lens.fx, lens.fy, lens.cx, lens.cy, v.R.double().numpy(), v.t.double().numpy()) for v in wrong)
-        pixels = [
-            Camera("", SIZE, SIZE, lens.fx, lens.fy, lens.cx, lens.cy, v.R.double().numpy(), v.t.double().numpy()).project(points)[0]
-            for v in true
-        ]
-        distances.append(np.median(sampson_distances(a, b, *pixels)))
+        a, b = (camera_of(view) for view in wrong)
+        planes = [image_plane(camera, camera.project(points)[0]) for camera in map(camera_of, true)]
+        distances.append(np.median(sampson_distances(a, b, *planes)))
     assert np.median(distances) == pytest.approx(EPIPOLAR_SHARE * np.sqrt(np.mean(np.square(errors))), rel=0.25)
 
 
