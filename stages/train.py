@@ -23,7 +23,7 @@ def run(ctx: Context) -> dict[str, Any]:
 
 STAGE = Stage(
     name="train",
-    version=11,
+    version=12,
     title="Surfel training",
     run=run,
     summary="{surfels} surfels, {steps} steps, {psnr:dB} on validation photos",

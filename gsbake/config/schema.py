@@ -298,7 +298,7 @@ class Skip(Section):
     confirmed_steps: Rule = Field("auto", description="Up to half of the training iterations, in proportion to the share of the object that stereo confirmed. always: half of them.")
     converged_steps: Rule = Field("auto", description="Training iterations after held-out PSNR and median SDF sample reach a plateau (early stopping). always: the last iterations in any case.")
     pose_refinement: Rule = Field("auto", description="Refining poses during training, where structure from motion solved them, matched features do not contradict them, or held-out PSNR does not improve.")
-    exposure_refinement: Rule = Field("auto", description="Learning exposure gains during training, where held-out PSNR does not improve.")
+    exposure_refinement: Rule = Field("auto", description="Learning exposure gains during training, where photos agree at their tie points, these are too few, or held-out PSNR does not improve.")
     empty_cells: Rule = Field("auto", description="Voxels far from the surface.")
     exposure_equalisation: Rule = Field("auto", description="Dividing out exposure gains, where the photos agree in brightness on the surface.")
     normal_map: Rule = Field("auto", description="The normal map, where the low-poly mesh has the normals of the dense one.")

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from gsbake.capture.photos.exposure import MAX_SPREAD
 from gsbake.texturing.normal_map import DenseSamples
 
 #: Gains between photos below this factor count as view dependence, not exposure: dividing them out would remove reflections.
@@ -14,8 +15,6 @@ MAX_GAIN_SPREAD = 1.25
 #: So do gains that explain less than this share of the differences between photos: exposure scales all of a photo equally, reflections do
 #: not. With tie points a lower share is enough.
 MIN_EXPLAINED, MIN_EXPLAINED_WITH_TIE_POINTS = 0.35, 0.1
-#: Tie points, which are rarely specular, reveal changes of exposure from this factor on.
-MAX_TIE_POINT_SPREAD = 1.15
 #: No normal map is needed where normals deviate by less than this angle (degrees) at this share of the texels.
 MAX_NORMAL_ANGLE, NORMAL_QUANTILE = 2.0, 0.95
 
@@ -32,8 +31,8 @@ def constant_exposure(gains: NDArray[Any], explained: float, tie_point_spread: f
     if spread >= MAX_GAIN_SPREAD:
         evidence += f"; they explain {100 * explained:.0f} % of the differences, threshold {100 * needed:g} %"
     if tie_point_spread is not None:
-        evidence += f"; 90 % of tie points agree within {tie_point_spread:.2f}x, threshold {MAX_TIE_POINT_SPREAD:g}x"
-    agreeing = tie_point_spread is not None and tie_point_spread < MAX_TIE_POINT_SPREAD
+        evidence += f"; 90 % of tie points agree within {tie_point_spread:.2f}x, threshold {MAX_SPREAD:g}x"
+    agreeing = tie_point_spread is not None and tie_point_spread < MAX_SPREAD
     return spread < MAX_GAIN_SPREAD or explained < needed or agreeing, evidence
 
 

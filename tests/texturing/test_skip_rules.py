@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 import trimesh
 
+from gsbake.capture.photos.exposure import MAX_SPREAD
 from gsbake.geometry.raycast import RayCaster
 from gsbake.texturing.normal_map import sample_dense_mesh, vertex_normals
-from gsbake.texturing.skip_rules import MAX_GAIN_SPREAD, MAX_TIE_POINT_SPREAD, MIN_EXPLAINED, constant_exposure, normals_agree
+from gsbake.texturing.skip_rules import MAX_GAIN_SPREAD, MIN_EXPLAINED, constant_exposure, normals_agree
 
 
 @pytest.mark.parametrize(
@@ -22,9 +23,7 @@ def test_exposure_is_constant_below_the_gain_threshold(gain: float, constant: bo
     assert holds is constant and f"{max(gain, 1 / gain):.2f}x" in evidence
 
 
-@pytest.mark.parametrize(
-    ("tie_point_spread", "constant"), [(MAX_TIE_POINT_SPREAD - 0.02, True), (MAX_TIE_POINT_SPREAD + 0.02, False), (None, False)]
-)
+@pytest.mark.parametrize(("tie_point_spread", "constant"), [(MAX_SPREAD - 0.02, True), (MAX_SPREAD + 0.02, False), (None, False)])
 def test_tie_points_decide_on_specular_surfaces(tie_point_spread: float | None, constant: bool) -> None:
     gains = np.ones((5, 3))
     gains[3] = 1.6

@@ -24,6 +24,8 @@ VALUE_RANGE = (0.01, 0.9)
 MIN_VIEWS, MIN_POINTS_PER_PHOTO, MIN_POINTS = 3, 30, 200
 #: Quantile of the photos' exposure offsets that is returned: a photo that shares few points with the others may be an outlier.
 SPREAD_QUANTILE = 0.9
+#: Photos whose spread is below this factor have one exposure: tie points are rarely specular.
+MAX_SPREAD = 1.15
 
 
 class TiePointExposure:

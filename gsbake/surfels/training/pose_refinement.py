@@ -3,8 +3,8 @@
 Held-out photos are aligned to the surfels on half of their pixels (squares of a checkerboard). This measures pose and exposure errors and,
 on the other half, how well surfels fit the photos once aligned (PSNR). Large errors start a trial: the same steps with and without
 corrected photos; the run with the higher PSNR continues. Corrections alternate with training (block coordinate descent); `align`
-computes each of them with the surfels frozen. Poses are tried only where matched features contradict them: surfels cannot tell a wrong
-camera from reflections that move over a glossy object.
+computes each of them with the surfels frozen. Poses are tried only where matched features contradict them, and exposures where photos
+differ at tie points: surfels cannot tell a wrong camera or another exposure from reflections that move over a glossy object.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from gsbake.capture.photos.exposure import MAX_SPREAD
 from gsbake.geometry.cameras import CameraSet
 from gsbake.monitor import Rule
 from gsbake.surfels.training import alignment as align
@@ -87,6 +88,18 @@ def pose_rule(rule: Rule, cameras: CameraSet, size: int) -> tuple[Rule, str]:
     limit = EPIPOLAR_SHARE * motion_bound(size)
     if error < limit:
         return "always", f"matched features are {error:.2f} px from the epipolar lines of the given poses; a trial needs {limit:.2g} px"
+    return "auto", ""
+
+
+def exposure_rule(rule: Rule, spread: float | None) -> tuple[Rule, str]:
+    """The `rule` of exposure refinement for photos with this `spread` of tie points (`capture.photos.exposure`, None: too few of them), and
+    the reason where it differs."""
+    if rule != "auto":
+        return rule, ""
+    if spread is None:
+        return "always", "too few tie points to tell whether photos differ in exposure"
+    if spread < MAX_SPREAD:
+        return "always", f"90 % of the photos agree within {spread:.2f}x at their tie points; a trial needs {MAX_SPREAD:g}x"
     return "auto", ""
 
 

@@ -23,10 +23,10 @@ from gsbake.surfels.fields.registry import save_field
 from gsbake.surfels.model import Surfels
 from gsbake.surfels.raster.threads import configure
 from gsbake.surfels.training.corrections import Correction
-from gsbake.surfels.training.pose_refinement import Aligner, pose_rule
+from gsbake.surfels.training.pose_refinement import Aligner, exposure_rule, pose_rule
 from gsbake.surfels.training.prior_maps import add_priors
 from gsbake.surfels.training.trainer import Plan, Trainer
-from gsbake.surfels.training.views import load_views
+from gsbake.surfels.training.views import exposure_spread, load_views
 
 #: Checkpoints of other versions are ignored.
 CHECKPOINT_VERSION = 5
@@ -113,8 +113,12 @@ class Session:
         )
         light = None if light is None else light.to(run.device)
         self.trainer = Trainer(plan, surfels.to(run.device), light, full, half, validation, test, field)
-        rule, self.poses_kept = pose_rule(options.pose_refinement, posed.cameras, max(full[0].rgb.shape[1:]))
-        self.aligner = None if trained else Aligner(self.trainer, rule, options.exposure_refinement)
+        self.aligner = None
+        if trained is None:
+            poses, self.poses_kept = pose_rule(options.pose_refinement, posed.cameras, max(full[0].rgb.shape[1:]))
+            spread = exposure_spread(posed, full) if options.exposure_refinement == "auto" else None
+            gains, self.exposures_kept = exposure_rule(options.exposure_refinement, spread)
+            self.aligner = Aligner(self.trainer, poses, gains)
         self.before = len(surfels)
         self.step_seconds = 0.0  # measured by `run`, evaluations included
         self._resume()
@@ -188,8 +192,8 @@ class Session:
         kinds, evidence = self.aligner.decision, self.aligner.evidence
         reason = self.poses_kept or evidence
         decide_skip(self.monitor, "pose_refinement", options.pose_refinement, not kinds.poses, reason, "poses kept", "poses refined")
-        constant, learnt = "constant exposure", "exposure gains learnt"
-        decide_skip(self.monitor, "exposure_refinement", options.exposure_refinement, not kinds.gains, evidence, constant, learnt)
+        reason, constant, learnt = self.exposures_kept or evidence, "constant exposure", "exposure gains learnt"
+        decide_skip(self.monitor, "exposure_refinement", options.exposure_refinement, not kinds.gains, reason, constant, learnt)
 
     def _write_corrections(self) -> None:
         """Write cameras and exposure gains where they differ from those of the poses stage."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -9,8 +10,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gsbake.capture.photos.exposure import TiePointExposure
 from gsbake.capture.posed_photos import PosedPhotos
 from gsbake.geometry.cameras import Camera
+from gsbake.imaging.srgb import decode_bytes
 from gsbake.surfels.raster.projection import Pinhole
 
 
@@ -68,3 +71,14 @@ def load_views(posed: PosedPhotos, max_size: int) -> tuple[list[TrainView], list
         mask = None if view.mask is None else cv2.resize(view.mask, (w, h), interpolation=cv2.INTER_AREA)
         half.append(_to_view(view.camera.scaled(w, h), rgb, mask))
     return full, half
+
+
+def exposure_spread(posed: PosedPhotos, views: Sequence[TrainView]) -> float | None:
+    """Factor within which the exposures of most photos lie at their tie points (`TiePointExposure.spread`); `views` are all photos."""
+    tie_points = TiePointExposure.from_model(posed.folder / "sparse", posed.cameras.to_world.inverse())
+    if tie_points is None:
+        return None
+    for camera, view in zip(posed.cameras.cameras, views, strict=True):
+        planes = view.rgb.permute(1, 2, 0).cpu().numpy()
+        tie_points.add(camera.downscaled_to(max(planes.shape)), decode_bytes(planes))
+    return tie_points.spread()

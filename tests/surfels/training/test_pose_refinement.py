@@ -11,6 +11,7 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
+from gsbake.capture.photos.exposure import MAX_SPREAD
 from gsbake.capture.photos.roles import held_out
 from gsbake.capture.photos.undistortion import image_plane
 from gsbake.capture.posed_photos import PosedPhotos
@@ -40,6 +41,7 @@ from gsbake.surfels.training.pose_refinement import (
     MIN_PSNR_GAIN,
     Aligner,
     AlignmentResult,
+    exposure_rule,
     needs_trial,
     pose_rule,
     trial_improves,
@@ -314,6 +316,21 @@ def test_exact_photos_are_not_corrected() -> None:
 def test_poses_are_tried_where_matched_features_contradict_them(rule: Rule, origin: str, error: float | None, expected: Rule) -> None:
     camera = Camera("a", 800, 600, 900.0, 900.0, 400.0, 300.0, np.eye(3), np.array([0.0, 0.0, 3.0]))
     found, reason = pose_rule(rule, CameraSet((camera,), poses=origin, epipolar_px=error), 400)  # trained at half the size
+    assert found == expected and bool(reason) == (found != rule)
+
+
+@pytest.mark.parametrize(
+    ("rule", "spread", "expected"),
+    [
+        ("auto", None, "always"),  # nothing tells that they differ
+        ("auto", MAX_SPREAD - 0.02, "always"),
+        ("auto", MAX_SPREAD + 0.02, "auto"),
+        ("never", None, "never"),
+        ("always", 2.0, "always"),
+    ],
+)
+def test_exposures_are_tried_where_tie_points_differ(rule: Rule, spread: float | None, expected: Rule) -> None:
+    found, reason = exposure_rule(rule, spread)
     assert found == expected and bool(reason) == (found != rule)
 
 

@@ -12,12 +12,14 @@ import pytest
 import torch
 from scipy.spatial import cKDTree
 
+from gsbake.capture.photos.exposure import TiePointExposure
 from gsbake.capture.photos.roles import held_out
 from gsbake.capture.posed_photos import PosedPhotos
 from gsbake.checkpoint import load_checkpoint, save_checkpoint
 from gsbake.config.schema import Profile
 from gsbake.errors import BadInputError
 from gsbake.geometry.cameras import CameraSet
+from gsbake.imaging.srgb import decode_bytes, encode_bytes
 from gsbake.surfels.densification.refinement import prune_and_densify
 from gsbake.surfels.fields.samples import SamplesField
 from gsbake.surfels.initialisation import fibonacci_sphere, initialise_surfels, spacing
@@ -133,7 +135,24 @@ def test_poses_are_measured_where_matched_features_contradict_them(
     train_surfels(folder, tmp_path, TrainOptions(p.train, p.surfels, p.loss), monitor=recorder)
     choice, reason = recorder.decisions["skip.pose_refinement"]
     assert choice == "poses kept" and evidence in reason
-    assert "a trial needs" in recorder.decisions["skip.exposure_refinement"][1]  # exposures are measured either way
+    assert "too few tie points" in recorder.decisions["skip.exposure_refinement"][1]
+
+
+@pytest.mark.parametrize(("gain", "evidence"), [(1.0, "agree within 1.0"), (1.4, "a trial needs 1.5 px or 8 %")])
+def test_exposures_are_measured_where_photos_differ_at_tie_points(
+    posed: PosedPhotos, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, gain: float, evidence: str
+) -> None:
+    folder, p, recorder = tmp_path / "posed", profile(iterations=20), Recorder()
+    shutil.copytree(posed.folder, folder)
+    for i, path in enumerate(sorted((folder / "photos").iterdir())):
+        linear = decode_bytes(np.asarray(cv2.imread(str(path)), np.uint8)) * 0.5 * gain ** (i % 3 - 1)
+        cv2.imwrite(str(path), encode_bytes(linear))
+    points = 0.8 * fibonacci_sphere(1500)
+    visible = {c.name: np.flatnonzero(((c.centre - points) * points).sum(1) > 0.3) for c in posed.cameras.cameras}
+    monkeypatch.setattr(TiePointExposure, "from_model", lambda folder, to_frame: TiePointExposure(points, visible))
+    train_surfels(folder, tmp_path, TrainOptions(p.train, p.surfels, p.loss), monitor=recorder)
+    choice, reason = recorder.decisions["skip.exposure_refinement"]
+    assert choice == "constant exposure" and evidence in reason
 
 
 def test_refinement_raises_when_all_surfels_are_pruned(posed: PosedPhotos) -> None:
