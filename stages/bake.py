@@ -18,7 +18,7 @@ def run(ctx: Context) -> dict[str, Any]:
 
 STAGE = Stage(
     name="bake",
-    version=44,
+    version=45,
     title="Textures",
     run=run,
     summary="{charts} charts, {texels} texels, {fit_psnr:dB} on test photos",

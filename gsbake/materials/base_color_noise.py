@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from gsbake.imaging.srgb import decode, encode
 from gsbake.materials.bilateral import EdgeAwareFilter
-from gsbake.materials.linear_shading import BaseColourSolver, LinearShading, PhotoSamples, observed_weight
+from gsbake.materials.linear_shading import BaseColourSolver, PhotoSamples, observed_weight
 from gsbake.texturing.texels import Texels
 
 Floats = NDArray[np.float64]
@@ -59,7 +59,7 @@ def _noise(photos: Sequence[PhotoSamples], roughness: NDArray[np.float32]) -> tu
     second one, and where it is measured (n,)."""
     solved, measured = [], np.ones(len(roughness), bool)
     for half in (photos[::2], photos[1::2]):
-        shadings = [LinearShading.of(samples.shade, roughness, 1.0) for samples in half]
+        shadings = [samples.shade(roughness, 1.0) for samples in half]
         solved.append(encode(BaseColourSolver(half, len(roughness)).solve(shadings, robust=True)))
         measured &= observed_weight(half, len(roughness)) > MIN_WEIGHT
     return np.asarray(np.square(solved[0] - solved[1]) / 4, np.float64), measured

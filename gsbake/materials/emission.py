@@ -87,9 +87,8 @@ def _diffuse_radiance(photos: Sequence[PhotoSamples], roughness: NDArray[np.floa
     n = len(roughness)
     radiance, irradiance, total = np.zeros((n, 3)), np.zeros((n, 3)), np.zeros((n, 3))
     for photo in photos:
-        weight, specular = perceptual_weights(photo), photo.shade(0.0, roughness, 0.0)
-        lit = photo.shade(1.0, roughness, 0.0) - specular
-        for sums, value in ((radiance, weight * (photo.colour - specular)), (irradiance, weight * lit), (total, weight)):
+        weight, shading = perceptual_weights(photo), photo.shade(roughness, 0.0)
+        for sums, value in ((radiance, weight * (photo.colour - shading.offset)), (irradiance, weight * shading.slope), (total, weight)):
             for k in range(3):
                 sums[:, k] += np.bincount(photo.texel, value[:, k], n)
     count = np.maximum(total, 1e-12)

@@ -36,7 +36,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsbake.materials.intensity_prior import IntensityPrior
-from gsbake.materials.linear_shading import BaseColourSolver, LinearShading, PhotoSamples
+from gsbake.materials.linear_shading import BaseColourSolver, PhotoSamples
 
 Floats = NDArray[np.float64]
 
@@ -197,7 +197,7 @@ def _tinted(best: _Candidate, residual: Callable[[_Candidate], Floats]) -> _Cand
 
 def _residual(photos: Sequence[PhotoSamples], roughness: NDArray[np.float32]) -> Floats:
     """Block-averaged absolute residuals (3,) of sRGB values at the best base colours."""
-    shadings = [LinearShading.of(photo.shade, roughness, 0.0) for photo in photos]
+    shadings = [photo.shade(roughness, 0.0) for photo in photos]
     base = BaseColourSolver(photos, len(roughness)).solve(shadings, robust=True)
     total, pixels = np.zeros(3), 0.0
     for photo, shading in zip(photos, shadings, strict=True):

@@ -34,8 +34,21 @@ MIN_SLOPE_COLOUR = 0.02
 #: Rounds of the solution, and the error of an sRGB value (0..1) from which pixels weigh less in the robust one.
 ROUNDS, ROBUST_SCALE = 3, 0.02
 
-#: Shades pixels of one photo: (base colour 0 or 1, roughness (texels,), metallic 0 or 1) to linear colours (n, 3).
-Shader = Callable[[float, NDArray[np.float32], float], NDArray[np.float32]]
+
+@dataclass(frozen=True)
+class LinearShading:
+    """Shading of a photo's pixels as a linear function of base colour: shade = b · `slope` + `offset`, both (n, 3)."""
+
+    slope: NDArray[np.float32]
+    offset: NDArray[np.float32]
+
+    def srgb(self, base: NDArray[Any]) -> NDArray[np.float32]:
+        """sRGB colours (n, 3), clipped at white, of base colours `base` (n, 3)."""
+        return np.asarray(encode(np.clip(base * self.slope + self.offset, 0, 1)), np.float32)
+
+
+#: Shades pixels of one photo at a roughness (texels,) and metallic 0 or 1.
+Shader = Callable[[NDArray[np.float32], float], LinearShading]
 
 
 @dataclass(frozen=True)
@@ -72,24 +85,6 @@ def observed_weight(photos: Sequence[PhotoSamples], texels: int) -> Floats:
     for photo in photos:
         out += np.bincount(photo.texel, photo.weight, texels)
     return out
-
-
-@dataclass(frozen=True)
-class LinearShading:
-    """Shading of a photo's pixels as a linear function of base colour: shade = b · `slope` + `offset`, both (n, 3)."""
-
-    slope: NDArray[np.float32]
-    offset: NDArray[np.float32]
-
-    @classmethod
-    def of(cls, shade: Shader, roughness: NDArray[np.float32], metallic: float) -> LinearShading:
-        """What `shade` gives at `roughness` (texels,) and `metallic` 0 or 1."""
-        offset = shade(0.0, roughness, metallic)
-        return cls(shade(1.0, roughness, metallic) - offset, offset)
-
-    def srgb(self, base: NDArray[Any]) -> NDArray[np.float32]:
-        """sRGB colours (n, 3), clipped at white, of base colours `base` (n, 3)."""
-        return np.asarray(encode(np.clip(base * self.slope + self.offset, 0, 1)), np.float32)
 
 
 class BaseColourSolver:

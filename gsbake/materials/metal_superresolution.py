@@ -108,7 +108,7 @@ def superresolve_metals(
         rows, samples = fit.samples_of(pixels, region)
         pixel = pixels.pixel[rows]
         row, column = np.divmod(pixel, camera.width)
-        shading = LinearShading.of(samples.shade, roughness, 1.0)
+        shading = samples.shade(roughness, 1.0)
         metal_pixels.append(MetalPixels(column, row, *reader.subpixel_texels(camera, pixel), samples, shading))
     return superresolved(values, surface.texels, coarse.up(region[:, None].astype(np.float32))[:, 0] > 0.5, metal_pixels)
 

@@ -73,7 +73,7 @@ class ShadingModel:
     @classmethod
     def of(cls, samples: PhotoSamples, roughness: NDArray[np.float32], metallic: float) -> ShadingModel:
         """The model of the `samples` at `roughness` (texels,) and `metallic` 0 or 1."""
-        shading, *tilted = (LinearShading.of(shade, roughness, metallic) for shade in (samples.shade, *samples.tilted))
+        shading, *tilted = (shade(roughness, metallic) for shade in (samples.shade, *samples.tilted))
         return cls(shading, tuple(tilted))
 
     def negative_log_likelihood(self, samples: PhotoSamples, base: Floats) -> Floats:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from gsbake.imaging.srgb import decode
 from gsbake.materials import fit_kernel
-from gsbake.materials.linear_shading import PhotoSamples, Shader
+from gsbake.materials.linear_shading import LinearShading, PhotoSamples, Shader
 from gsbake.materials.metallic import NORMAL_ERROR
 from gsbake.materials.pixels import Pixels
 from gsbake.shading import brdf
@@ -167,10 +167,9 @@ class PhotoBatch:
                 last[:] = [(roughness, out)]
             return last[0][1]
 
-        def shaded(base: float, roughness: NDArray[np.float32], metallic: float) -> Floats:
+        def shaded(roughness: NDArray[np.float32], metallic: float) -> LinearShading:
             diffuse, specular, scaled, edge = parts(roughness)
-            slope, offset = (scaled, edge) if metallic else (diffuse, specular)
-            return (np.float32(base) * slope if base else 0) + offset + emission
+            return LinearShading(scaled, edge + emission) if metallic else LinearShading(diffuse, specular + emission)
 
         return shaded
 

@@ -155,7 +155,7 @@ class Visibility:
         indirect = np.zeros_like(reflectance)
         for _ in range(BOUNCES):
             indirect = self.hits @ (reflectance * (irradiance + indirect))
-        return np.stack([self._filter(indirect[:, c]) for c in range(3)], 1)
+        return self._filter(indirect)
 
     def _cell_radiance(self, radiance: NDArray[Any]) -> Floats:
         """Radiance (ROTATIONS·count, 3) of each direction's cell."""
@@ -168,5 +168,5 @@ class Visibility:
         return out
 
     def _filter(self, value: Floats) -> Floats:
-        """`value` (n,) averaged over neighbouring texels of the surface."""
+        """`value` (n,) or (n, c) averaged over neighbouring texels of the surface."""
         return smooth_over_surface(self.texels, value, self.position, self.normal, self.radius)

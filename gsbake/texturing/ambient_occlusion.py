@@ -75,26 +75,27 @@ def _directions(normal: Floats, k: int, rays: int, out: Floats) -> None:
 
 
 def smooth_over_surface(texels: Texels, value: Floats, position: NDArray[Any], normal: NDArray[Any], radius: float) -> Floats:
-    """`value` (n,) averaged over neighbouring texels within `radius` (mesh units) with similar normals."""
-    values = texels.image(value, np.nan)[..., 0]
+    """`value` (n,) or (n, c), not negative, averaged over neighbouring texels within `radius` (mesh units) with similar normals."""
+    values = texels.image(value, np.nan)
     out = _filter(values, texels.image(position), texels.image(normal), np.float32(radius))
-    return np.asarray(out.ravel()[texels.index], np.float32)
+    return np.asarray(out.reshape(-1, out.shape[2])[texels.index].reshape(value.shape), np.float32)
 
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")
 def _filter(value: Floats, position: Floats, normal: Floats, radius: np.float32) -> Floats:
-    """Mean of `value` (s, s; NaN where empty) over neighbouring texels, weighted by distance and similarity of normals."""
-    size = value.shape[0]
+    """Mean of `value` (s, s, c; NaN where empty) over neighbouring texels, weighted by distance and similarity of normals."""
+    size, channels = value.shape[0], value.shape[2]
     out = value.copy()
     for j in numba.prange(size):
+        total = np.empty(channels)
         for i in range(size):
-            if not value[j, i] >= 0:
+            if not value[j, i, 0] >= 0:
                 continue
-            total: Any = 0.0
+            total[:] = 0.0
             weight: Any = 0.0
             for y in range(max(0, j - FILTER_RADIUS), min(size, j + FILTER_RADIUS + 1)):
                 for x in range(max(0, i - FILTER_RADIUS), min(size, i + FILTER_RADIUS + 1)):
-                    if not value[y, x] >= 0:
+                    if not value[y, x, 0] >= 0:
                         continue
                     distance2, cosine = 0.0, 0.0
                     for c in range(3):
@@ -103,8 +104,10 @@ def _filter(value: Floats, position: Floats, normal: Floats, radius: np.float32)
                     if distance2 > radius * radius or cosine < 0.8:
                         continue
                     w = (cosine - 0.8) * (1.0001 - distance2 / (radius * radius))
-                    total += w * value[y, x]
+                    for c in range(channels):
+                        total[c] += w * value[y, x, c]
                     weight += w
             if weight > 0:
-                out[j, i] = total / weight
+                for c in range(channels):
+                    out[j, i, c] = total[c] / weight
     return out

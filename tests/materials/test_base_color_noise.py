@@ -13,6 +13,7 @@ from gsbake.materials.adjacency import neighbours
 from gsbake.materials.base_color_noise import without_noise
 from gsbake.materials.linear_shading import PhotoSamples
 from gsbake.texturing.texels import Texels, rasterise
+from tests.support.linear import linear
 
 SIZE, PHOTOS = 64, 12
 
@@ -45,7 +46,7 @@ class Plate:
         def shade(base: float, roughness: NDArray[np.float32], metallic: float) -> NDArray[np.float32]:
             return np.full((n, 3), base, np.float32)
 
-        return PhotoSamples(np.arange(n), np.float32(colour), np.ones(n, np.float32), np.zeros(n, np.int32), shade)
+        return PhotoSamples(np.arange(n), np.float32(colour), np.ones(n, np.float32), np.zeros(n, np.int32), linear(shade))
 
     def error(self, base: NDArray[np.floating]) -> float:
         """Root mean square of sRGB values."""

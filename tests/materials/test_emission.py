@@ -11,6 +11,7 @@ from gsbake.materials.emission import BOUNDARY_STEPS, Emission, find_emission
 from gsbake.materials.linear_shading import PhotoSamples
 from gsbake.shading.environment import EnvironmentLight
 from gsbake.shading.split_sum import shade
+from tests.support.linear import linear
 
 SIDE, PHOTOS, ROUGH = 32, 8, 0.3
 ROWS, COLUMNS = (x.ravel() for x in np.mgrid[:SIDE, :SIDE])
@@ -51,7 +52,9 @@ def detected(base: NDArray[np.float32], emission: NDArray[np.float32], curve: fl
 
         colour = shaded(base, own, 0.0, normal) + emission + rng.normal(scale=0.005, size=base.shape).astype(np.float32)
         clipped = np.clip(colour, 0, 1).astype(np.float32)
-        photos.append(PhotoSamples(np.arange(len(base)), clipped, np.ones(len(base), np.float32), np.zeros(len(base), np.int32), trial))
+        photos.append(
+            PhotoSamples(np.arange(len(base)), clipped, np.ones(len(base), np.float32), np.zeros(len(base), np.int32), linear(trial))
+        )
     return find_emission(photos, own, pairs(), PLACE)
 
 

@@ -11,7 +11,6 @@ from numba import set_num_threads
 
 from gsbake.materials import fit_kernel
 from gsbake.materials.fit_reference import Batch, photo_loss, prior_loss
-from gsbake.materials.linear_shading import LinearShading
 from gsbake.materials.photo_batch import FitStep, KernelTables, PhotoBatch, TexelInputs
 from gsbake.materials.pixels import Pixels
 from gsbake.shading.environment import EnvironmentLight
@@ -112,7 +111,7 @@ def test_linear_shading_is_the_shading_at_both_ends() -> None:
     torch_batch = Batch.of(replace(case.pixels, bilinear=batch.bilinear), torch.as_tensor(case.normal))
     rough = np.ascontiguousarray(case.values[:, 3])
     for metallic in (0.0, 1.0):
-        shading = LinearShading.of(samples.shade, rough, metallic)
+        shading = samples.shade(rough, metallic)
         values = case.values[:, :5].copy()
         values[:, 4] = metallic
         inputs = torch.as_tensor(values), torch.as_tensor(case.values[:, 5:])

@@ -23,6 +23,7 @@ from gsbake.materials.linear_shading import PhotoSamples
 from gsbake.shading.cubemap import solid_angles
 from gsbake.shading.environment import EnvironmentLight
 from gsbake.shading.split_sum import shade
+from tests.support.linear import linear
 from tests.support.monte_carlo import render
 
 Doubles = NDArray[np.float64]
@@ -90,7 +91,9 @@ class Plastic:
                 # Blocks of pixels show adjacent texels, here those with similar normals.
                 order = np.argsort(np.argsort(self.normal[visible] @ np.array([0.3, 0.5, 0.8])))
                 block = order if self.single else order // 25
-                found.append(PhotoSamples(visible, np.clip(colour, 0, 1), np.ones(len(visible), np.float32), block.astype(np.int32), trial))
+                found.append(
+                    PhotoSamples(visible, np.clip(colour, 0, 1), np.ones(len(visible), np.float32), block.astype(np.int32), linear(trial))
+                )
             return found
 
         return under
@@ -192,7 +195,7 @@ def test_second_search_finds_a_clearly_deeper_minimum(depth: float, there: bool)
             return decode(np.full((1, 3), 0.3 + error(steps, roughness_shift) + 0.01 * abs(contrast - 1), np.float32))
 
         colour = decode(np.full((1, 3), 0.3, np.float32))
-        return [PhotoSamples(np.zeros(1, np.int64), colour, np.ones(1, np.float32), np.zeros(1, np.int32), shown)]
+        return [PhotoSamples(np.zeros(1, np.int64), colour, np.ones(1, np.float32), np.zeros(1, np.int32), linear(shown))]
 
     found = search_light(under, np.full(1, 0.5, np.float32), tint=False)
     assert (found.roughness_shift > 1.5) == there

@@ -26,11 +26,8 @@ def photo(slope: list[float], offset: list[float], texel: list[int] | None = Non
     colour = np.clip(TRUE * shading.slope + shading.offset, 0, 1).astype(np.float32)
     n = len(slope)
 
-    def shade(value: float, rough: NDArray[np.float32], metal: float) -> NDArray[np.float32]:
-        return value * shading.slope + shading.offset
-
     where = np.zeros(n, np.int64) if texel is None else np.array(texel)
-    return PhotoSamples(where, colour, np.ones(n, np.float32), np.zeros(n, np.int32), shade), shading
+    return PhotoSamples(where, colour, np.ones(n, np.float32), np.zeros(n, np.int32), lambda roughness, metallic: shading), shading
 
 
 def solve(*photos: tuple[PhotoSamples, LinearShading], texels: int = 1, lowest: float = 0.0, robust: bool = False) -> NDArray[np.float64]:

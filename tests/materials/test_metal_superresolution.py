@@ -57,7 +57,7 @@ def photos(base: NDArray[np.float32], count: int = 30, noise: float = 0.0) -> li
     return out
 
 
-def never(base: float, roughness: NDArray[np.float32], metallic: float) -> NDArray[np.float32]:
+def never(roughness: NDArray[np.float32], metallic: float) -> LinearShading:
     raise AssertionError("shading is known")
 
 

@@ -9,10 +9,11 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from gsbake.materials.linear_shading import PhotoSamples
+from gsbake.materials.linear_shading import LinearShading, PhotoSamples, Shader
 from gsbake.materials.metallic import MIN_METAL_ALBEDO, MIN_PHOTOS, find_metals, majority_vote
 from gsbake.shading.environment import EnvironmentLight
 from gsbake.shading.split_sum import shade
+from tests.support.linear import linear
 from tests.support.monte_carlo import render
 
 TEXELS, PHOTOS = 60, 24
@@ -56,7 +57,7 @@ class Wall:
                 return self.colours(towards, np.full((TEXELS, 3), value, np.float32), rough, metal)
 
             colour = self.colours(towards, base, np.full(TEXELS, roughness, np.float32), metallic)
-            found.append(PhotoSamples(np.arange(TEXELS), colour, np.ones(TEXELS, np.float32), np.zeros(TEXELS, np.int32), shaded))
+            found.append(PhotoSamples(np.arange(TEXELS), colour, np.ones(TEXELS, np.float32), np.zeros(TEXELS, np.int32), linear(shaded)))
         return found
 
     def reference(self, base: NDArray[np.float32], roughness: float, metallic: float) -> list[PhotoSamples]:
@@ -164,11 +165,21 @@ def test_majority_vote_removes_isolated_texels() -> None:
     np.testing.assert_array_equal(np.flatnonzero(found), [*range(20, 35), *range(36, 40)])
 
 
+def brightened(shade: Shader, exposure: float) -> Shader:
+    """The shading under a brighter light."""
+
+    def shaded(roughness: NDArray[np.float32], metallic: float) -> LinearShading:
+        shading = shade(roughness, metallic)
+        return LinearShading(exposure * shading.slope, exposure * shading.offset)
+
+    return shaded
+
+
 def test_clipped_pixels_do_not_hide_a_metal(wall: Wall) -> None:
     gold = np.tile(np.array([1.0, 0.77, 0.34], np.float32), (TEXELS, 1))
 
     def four_times(e: PhotoSamples) -> PhotoSamples:
-        return replace(e, colour=np.minimum(4 * e.colour, 1), shade=lambda base, rough, metal: 4 * e.shade(base, rough, metal))
+        return replace(e, colour=np.minimum(4 * e.colour, 1), shade=brightened(e.shade, 4))
 
     photos = [four_times(e) for e in wall.photos(gold, 0.2, 1.0)]
     assert np.mean([e.colour >= 1 for e in photos]) > 0.3
@@ -184,7 +195,7 @@ def test_overexposed_white_is_not_metal(wall: Wall, exposure: float) -> None:
 
     def exposed(e: PhotoSamples) -> PhotoSamples:
         colour = np.minimum(exposure * e.colour, 1)
-        return replace(e, colour=colour, shade=lambda base, rough, metal: exposure * e.shade(base, rough, metal))
+        return replace(e, colour=colour, shade=brightened(e.shade, exposure))
 
     photos = [exposed(e) for e in wall.photos(white, 0.2, 0.0)]
     clipped = np.mean([e.colour >= 1 for e in photos])

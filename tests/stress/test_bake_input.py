@@ -26,6 +26,7 @@ from gsbake.shading.cubemap import solid_angles
 from gsbake.shading.environment import EnvironmentLight
 from tests.stress.captures import CAMERAS, MASKS, PHOTOS, masks, photos, write
 from tests.stress.meshes import MESHES
+from tests.support.linear import linear
 from tests.support.recorder import Recorder
 
 SIZE = 128
@@ -193,7 +194,11 @@ def test_light_search(colour: float, count: int) -> None:
             return np.full((count, 3), shading * (value + 0.04), np.float32)
 
         def samples(intensity: np.ndarray, contrast: float, shade: Any = shade) -> Sequence[PhotoSamples]:
-            return [PhotoSamples(texel, np.full((count, 3), colour, np.float32), np.ones(count, np.float32), texel.astype(np.int32), shade)]
+            return [
+                PhotoSamples(
+                    texel, np.full((count, 3), colour, np.float32), np.ones(count, np.float32), texel.astype(np.int32), linear(shade)
+                )
+            ]
 
         found = search_light(samples, np.full(20, 0.3, np.float32))
         assert np.isfinite(found.intensity).all() and np.isfinite([found.contrast, found.roughness_shift, found.improvement]).all()

@@ -39,3 +39,14 @@ def test_filter_does_not_cross_depth_edges() -> None:
     out = smooth_over_surface(texels, value, position, np.tile([0, 0, 1.0], (len(texels), 1)), radius=3.0)
     assert abs(out[column == 15].mean() - 0.2) < 0.02 and abs(out[column == 16].mean() - 0.8) < 0.02
     assert out[column < 16].std() < 0.03
+
+
+def test_filter_of_channels_is_that_of_each() -> None:
+    texels = rasterise(np.array([[0.1, 0.1], [0.9, 0.1], [0.5, 0.9]]), np.array([[0, 2, 1]]), 24)
+    rng, n = np.random.default_rng(1), len(texels)
+    position = np.stack([texels.index % 24, texels.index // 24, rng.normal(0, 0.5, n)], 1)
+    value, normal = rng.random((n, 3)).astype(np.float32), np.tile([0, 0, 1.0], (n, 1))
+    together = smooth_over_surface(texels, value, position, normal, 2.5)
+    alone = [smooth_over_surface(texels, channel, position, normal, 2.5) for channel in value.T]
+    np.testing.assert_array_equal(together, np.stack(alone, 1))
+    assert np.abs(together - value).max() > 0.1
