@@ -1,4 +1,4 @@
-"""pycolmap breaks zlib when it is loaded first; these tests guard its only import."""
+"""pycolmap breaks zlib when it is loaded first, and takes over SIGTERM; these tests guard its only import."""
 
 from __future__ import annotations
 
@@ -44,3 +44,18 @@ def test_nothing_else_imports_pycolmap() -> None:
             if any(name.split(".")[0] == "pycolmap" for name in names):
                 importers.append(path.name)
     assert not importers
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="processes are not asked to stop by signals there")
+@pytest.mark.parametrize(("handler", "code"), [("signal.signal(signal.SIGTERM, lambda *_: sys.exit(75))", 75), ("pass", -15)])
+def test_sigterm_is_left_to_the_stage(handler: str, code: int) -> None:
+    """A new process sets a handler or none, imports pycolmap, and sends itself the signal."""
+    program = f"""
+import os, signal, sys
+sys.path.insert(0, {str(ROOT)!r})
+{handler}
+from gsbake.capture.sfm.colmap import pycolmap
+os.kill(os.getpid(), signal.SIGTERM)
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == code and "stack trace" not in done.stderr
