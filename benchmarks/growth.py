@@ -24,8 +24,8 @@ from pathlib import Path
 from benchmarks.charts import COLOURS, Panel, Series, write
 from benchmarks.step import profile
 from gsbake.api import RunOptions, open_session
+from gsbake.kernel_threads import configure
 from gsbake.pipeline.machine import default_threads
-from gsbake.surfels.raster.threads import configure
 from gsbake.synth.capture import write_capture
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -22,6 +22,7 @@ import torch
 
 from benchmarks.raster import sphere
 from gsbake.config.schema import Profile
+from gsbake.kernel_threads import configure, thread_count
 from gsbake.shading import light_tables as tables
 from gsbake.shading import split_sum_kernel as light_kernels
 from gsbake.shading.environment import EnvironmentLight
@@ -36,7 +37,6 @@ from gsbake.surfels.losses import terms as losses
 from gsbake.surfels.model import Surfels, create
 from gsbake.surfels.raster import projection
 from gsbake.surfels.raster import rasterise as raster
-from gsbake.surfels.raster.threads import configure, thread_count
 from gsbake.surfels.training import adam
 from gsbake.surfels.training.trainer import Plan, Trainer
 from gsbake.surfels.training.views import TrainView

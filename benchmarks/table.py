@@ -26,9 +26,9 @@ import numpy as np
 
 from benchmarks.raster import sphere
 from benchmarks.step import profile
+from gsbake.kernel_threads import configure, thread_count
 from gsbake.surfels.raster.rasterise import render
 from gsbake.surfels.raster.reference import render_reference
-from gsbake.surfels.raster.threads import configure, thread_count
 
 RESULTS = Path(__file__).parent / "results" / "raster.csv"
 COLUMNS = ("surfels", "size", "channels", "pass", "ms", "x_copy", "x_twin", "threads")

@@ -17,10 +17,10 @@ from gsbake.errors import BadInputError
 from gsbake.geometry.ply import read_mesh
 from gsbake.geometry.raycast import RayCaster
 from gsbake.imaging.exr import write_exr
+from gsbake.kernel_threads import configure
 from gsbake.materials.delighting import find_irradiance, remove_shading
 from gsbake.materials.fitting import RAY_OFFSET, SMOOTHING_RADIUS, FitSettings, fit_materials
 from gsbake.monitor import SILENT, Monitor, Rule, decide_skip
-from gsbake.surfels.raster.threads import configure
 from gsbake.texturing.atlas import make_atlas
 from gsbake.texturing.inpainting import fill_empty_texels, inpaint_surface
 from gsbake.texturing.normal_map import DenseSamples, normal_map, sample_dense_mesh, vertex_normals

@@ -13,8 +13,8 @@ import torch
 from numba import njit
 from torch import Tensor
 
+from gsbake.kernel_threads import run_chunks
 from gsbake.surfels.raster.blocks import JIT
-from gsbake.surfels.raster.threads import run_chunks
 
 SH0 = 0.28209479177387814  # Y_00
 SH1 = 0.4886025119029199  # Y_1m

@@ -10,11 +10,11 @@ import psutil
 import pytest
 import torch
 
+from gsbake import kernel_threads
 from gsbake.config.schema import Profile
 from gsbake.shading.environment import EnvironmentLight
 from gsbake.surfels.initialisation import fibonacci_sphere, spacing
 from gsbake.surfels.model import create
-from gsbake.surfels.raster import threads
 from gsbake.surfels.raster.projection import Pinhole
 from gsbake.surfels.training.finite import first_non_finite
 from gsbake.surfels.training.trainer import Plan, Trainer
@@ -29,10 +29,10 @@ MOST_SURFELS = 400
 
 @pytest.fixture
 def one_thread_after() -> Iterator[None]:
-    before, configured = torch.get_num_threads(), threads._configured
+    before, configured = torch.get_num_threads(), kernel_threads._configured
     yield
     torch.set_num_threads(before)
-    threads._configured = configured
+    kernel_threads._configured = configured
 
 
 def pose(eye: np.ndarray) -> tuple[torch.Tensor, torch.Tensor]:
@@ -119,7 +119,7 @@ def test_long_soak(shading: str) -> None:
 
 
 def final(count: int, shading: str, steps: int) -> dict[str, torch.Tensor]:
-    threads.configure(count)
+    kernel_threads.configure(count)
     t = trainer("random photos", steps, shading)
     while t.done < t.end:
         t.step()

@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.linalg import cg
 
+from gsbake.kernel_threads import run_chunks
 from gsbake.meshing.cleanup import Faces, Vertices
 from gsbake.meshing.depth_views import DepthView, Floats
-from gsbake.surfels.raster.threads import run_chunks
 
 
 class NormalAccumulator:

@@ -20,13 +20,13 @@ from numpy.typing import NDArray
 
 from gsbake.geometry.cameras import Camera
 from gsbake.geometry.raycast import RayCaster
+from gsbake.kernel_threads import run_chunks
 from gsbake.meshing.cleanup import Faces, Vertices
 from gsbake.meshing.refinement.normals import unique_edges, vertex_normals
 from gsbake.meshing.refinement.photometric_kernel import measure_displacements
 from gsbake.mvs.ncc import RADIUS, SAMPLES, SamplingPattern
 from gsbake.mvs.pyramids import MatchingViews, Photo
 from gsbake.mvs.view_selection import select_views
-from gsbake.surfels.raster.threads import run_chunks
 
 Floats = NDArray[np.float32]
 Doubles = NDArray[np.float64]

@@ -20,8 +20,8 @@ from numba import njit
 from numpy.typing import NDArray
 from torch import Tensor
 
+from gsbake.kernel_threads import run_chunks
 from gsbake.surfels.raster.blocks import JIT
-from gsbake.surfels.raster.threads import run_chunks
 
 #: How a corner finds its row.
 DENSE, HASHED, CORNERS, BLOCKS = range(4)

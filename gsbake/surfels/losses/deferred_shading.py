@@ -12,13 +12,13 @@ import numpy as np
 from numba import njit
 
 from gsbake.imaging import srgb
+from gsbake.kernel_threads import run_chunks
 from gsbake.shading import brdf
 from gsbake.shading import split_sum_kernel as kernels
 from gsbake.shading.light_tables import LightTables
 from gsbake.surfels.raster.blocks import JIT
 from gsbake.surfels.raster.gbuffer import SHADING_ALPHA_MIN
 from gsbake.surfels.raster.lanes import EXP2_COEFFICIENTS, LANES, broadcast, exp2, load, log, select, store
-from gsbake.surfels.raster.threads import run_chunks
 from gsbake.surfels.training.views import TrainView
 
 #: Features: base colour, roughness, metallic, normal; then the planes of `gsbake.surfels.raster.kernel`, alpha the fifth of them.

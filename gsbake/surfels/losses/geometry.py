@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 from numba import njit
 
+from gsbake.kernel_threads import run_chunks
 from gsbake.surfels.losses.photometric import BYTE
 from gsbake.surfels.raster.blocks import JIT
 from gsbake.surfels.raster.lanes import LANES, broadcast, lane_column, lane_row, load, log, select, sqrt, store, sum_lanes
-from gsbake.surfels.raster.threads import run_chunks
 
 #: Rows of one piece of work; one more on either side is computed for it.
 STRIP = 64

@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 from numba import njit
 
+from gsbake.kernel_threads import run_chunks
 from gsbake.surfels.raster.blocks import JIT
 from gsbake.surfels.raster.lanes import LANES, broadcast, load, select, store, sum_lanes
-from gsbake.surfels.raster.threads import run_chunks
 
 TAPS = 11
 HALF = TAPS // 2

@@ -9,12 +9,12 @@ import torch
 from numba import njit
 from torch import Tensor
 
+from gsbake.kernel_threads import run_chunks
 from gsbake.surfels.losses import terms as losses
 from gsbake.surfels.losses.geometry import ALPHA_SURFACE
 from gsbake.surfels.losses.terms import PROJECTION_ERROR_MAX
 from gsbake.surfels.raster.blocks import JIT
 from gsbake.surfels.raster.projection import Pinhole
-from gsbake.surfels.raster.threads import run_chunks
 
 #: Surfels of one sum; fixed, so that the total does not depend on the number of threads.
 CHUNK = 4096

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from numba import njit
 
+from gsbake.kernel_threads import thread_count
 from gsbake.surfels.raster.blocks import JIT, TILE
 from gsbake.surfels.raster.lanes import prefetch
-from gsbake.surfels.raster.threads import thread_count
 
 #: log2 of the tile size: a shift divides box coordinates, which are not negative, by `TILE`.
 SHIFT = TILE.bit_length() - 1

@@ -19,9 +19,9 @@ import torch
 from numba import njit
 from torch import Tensor
 
+from gsbake.kernel_threads import run_chunks
 from gsbake.surfels.raster.blocks import FASTMATH
 from gsbake.surfels.raster.kernel import ALPHA_MIN
-from gsbake.surfels.raster.threads import run_chunks
 
 #: |cos| between ray and plane below which a surfel counts as edge-on and is skipped.
 EDGE_ON_COS = 1e-3

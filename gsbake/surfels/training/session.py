@@ -17,11 +17,11 @@ from gsbake.capture.posed_photos import PosedPhotos
 from gsbake.checkpoint import DamagedCheckpointError, load_checkpoint, save_checkpoint
 from gsbake.config.schema import Coupling, DistanceField, Loss, Train
 from gsbake.config.schema import Surfels as SurfelSettings
+from gsbake.kernel_threads import configure
 from gsbake.monitor import SILENT, Monitor, Rule, decide_skip
 from gsbake.surfels.fields.field import Field
 from gsbake.surfels.fields.registry import save_field
 from gsbake.surfels.model import Surfels
-from gsbake.surfels.raster.threads import configure
 from gsbake.surfels.training.corrections import Correction
 from gsbake.surfels.training.pose_refinement import Aligner, exposure_rule, pose_rule
 from gsbake.surfels.training.prior_maps import add_priors

@@ -8,13 +8,13 @@ import torch
 from skimage.metrics import structural_similarity
 from torch import Tensor
 
+from gsbake import kernel_threads
 from gsbake.shading.environment import EnvironmentLight
 from gsbake.shading.light_tables import LightTables
 from gsbake.surfels.losses import photometric as similarity
 from gsbake.surfels.losses import terms as losses
 from gsbake.surfels.losses.image import image_losses
 from gsbake.surfels.losses.terms import ImageWeights
-from gsbake.surfels.raster import threads
 from gsbake.surfels.raster.gbuffer import rendered_image
 from gsbake.surfels.raster.projection import Pinhole
 from gsbake.surfels.training.views import TrainView
@@ -178,7 +178,7 @@ def test_the_number_of_threads_does_not_matter(monkeypatch: pytest.MonkeyPatch) 
     tables = EnvironmentLight(8).prefilter().detach()
     found = []
     for count in (1, 3):
-        monkeypatch.setattr(threads, "_configured", count)
+        monkeypatch.setattr(kernel_threads, "_configured", count)
         leaf = planes.clone().requires_grad_()
         total, _ = image_losses(leaf, tables, view, True, back, ALL)
         total.backward()
