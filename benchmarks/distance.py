@@ -37,11 +37,11 @@ from gsbake.capture.posed_photos import PosedPhotos
 from gsbake.checkpoint import load_checkpoint
 from gsbake.config.schema import Profile
 from gsbake.errors import InterruptedRun, UsageError
-from gsbake.meshing.resolution import choose_resolution, pixel_footprint, surfel_spacing
+from gsbake.meshing.resolution import choose_resolution, pixel_footprint
 from gsbake.monitor import SilentMonitor
-from gsbake.surfels.densification.policy import typical_spacing
 from gsbake.surfels.model import Surfels
 from gsbake.surfels.raster.render import SurfelRenderer
+from gsbake.surfels.spacing import surfel_spacing, typical_spacing
 from gsbake.surfels.training.run import train_surfels
 from gsbake.surfels.training.session import TrainOptions
 from gsbake.surfels.transfer import transfer_by_name

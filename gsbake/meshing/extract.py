@@ -23,12 +23,11 @@ from gsbake.meshing.decimation import decimate_to_error_bound
 from gsbake.meshing.decimator_choice import resolve_decimator
 from gsbake.meshing.depth_cache import DepthViewCache
 from gsbake.meshing.depth_views import DepthView, depth_noise
-from gsbake.meshing.oriented_points import BALL_RADIUS, OrientedPoints, oriented_points
 from gsbake.meshing.refinement.normal_filter import denoise
 from gsbake.meshing.refinement.normals import NormalAccumulator, integrate_normals
 from gsbake.meshing.refinement.silhouette import refine_silhouettes
 from gsbake.meshing.repair import close_holes, repair
-from gsbake.meshing.resolution import Resolution, choose_resolution, pixel_footprint, surfel_spacing
+from gsbake.meshing.resolution import Resolution, choose_resolution, pixel_footprint
 from gsbake.meshing.stereo_depth import merge_stereo_depth
 from gsbake.meshing.support_plane import SupportPlane, find_support_plane, remove_background_components
 from gsbake.meshing.tsdf import SparseTsdf
@@ -38,7 +37,9 @@ from gsbake.surfels.fields.continuous import ContinuousField
 from gsbake.surfels.fields.field import Field
 from gsbake.surfels.fields.registry import load_field
 from gsbake.surfels.fields.samples import SamplesField
+from gsbake.surfels.oriented_points import BALL_RADIUS, OrientedPoints, oriented_points
 from gsbake.surfels.raster.render import SurfelRenderer
+from gsbake.surfels.spacing import surfel_spacing
 
 Doubles = NDArray[np.float64]
 Faces = NDArray[np.int32]

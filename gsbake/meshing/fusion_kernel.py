@@ -15,7 +15,7 @@ from typing import Any
 import numba as nb
 import numpy as np
 
-from gsbake.meshing.sparse_lattice import EDGE
+from gsbake.geometry.sparse_lattice import EDGE
 
 #: Bits of `observed`: the sample lies in front of or near a measured depth; the sample projects outside a mask.
 OBSERVED_BY_DEPTH, OBSERVED_BY_MASK = 1, 2

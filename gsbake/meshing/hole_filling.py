@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation
 
+from gsbake.geometry.sparse_lattice import EDGE, BlockLattice, Floats
 from gsbake.kernel_threads import run_chunks
-from gsbake.meshing.sparse_lattice import EDGE, BlockLattice, Floats
 
 #: Minimum slope (per sample) in conductivities; it keeps the transition a few samples wide.
 MIN_SLOPE = 0.01

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from skimage.measure import marching_cubes
 
-from gsbake.meshing.sparse_lattice import EDGE, BlockLattice, Floats, gather_samples
+from gsbake.geometry.sparse_lattice import EDGE, BlockLattice, Floats, gather_samples
 
 #: Samples along a super-block's edge, without the layer shared with the next one: 1 MB of field.
 SUPER_BLOCK = 8 * EDGE

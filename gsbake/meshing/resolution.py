@@ -10,7 +10,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from gsbake.geometry.cameras import Camera
 
@@ -30,19 +29,6 @@ class Resolution:
     cell: float
     cells: int
     reason: str
-
-
-def surfel_spacing(positions: NDArray[np.floating], limit: int = 20_000) -> float:
-    """Median spacing of neighbouring surfels on a surface.
-
-    n neighbours within radius r at spacing s (one per s²) give n s² = π r²; n = 4 gives s = r √(π/4).
-    """
-    points = np.asarray(positions, np.float64)
-    if len(points) < 6:
-        return float("inf")
-    sample = points[:: max(1, len(points) // limit)]
-    radius = cKDTree(points).query(sample, k=[5])[0][:, 0]  # the first neighbour is the point itself
-    return float(np.median(radius) * np.sqrt(np.pi / 4))
 
 
 def pixel_footprint(cameras: Sequence[Camera], centre: NDArray[np.float64]) -> float:

@@ -74,9 +74,9 @@ def marker_axis(markers: Sequence[Marker]) -> tuple[Array | None, str]:
 
 def _ground_axis(posed: PosedPhotos, surfels: Path) -> tuple[Array | None, str]:
     """The normal (3,) of the plane that the object stands on, in the world, and the evidence; None where there is none."""
-    from gsbake.meshing.oriented_points import oriented_points
     from gsbake.meshing.support_plane import find_support_plane
     from gsbake.surfels.model import Surfels
+    from gsbake.surfels.oriented_points import oriented_points
 
     if posed.has_masks:
         return None, "the photos have masks, so the ground was not reconstructed"

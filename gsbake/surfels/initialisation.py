@@ -16,8 +16,8 @@ from scipy.spatial import cKDTree
 
 from gsbake.capture.posed_photos import PosedPhotos
 from gsbake.geometry.vectors import unit
-from gsbake.surfels.densification.policy import typical_spacing
 from gsbake.surfels.model import Surfels, create
+from gsbake.surfels.spacing import typical_spacing
 
 Floats = NDArray[np.float64]
 #: Radius of the initial sphere (unit frame).

@@ -24,6 +24,9 @@ from gsbake.surfels.transfer import DEFAULT_TRANSFER, Transfer, transfer_by_name
 #: Start values of roughness (.27) and metallic (.05) before the sigmoid. A smooth start lets reflections teach the light at once; from the
 #: paper's .646 the light stays a blur and the surfaces stay rough (docs/decisions/0003-smooth-start.md).
 ROUGHNESS_INIT, METALLIC_INIT = -1.0, -3.0
+#: Larger scale of a surfel as a share of the distance to its neighbours: discs overlap without smearing. Training preserves it while
+#: surfels cover the surface.
+SCALE_TO_SPACING = 0.6
 FORMAT = "gsbake surfels 1"
 
 
@@ -159,7 +162,6 @@ def create(
         sh = torch.zeros(n, (sh_degree + 1) ** 2, 3)
         sh[:, 0] = (rgb - 0.5) / harmonics.SH0
         attributes = {"sh": sh}
-    # σ of .6 neighbour distances: discs overlap without smearing
-    log_scale = torch.from_numpy(np.log(0.6 * np.maximum(spacing, 1e-5)).astype(np.float32))[:, None].repeat(1, 2)
+    log_scale = torch.from_numpy(np.log(SCALE_TO_SPACING * np.maximum(spacing, 1e-5)).astype(np.float32))[:, None].repeat(1, 2)
     rotation, samples = quaternion_from_normal(normal), torch.full((n,), sdf)
     return Surfels(position, rotation, log_scale, samples, torch.tensor([gamma]), attributes, transfer_by_name(transfer))

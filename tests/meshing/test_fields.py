@@ -5,14 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from gsbake.geometry.sparse_lattice import EDGE, BlockLattice
 from gsbake.meshing import cleanup as clean
 from gsbake.meshing.depth_views import DepthView, depth_noise, distance_outside_mask
 from gsbake.meshing.hole_filling import minimise_area, sign_change_blocks, solve_laplace
-from gsbake.meshing.imls import imls_field
 from gsbake.meshing.marching_cubes import extract_isosurface
 from gsbake.meshing.refinement.normals import NormalAccumulator, integrate_normals, vertex_normals
-from gsbake.meshing.resolution import choose_resolution, pixel_footprint, surfel_spacing
-from gsbake.meshing.sparse_lattice import EDGE, BlockLattice
+from gsbake.meshing.resolution import choose_resolution, pixel_footprint
+from gsbake.surfels.fields.imls import imls_field
+from gsbake.surfels.spacing import surfel_spacing
 from tests.meshing.scenes import camera_at, cameras_around, gradient, sphere, torus, trace
 
 CELL = 1 / 40

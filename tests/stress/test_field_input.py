@@ -12,16 +12,17 @@ import trimesh
 
 from gsbake.config.schema import Mesh
 from gsbake.errors import GsbakeError
+from gsbake.geometry.sparse_lattice import BlockLattice
 from gsbake.meshing.depth_views import DepthView, depth_noise
 from gsbake.meshing.extract import MeshOptions, extract_mesh
 from gsbake.meshing.hole_filling import minimise_area, sign_change_blocks, solve_laplace
-from gsbake.meshing.imls import imls_field
 from gsbake.meshing.marching_cubes import extract_isosurface
-from gsbake.meshing.resolution import choose_resolution, pixel_footprint, surfel_spacing
-from gsbake.meshing.sparse_lattice import BlockLattice
+from gsbake.meshing.resolution import choose_resolution, pixel_footprint
 from gsbake.meshing.support_plane import find_support_plane
 from gsbake.meshing.tsdf import SparseTsdf
+from gsbake.surfels.fields.imls import imls_field
 from gsbake.surfels.model import Surfels, create
+from gsbake.surfels.spacing import surfel_spacing
 from tests.stress.captures import CAMERAS, SIZE, around, masks, photos, write
 from tests.support.recorder import Recorder
 

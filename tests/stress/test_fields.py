@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from gsbake.config.schema import Coupling, DistanceField, Loss, Profile, Train
-from gsbake.meshing.sparse_lattice import BlockLattice
+from gsbake.geometry.sparse_lattice import BlockLattice
 from gsbake.surfels.densification.seeding import place_anew, seed_gaps
 from gsbake.surfels.fields.continuous import ContinuousField
 from gsbake.surfels.fields.field import Field

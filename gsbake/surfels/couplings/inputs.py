@@ -11,10 +11,10 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from gsbake.surfels.couplings.ray_pixels import pixel_table
-from gsbake.surfels.densification.policy import typical_spacing
 from gsbake.surfels.fields.field import TrainingStep
 from gsbake.surfels.fields.ray_marching import March, Rays, make_rays, march, sample_depths, sphere_trace
 from gsbake.surfels.raster.kernel import AUX_PLANES
+from gsbake.surfels.spacing import typical_spacing
 from gsbake.surfels.training.views import TrainView
 
 if TYPE_CHECKING:

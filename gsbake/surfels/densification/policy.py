@@ -13,10 +13,8 @@ from dataclasses import dataclass
 from torch import Tensor
 
 from gsbake.surfels.model import Surfels
+from gsbake.surfels.spacing import typical_spacing
 
-#: Larger scale of a surfel as a share of the distance to its neighbours: the value of `surfels.model.create`, which training preserves
-#: while surfels cover the surface.
-SCALE_TO_SPACING = 0.6
 #: Distance from the surface, in spacings, beyond which surfels are pruned in training; refinement has a setting for it.
 MAX_DISTANCE_SPACINGS = 3.0
 
@@ -37,11 +35,6 @@ class PolicyInputs:
         """From the field's signed `distance` (n,) of the surfels, the spacing from their median scale."""
         spacing = typical_spacing(surfels)
         return PolicyInputs(distance.abs(), surfels.opacity() / surfels.peak_opacity, spacing, MAX_DISTANCE_SPACINGS * spacing)
-
-
-def typical_spacing(surfels: Surfels) -> float:
-    """Typical distance (unit frame) between neighbouring surfels, from their median scale; 1 without surfels."""
-    return float(surfels.scale.detach().max(1).values.median()) / SCALE_TO_SPACING if len(surfels) else 1.0
 
 
 #: Score (n,) from mean screen-space gradients (n,): the highest scores are densified, surfels with a score of 0 never.

@@ -15,7 +15,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from gsbake.meshing.sparse_lattice import BlockLattice
+from gsbake.geometry.sparse_lattice import BlockLattice
 from gsbake.surfels.couplings.combined import combined_losses
 from gsbake.surfels.fields.field import CHUNK, Field, TrainingStep
 from gsbake.surfels.fields.known import Known

@@ -16,7 +16,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from gsbake.meshing.sparse_lattice import BlockLattice
+from gsbake.geometry.sparse_lattice import BlockLattice
 from gsbake.surfels.model import Surfels
 from gsbake.surfels.raster.rasterise import Rendered
 from gsbake.surfels.training.views import TrainView

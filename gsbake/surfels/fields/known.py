@@ -13,7 +13,7 @@ from scipy.ndimage import label
 from scipy.spatial import cKDTree
 
 from gsbake.geometry.vectors import unit
-from gsbake.meshing.resolution import surfel_spacing
+from gsbake.surfels.spacing import surfel_spacing
 
 Floats = NDArray[np.float64]
 

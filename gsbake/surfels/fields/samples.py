@@ -2,7 +2,7 @@
 
 Each surfel, projected by its own sample (μ' = μ − s n), is an oriented point of the surface. Between surfels the field is the moving least
 squares of their planes, f(x) = Σ wᵢ nᵢ·(x − μ'ᵢ) / Σ wᵢ with Gaussian weights over the nearest ones (Kolluri, *Provably good moving least
-squares*, SODA 2005); it is a distance near the surface only. Extraction uses `gsbake.meshing.imls`, the same field with compact support.
+squares*, SODA 2005); it is a distance near the surface only. Meshes are extracted from `imls`, the same field with compact support.
 """
 
 from __future__ import annotations
@@ -15,14 +15,15 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from gsbake.geometry.sparse_lattice import BlockLattice
 from gsbake.imaging.distance import distance_to_zero
-from gsbake.meshing.imls import imls_field
-from gsbake.meshing.sparse_lattice import BlockLattice
-from gsbake.surfels.densification.policy import typical_spacing
 from gsbake.surfels.fields.field import Field, TrainingStep
+from gsbake.surfels.fields.imls import imls_field
 from gsbake.surfels.losses import terms as losses
 from gsbake.surfels.losses.projection import projection_loss
 from gsbake.surfels.model import Surfels
+from gsbake.surfels.oriented_points import oriented_points
+from gsbake.surfels.spacing import typical_spacing
 from gsbake.surfels.training.views import TrainView
 
 #: Nearest samples that are blended at a point.
@@ -152,8 +153,6 @@ class SamplesField(Field):
         return final * spacing, spacing * (final + (widest - final) * (1 - step.share))
 
     def mesh(self, lattice: BlockLattice, truncation: float) -> NDArray[np.float32]:
-        """Implicit moving least squares with compact support; see `gsbake.meshing.imls`."""
-        from gsbake.meshing.extract import oriented_points
-
+        """Implicit moving least squares with compact support; see `imls`."""
         samples = oriented_points(self.surfels)
         return imls_field(lattice, samples.points, samples.normals, truncation, samples.weights)

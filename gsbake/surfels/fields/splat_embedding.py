@@ -12,9 +12,9 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from gsbake.surfels.densification.policy import typical_spacing
 from gsbake.surfels.fields.heads import Network
 from gsbake.surfels.model import Surfels
+from gsbake.surfels.spacing import typical_spacing
 
 #: Surfels that are blended at a point, and numbers of an anchor: normal, opacity, log-scales.
 NEIGHBOURS, ATTRIBUTES = 4, 6

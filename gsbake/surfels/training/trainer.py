@@ -16,7 +16,7 @@ from torch import Tensor
 
 from gsbake.imaging.metrics import decibels
 from gsbake.surfels.densification.clone_split import Statistics, densify, prune, reset_opacity
-from gsbake.surfels.densification.policy import PolicyInputs, typical_spacing
+from gsbake.surfels.densification.policy import PolicyInputs
 from gsbake.surfels.densification.registry import DENSIFICATION, PRUNING
 from gsbake.surfels.densification.seeding import place_anew, seed_gaps
 from gsbake.surfels.fields.field import Field, TrainingStep
@@ -26,6 +26,7 @@ from gsbake.surfels.losses.terms import ImageWeights
 from gsbake.surfels.model import Surfels
 from gsbake.surfels.raster.gbuffer import rasterise, rendered_image
 from gsbake.surfels.raster.rasterise import Rendered
+from gsbake.surfels.spacing import typical_spacing
 from gsbake.surfels.training.adam import Adam
 from gsbake.surfels.training.early_stopping import has_plateaued
 from gsbake.surfels.training.finite import first_non_finite

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from gsbake.config.schema import Coupling, DistanceField, Loss, Train
-from gsbake.meshing.sparse_lattice import BlockLattice
+from gsbake.geometry.sparse_lattice import BlockLattice
 from gsbake.surfels.fields.continuous import ContinuousField
 from gsbake.surfels.fields.known import KnownDistance, SphereDistance
 from gsbake.surfels.fields.registry import FIELDS, load_field, make_field, save_field

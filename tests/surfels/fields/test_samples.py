@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from gsbake.config.schema import Loss, Train
-from gsbake.meshing.sparse_lattice import BlockLattice
+from gsbake.geometry.sparse_lattice import BlockLattice
 from gsbake.surfels.fields.samples import SamplesField
 from gsbake.surfels.initialisation import fibonacci_sphere, spacing
 from gsbake.surfels.model import Surfels, create

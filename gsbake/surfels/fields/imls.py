@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
-from gsbake.meshing.sparse_lattice import EDGE, BlockLattice, Floats
+from gsbake.geometry.sparse_lattice import EDGE, BlockLattice, Floats
 
 #: Support radius in units of the local spacing: about 25 samples contribute at each point.
 SUPPORT_FACTOR = 2.8
