@@ -24,8 +24,8 @@ from gsbake.surfels.model import Surfels, quaternion_from_normal
 from gsbake.surfels.raster.projection import Pinhole
 from gsbake.surfels.raster.rasterise import render
 from gsbake.surfels.training.trainer import Plan, Trainer
-from gsbake.surfels.training.views import TrainView
 from gsbake.surfels.transfer import transfer_by_name
+from gsbake.surfels.views import TrainView
 
 CHANNELS = 10
 CASES = [(surfels, size) for surfels in (100_000, 1_000_000) for size in (800, 1600)]

@@ -40,7 +40,7 @@ from gsbake.errors import InterruptedRun, UsageError
 from gsbake.meshing.resolution import choose_resolution, pixel_footprint
 from gsbake.monitor import SilentMonitor
 from gsbake.surfels.model import Surfels
-from gsbake.surfels.raster.render import SurfelRenderer
+from gsbake.surfels.renderer import SurfelRenderer
 from gsbake.surfels.spacing import surfel_spacing, typical_spacing
 from gsbake.surfels.training.run import train_surfels
 from gsbake.surfels.training.session import TrainOptions

@@ -40,7 +40,7 @@ from gsbake.config.load import shipped
 from gsbake.config.schema import Profile
 from gsbake.errors import BadInputError, UsageError
 from gsbake.imaging.metrics import decibels
-from gsbake.surfels.raster.render import SurfelRenderer
+from gsbake.surfels.renderer import SurfelRenderer
 
 RESULTS = ROOT / "benchmarks" / "results" / "fields.csv"
 #: Profiles of the family, `default` first.

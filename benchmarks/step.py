@@ -26,6 +26,7 @@ from gsbake.kernel_threads import configure, thread_count
 from gsbake.shading import light_tables as tables
 from gsbake.shading import split_sum_kernel as light_kernels
 from gsbake.shading.environment import EnvironmentLight
+from gsbake.surfels import adam
 from gsbake.surfels import spherical_harmonics as harmonics
 from gsbake.surfels.densification import clone_split as adapt
 from gsbake.surfels.losses import deferred_shading as deferred
@@ -37,9 +38,8 @@ from gsbake.surfels.losses import terms as losses
 from gsbake.surfels.model import Surfels, create
 from gsbake.surfels.raster import projection
 from gsbake.surfels.raster import rasterise as raster
-from gsbake.surfels.training import adam
 from gsbake.surfels.training.trainer import Plan, Trainer
-from gsbake.surfels.training.views import TrainView
+from gsbake.surfels.views import TrainView
 
 #: Name in the table, owner and attribute of the timed function.
 KERNELS = (("blend forward", raster._Blend, "forward"), ("blend backward", raster._Blend, "backward"))

@@ -85,7 +85,7 @@ def _surfels(source: Path, transfer: str, camera: Any) -> NDArray[np.float32]:
     from gsbake.checkpoint import load_checkpoint
     from gsbake.kernel_threads import configure
     from gsbake.surfels.model import Surfels
-    from gsbake.surfels.raster.render import SurfelRenderer
+    from gsbake.surfels.renderer import SurfelRenderer
     from gsbake.surfels.transfer import transfer_by_name
 
     configure(1)

@@ -33,12 +33,12 @@ from gsbake.meshing.support_plane import SupportPlane, find_support_plane, remov
 from gsbake.meshing.tsdf import SparseTsdf
 from gsbake.monitor import SILENT, Monitor, Rule, decide_skip, skips
 from gsbake.mvs.depth_maps import read_depth
+from gsbake.surfels.field import Field
 from gsbake.surfels.fields.continuous import ContinuousField
-from gsbake.surfels.fields.field import Field
 from gsbake.surfels.fields.registry import load_field
 from gsbake.surfels.fields.samples import SamplesField
 from gsbake.surfels.oriented_points import BALL_RADIUS, OrientedPoints, oriented_points
-from gsbake.surfels.raster.render import SurfelRenderer
+from gsbake.surfels.renderer import SurfelRenderer
 from gsbake.surfels.spacing import surfel_spacing
 
 Doubles = NDArray[np.float64]

@@ -11,7 +11,7 @@ from gsbake.capture.photos.roles import held_out
 from gsbake.capture.posed_photos import PosedPhotos
 from gsbake.imaging.srgb import decode_bytes
 from gsbake.monitor import Monitor, Rule, decide_skip
-from gsbake.surfels.raster.render import SurfelRenderer
+from gsbake.surfels.renderer import SurfelRenderer
 from gsbake.texturing.projection import ProjectedTexture, ProjectionBlender, mask_weights
 from gsbake.texturing.skip_rules import constant_exposure
 from gsbake.texturing.unwrapped_mesh import UnwrappedMesh

@@ -6,7 +6,7 @@ import pytest
 import torch
 from hypothesis import HealthCheck, given, settings
 
-from gsbake.surfels.training.finite import first_non_finite
+from gsbake.surfels.finite import first_non_finite
 from tests.stress.scenes import Scene, build, scenes
 
 

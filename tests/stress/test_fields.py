@@ -11,15 +11,15 @@ import torch
 
 from gsbake.config.schema import Coupling, DistanceField, Loss, Profile, Train
 from gsbake.geometry.sparse_lattice import BlockLattice
+from gsbake.surfels.adam import Adam
 from gsbake.surfels.densification.seeding import place_anew, seed_gaps
+from gsbake.surfels.field import Field
 from gsbake.surfels.fields.continuous import ContinuousField
-from gsbake.surfels.fields.field import Field
 from gsbake.surfels.fields.known import KnownDistance
 from gsbake.surfels.fields.registry import FIELDS, make_field
+from gsbake.surfels.finite import first_non_finite
 from gsbake.surfels.initialisation import fibonacci_sphere, spacing
 from gsbake.surfels.model import Surfels, create
-from gsbake.surfels.training.adam import Adam
-from gsbake.surfels.training.finite import first_non_finite
 from gsbake.surfels.training.trainer import Plan, Trainer
 from tests.stress.test_training import KINDS, MOST_SURFELS, SIZE, views
 

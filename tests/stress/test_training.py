@@ -13,12 +13,12 @@ import torch
 from gsbake import kernel_threads
 from gsbake.config.schema import Profile
 from gsbake.shading.environment import EnvironmentLight
+from gsbake.surfels.finite import first_non_finite
 from gsbake.surfels.initialisation import fibonacci_sphere, spacing
 from gsbake.surfels.model import create
 from gsbake.surfels.raster.projection import Pinhole
-from gsbake.surfels.training.finite import first_non_finite
 from gsbake.surfels.training.trainer import Plan, Trainer
-from gsbake.surfels.training.views import TrainView
+from gsbake.surfels.views import TrainView
 from tests.support.cameras import look_at_rotation
 
 SIZE = 24

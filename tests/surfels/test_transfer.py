@@ -13,10 +13,10 @@ import pytest
 import torch
 
 from gsbake.errors import BadInputError
+from gsbake.surfels.adam import Adam
 from gsbake.surfels.densification.clone_split import MIN_RELATIVE_OPACITY, prune
 from gsbake.surfels.losses.terms import median_sharpness
 from gsbake.surfels.model import Surfels, create
-from gsbake.surfels.training.adam import Adam
 from gsbake.surfels.transfer import TRANSFERS, Transfer, transfer_by_name
 
 mp.mp.dps = 60

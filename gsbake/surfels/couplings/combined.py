@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from torch import Tensor
 
 from gsbake.surfels.couplings import attachment, extra_views, mutual, priors, pulling, regularity, rendering
+from gsbake.surfels.couplings.coupled_field import CoupledField
 from gsbake.surfels.couplings.inputs import CouplingInputs
-from gsbake.surfels.fields.field import TrainingStep
+from gsbake.surfels.field import TrainingStep
 from gsbake.surfels.losses import terms
 from gsbake.surfels.losses.projection import projection_loss
-from gsbake.surfels.training.views import TrainView
-
-if TYPE_CHECKING:
-    from gsbake.surfels.fields.continuous import ContinuousField
+from gsbake.surfels.views import TrainView
 
 #: Couplings by their setting in [coupling].
 COUPLINGS: dict[str, Callable[[CouplingInputs], Tensor]] = {
@@ -37,7 +35,7 @@ COUPLINGS: dict[str, Callable[[CouplingInputs], Tensor]] = {
 }
 
 
-def combined_losses(field: ContinuousField, step: TrainingStep, view: TrainView, loss: Any, coupling: Any) -> Tensor | None:
+def combined_losses(field: CoupledField, step: TrainingStep, view: TrainView, loss: Any, coupling: Any) -> Tensor | None:
     """Weighted sum of the couplings; None where none is on. Where the opacity follows from the field, the median and projection losses of
     the discretized SDF (section [loss]) act on f(μ) as on samples."""
     inputs = CouplingInputs(field, step, view)

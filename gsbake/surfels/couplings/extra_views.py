@@ -11,10 +11,10 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from gsbake.surfels.couplings.inputs import CouplingInputs
-from gsbake.surfels.fields.ray_marching import make_rays, march, sample_depths
+from gsbake.surfels.couplings.ray_marching import make_rays, march, sample_depths
+from gsbake.surfels.gbuffer import rasterise
 from gsbake.surfels.losses.terms import PROJECTION_ERROR_MAX
-from gsbake.surfels.raster.gbuffer import rasterise
-from gsbake.surfels.training.views import TrainView
+from gsbake.surfels.views import TrainView
 
 
 def view_between(first: TrainView, second: TrainView, share: float) -> TrainView:

@@ -4,21 +4,19 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from gsbake.surfels.couplings.coupled_field import CoupledField
+from gsbake.surfels.couplings.ray_marching import March, Rays, make_rays, march, sample_depths, sphere_trace
 from gsbake.surfels.couplings.ray_pixels import pixel_table
-from gsbake.surfels.fields.field import TrainingStep
-from gsbake.surfels.fields.ray_marching import March, Rays, make_rays, march, sample_depths, sphere_trace
+from gsbake.surfels.field import TrainingStep
 from gsbake.surfels.raster.kernel import AUX_PLANES
 from gsbake.surfels.spacing import typical_spacing
-from gsbake.surfels.training.views import TrainView
-
-if TYPE_CHECKING:
-    from gsbake.surfels.fields.continuous import ContinuousField
+from gsbake.surfels.views import TrainView
 
 #: Half-width of the interval on a ray in units of the distance at the surfels' depth, and its least in cells.
 BAND, MIN_BAND_CELLS = 3.0, 3.0
@@ -39,7 +37,7 @@ class Points:
 class CouplingInputs:
     """Lazily evaluated inputs of one step."""
 
-    def __init__(self, field: ContinuousField, step: TrainingStep, view: TrainView) -> None:
+    def __init__(self, field: CoupledField, step: TrainingStep, view: TrainView) -> None:
         """`view` is the photo of the step, whose render is in `step`."""
         self.field, self.step, self.view = field, step, view
         self.settings: Any = field.settings
@@ -131,7 +129,7 @@ class CouplingInputs:
                 known = centre > 0
                 off = field.value(rays.at(centre[:, None])[:, 0]).abs()
             else:
-                centre, known = sphere_trace(field, rays)
+                centre, known = sphere_trace(field.value, rays)
                 off = torch.zeros_like(centre)
             half = (BAND * off).clamp_min(MIN_BAND_CELLS * field.cell) / rays.length
             z = sample_depths(rays, settings.ray_samples, centre, half, known, self.step.generator)

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsbake.surfels.training.views import TrainView
+from gsbake.surfels.views import TrainView
 
 #: Share of the rays inside the mask; the others are drawn around it.
 INSIDE_SHARE = 0.8

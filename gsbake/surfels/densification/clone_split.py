@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from gsbake.surfels.adam import Adam
 from gsbake.surfels.model import Surfels
 from gsbake.surfels.raster.reference import rotation_matrix
-from gsbake.surfels.training.adam import Adam
 
 #: Surfels with a lower opacity, as a share of the transfer function's peak, are pruned (discretized SDF: .005, its peak is 1).
 MIN_RELATIVE_OPACITY = 0.005

@@ -18,11 +18,11 @@ from gsbake.errors import BadInputError
 from gsbake.surfels.densification.clone_split import MIN_RELATIVE_OPACITY
 from gsbake.surfels.densification.policy import PolicyInputs
 from gsbake.surfels.densification.registry import PRUNING
-from gsbake.surfels.fields.field import Field
+from gsbake.surfels.field import Field
+from gsbake.surfels.gbuffer import rasterise
 from gsbake.surfels.initialisation import spacing
 from gsbake.surfels.model import Surfels
-from gsbake.surfels.raster.gbuffer import rasterise
-from gsbake.surfels.training.views import TrainView, camera_tensors
+from gsbake.surfels.views import TrainView, camera_tensors
 
 #: Minimum blending weight of a visible surfel in at least one view.
 MIN_VISIBLE_WEIGHT = 0.05

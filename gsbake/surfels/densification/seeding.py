@@ -11,11 +11,11 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from gsbake.surfels.adam import Adam
 from gsbake.surfels.densification.clone_split import replace_rows
-from gsbake.surfels.fields.field import Field
+from gsbake.surfels.field import Field
 from gsbake.surfels.model import SCALE_TO_SPACING, Surfels, quaternion_from_normal
 from gsbake.surfels.spacing import typical_spacing
-from gsbake.surfels.training.adam import Adam
 
 #: The zero level set is empty where the nearest surfel is farther than this many spacings.
 GAP_SPACINGS = 1.5

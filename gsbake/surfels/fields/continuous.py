@@ -16,13 +16,13 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from gsbake.geometry.sparse_lattice import BlockLattice
+from gsbake.surfels.adam import Adam
 from gsbake.surfels.couplings.combined import combined_losses
-from gsbake.surfels.fields.field import CHUNK, Field, TrainingStep
+from gsbake.surfels.field import CHUNK, Field, TrainingStep
 from gsbake.surfels.fields.known import Known
 from gsbake.surfels.fields.radiance import Radiance
 from gsbake.surfels.model import Surfels
-from gsbake.surfels.training.adam import Adam
-from gsbake.surfels.training.views import TrainView
+from gsbake.surfels.views import TrainView
 
 #: Width of a marched surface in cells at the start and at the end of a run.
 FIRST_WIDTH, LAST_WIDTH = 1.5, 0.25

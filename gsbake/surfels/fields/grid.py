@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from gsbake.surfels.fields.continuous import ContinuousField
-from gsbake.surfels.fields.interpolation import BLOCKS, DENSE, EDGE, Level, Levels, interpolate
+from gsbake.surfels.fields.interpolation import interpolate
 from gsbake.surfels.fields.known import Known
+from gsbake.surfels.fields.levels import BLOCKS, DENSE, EDGE, Level, Levels
 
 #: Cells of the coarse lattice per fine cell along an axis.
 COARSENING = 4

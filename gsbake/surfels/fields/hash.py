@@ -14,7 +14,8 @@ import torch
 from torch import Tensor
 
 from gsbake.surfels.fields.encoded import EncodedField
-from gsbake.surfels.fields.interpolation import DENSE, HASHED, Level, Levels, interpolate
+from gsbake.surfels.fields.interpolation import interpolate
+from gsbake.surfels.fields.levels import DENSE, HASHED, Level, Levels
 from gsbake.surfels.fields.splat_embedding import SplatEmbedding
 from gsbake.surfels.model import Surfels
 

@@ -1,9 +1,4 @@
-"""Multilinear interpolation of feature tables with its Jacobian, and the adjoint of both (Numba).
-
-All grids of the fields are one form: levels of samples at lattice corners, each with D features, of which a point blends eight. Levels
-differ in how a corner finds its row: dense (row-major), hashed (Müller et al., *Instant neural graphics primitives*, SIGGRAPH 2022), by a
-table of corners (a sparse octree), or by a table of blocks of 8³ corners (sparse voxels). A level with one sample along an axis does not
-depend on it: planes and lines of a factorised tensor are such levels.
+"""Multilinear interpolation of the feature tables of `levels` with its Jacobian, and the adjoint of both (Numba).
 
 The Jacobian is an output of its own, linear in the table, so that losses of ∇f need no second derivative. Points get the gradient of the
 features only: the curvature terms of a Jacobian's loss are left out. The twin is `interpolation_reference`.
@@ -11,72 +6,20 @@ features only: the curvature terms of a Jacobian's loss are left out. The twin i
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 import torch
 from numba import njit
-from numpy.typing import NDArray
 from torch import Tensor
 
 from gsbake.kernel_threads import run_chunks
+from gsbake.surfels.fields.interpolation_reference import interpolate_reference
+from gsbake.surfels.fields.levels import CORNERS, DENSE, EDGE, HASHED, PRIMES, Levels
 from gsbake.surfels.raster.blocks import JIT
 
-#: How a corner finds its row.
-DENSE, HASHED, CORNERS, BLOCKS = range(4)
-#: Edge of a block of corners.
-EDGE = 8
-#: Multipliers of the spatial hash (the first axis has 1).
-PRIMES = (2_654_435_761, 805_459_861)
 _ZERO, _ONE = np.float32(0.0), np.float32(1.0)
 _PRIME_Y, _PRIME_Z, _WRAP = np.uint64(PRIMES[0]), np.uint64(PRIMES[1]), np.uint64(0xFFFFFFFF)
-
-
-@dataclass(frozen=True)
-class Level:
-    """One lattice: `size` (3,) corners per axis over the whole box, `mode`, `rows` of its table.
-
-    `index` is the table of corners (nx, ny, nz) or of blocks, with -1 where there is none, whose features are 0.
-    """
-
-    size: tuple[int, int, int]
-    mode: int
-    rows: int
-    index: NDArray[np.int32] | None = None
-
-
-@dataclass(frozen=True)
-class Levels:
-    """Several levels over the box `lower`..`upper` (3,), their tables one after the other in one tensor (rows, D)."""
-
-    lower: NDArray[np.float32]
-    upper: NDArray[np.float32]
-    levels: tuple[Level, ...]
-    numbers: NDArray[np.int64] = field(init=False, repr=False)
-    scale: NDArray[np.float32] = field(init=False, repr=False)
-    index: NDArray[np.int32] = field(init=False, repr=False)
-
-    def __post_init__(self) -> None:
-        numbers, tables = [], []
-        row = at = 0
-        for level in self.levels:
-            shape = (0, 0, 0) if level.index is None else level.index.shape
-            numbers.append([level.mode, *level.size, row, level.rows, at, *shape])
-            row += level.rows
-            if level.index is not None:
-                tables.append(np.ascontiguousarray(level.index, np.int32).reshape(-1))
-                at += level.index.size
-        extent = np.maximum(np.asarray(self.upper, np.float32) - self.lower, 1e-12)
-        scale = [[(n - 1) / e for n, e in zip(level.size, extent, strict=True)] for level in self.levels]
-        object.__setattr__(self, "numbers", np.array(numbers, np.int64).reshape(len(self.levels), 10))
-        object.__setattr__(self, "scale", np.array(scale, np.float32).reshape(len(self.levels), 3))
-        object.__setattr__(self, "index", np.concatenate(tables) if tables else np.zeros(1, np.int32))
-
-    @property
-    def rows(self) -> int:
-        """Rows of the table."""
-        return sum(level.rows for level in self.levels)
 
 
 @njit(**JIT)
@@ -200,8 +143,6 @@ def interpolate(points: Tensor, table: Tensor, levels: Levels) -> tuple[Tensor, 
     Points outside the box take the features of the nearest point in it. On a GPU the twin is used.
     """
     if points.is_cuda:
-        from gsbake.surfels.fields.interpolation_reference import interpolate_reference
-
         return interpolate_reference(points, table, levels)
     out, jacobian = _Interpolate.apply(points, table, levels)
     return out, jacobian

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from gsbake.surfels.fields.interpolation import BLOCKS, CORNERS, DENSE, EDGE, HASHED, PRIMES, Level, Levels
+from gsbake.surfels.fields.levels import BLOCKS, CORNERS, DENSE, EDGE, HASHED, PRIMES, Level, Levels
 
 
 def corner_rows(level: Level, corner: Tensor) -> Tensor:

@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from gsbake.surfels.fields.continuous import ContinuousField
-from gsbake.surfels.fields.interpolation import CORNERS, DENSE, Level, Levels, interpolate
+from gsbake.surfels.fields.interpolation import interpolate
 from gsbake.surfels.fields.known import Known
+from gsbake.surfels.fields.levels import CORNERS, DENSE, Level, Levels
 
 Mask = NDArray[np.bool_]
 #: Cells per axis of the root level.

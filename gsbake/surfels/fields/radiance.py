@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from gsbake.surfels.fields.heads import Network
-from gsbake.surfels.fields.interpolation import DENSE, HASHED, Level, Levels, interpolate
+from gsbake.surfels.fields.interpolation import interpolate
+from gsbake.surfels.fields.levels import DENSE, HASHED, Level, Levels
 
 #: Cells per axis of the levels, features per level, largest number of rows of a level.
 CELLS, FEATURES, MAX_ROWS = (8, 16, 32, 64, 128), 2, 1 << 15

@@ -11,8 +11,8 @@ from safetensors.torch import save_file
 
 from gsbake.config.schema import Coupling, DistanceField, Loss, Train
 from gsbake.errors import BadInputError
+from gsbake.surfels.field import Field
 from gsbake.surfels.fields.continuous import ContinuousField
-from gsbake.surfels.fields.field import Field
 from gsbake.surfels.fields.grid import GridField
 from gsbake.surfels.fields.hash import HashField
 from gsbake.surfels.fields.known import Known, KnownDistance, SphereDistance

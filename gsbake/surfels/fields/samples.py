@@ -17,14 +17,14 @@ from torch import Tensor
 
 from gsbake.geometry.sparse_lattice import BlockLattice
 from gsbake.imaging.distance import distance_to_zero
-from gsbake.surfels.fields.field import Field, TrainingStep
+from gsbake.surfels.field import Field, TrainingStep
 from gsbake.surfels.fields.imls import imls_field
 from gsbake.surfels.losses import terms as losses
 from gsbake.surfels.losses.projection import projection_loss
 from gsbake.surfels.model import Surfels
 from gsbake.surfels.oriented_points import oriented_points
 from gsbake.surfels.spacing import typical_spacing
-from gsbake.surfels.training.views import TrainView
+from gsbake.surfels.views import TrainView
 
 #: Nearest samples that are blended at a point.
 NEIGHBOURS = 12

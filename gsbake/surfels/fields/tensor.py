@@ -10,7 +10,8 @@ import torch
 from torch import Tensor
 
 from gsbake.surfels.fields.encoded import EncodedField
-from gsbake.surfels.fields.interpolation import DENSE, Level, Levels, interpolate
+from gsbake.surfels.fields.interpolation import interpolate
+from gsbake.surfels.fields.levels import DENSE, Level, Levels
 
 #: Standard deviation of the initial features around the mean of planes (0) and lines (1).
 INITIAL = 0.02

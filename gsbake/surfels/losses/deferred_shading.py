@@ -1,7 +1,7 @@
 """Deferred shading inside the fused image losses: planes → G-buffer → light → sRGB picture, and the way back (Numba).
 
 The shading itself is `gsbake.shading.split_sum_kernel`; here is what stands around it.
-The twin is `gsbake.surfels.raster.gbuffer.picture` with autograd.
+The twin is `gsbake.surfels.gbuffer.picture` with autograd.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ from gsbake.kernel_threads import run_chunks
 from gsbake.shading import brdf
 from gsbake.shading import split_sum_kernel as kernels
 from gsbake.shading.light_tables import LightTables
+from gsbake.surfels.gbuffer import SHADING_ALPHA_MIN
 from gsbake.surfels.raster.blocks import JIT
-from gsbake.surfels.raster.gbuffer import SHADING_ALPHA_MIN
 from gsbake.surfels.raster.lanes import EXP2_COEFFICIENTS, LANES, broadcast, exp2, load, log, select, store
-from gsbake.surfels.training.views import TrainView
+from gsbake.surfels.views import TrainView
 
 #: Features: base colour, roughness, metallic, normal; then the planes of `gsbake.surfels.raster.kernel`, alpha the fifth of them.
 CHANNELS = 8

@@ -13,13 +13,13 @@ import torch
 from torch import Tensor
 
 from gsbake.shading.light_tables import LightTables
+from gsbake.surfels.gbuffer import rendered_image
 from gsbake.surfels.losses import geometry, photometric, smoothness
 from gsbake.surfels.losses import terms as losses
 from gsbake.surfels.losses.deferred_shading import DeferredShading
 from gsbake.surfels.losses.terms import ImageWeights
-from gsbake.surfels.raster.gbuffer import rendered_image
 from gsbake.surfels.raster.kernel import AUX_PLANES
-from gsbake.surfels.training.views import TrainView
+from gsbake.surfels.views import TrainView
 
 
 class _ImageLosses(torch.autograd.Function):

@@ -15,8 +15,9 @@ from torch import Tensor
 
 from gsbake.surfels.raster.kernel import AUX_PLANES
 from gsbake.surfels.raster.projection import Pinhole
-from gsbake.surfels.training.views import TrainView
+from gsbake.surfels.raster.rasterise import expected_depth
 from gsbake.surfels.transfer import Transfer
+from gsbake.surfels.views import TrainView
 
 #: Projection errors above this (unit frame) are other surfaces, not error.
 PROJECTION_ERROR_MAX = 0.1
@@ -115,11 +116,6 @@ def silhouette_distance(points: Tensor, distance: Tensor, R: Tensor, t: Tensor, 
     grid = torch.stack([x, y], 1)[None, None]
     pixels = F.grid_sample(distance[None, None], grid, mode="bilinear", padding_mode="border", align_corners=False)[0, 0, 0]
     return torch.where(known, pixels * (z.detach() / view.fx), 0.0).sum() / max(1, len(points))
-
-
-def expected_depth(depth: Tensor, alpha: Tensor) -> Tensor:
-    """Alpha-normalised z-depth of Σ w z and Σ w (h, w); 0 where nothing is."""
-    return torch.where(alpha > 1e-3, depth / alpha.clamp_min(1e-3), torch.zeros_like(depth))
 
 
 def depth_normals(depth: Tensor, R: Tensor, view: Pinhole) -> Tensor:

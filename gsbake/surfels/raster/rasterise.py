@@ -14,10 +14,14 @@ import torch
 from torch import Tensor
 
 from gsbake.kernel_threads import run_chunks
-from gsbake.surfels.losses.terms import expected_depth
 from gsbake.surfels.raster.binning import bin_surfels
 from gsbake.surfels.raster.kernel import AUX_PLANES, FEATURE_OFFSET, backward_kernel, forward_kernel, sum_slots
 from gsbake.surfels.raster.projection import Pinhole, Project
+
+
+def expected_depth(depth: Tensor, alpha: Tensor) -> Tensor:
+    """Alpha-normalised z-depth of Σ w z and Σ w (h, w); 0 where nothing is."""
+    return torch.where(alpha > 1e-3, depth / alpha.clamp_min(1e-3), torch.zeros_like(depth))
 
 
 @dataclass

@@ -15,10 +15,10 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from gsbake.imaging.metrics import decibels
-from gsbake.surfels.raster.gbuffer import rasterise, rendered_image
+from gsbake.surfels.gbuffer import rasterise, rendered_image
 from gsbake.surfels.raster.rasterise import Rendered
 from gsbake.surfels.training.corrections import SRGB_EXPONENT, SRGB_OFFSET, Correction, CorrectionKinds, compose
-from gsbake.surfels.training.views import TrainView
+from gsbake.surfels.views import TrainView
 
 #: Gaussian blur (standard deviation in pixels) of render and photo in each iteration: from a wide basin of convergence to precision.
 BLURS = (3.0, 1.5, 1.0)

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from gsbake.geometry.cameras import Camera
-from gsbake.surfels.training.views import TrainView
+from gsbake.surfels.views import TrainView
 
 #: Offset and exponent of the sRGB curve above its linear segment.
 SRGB_OFFSET, SRGB_EXPONENT = 0.055, 1 / 2.4

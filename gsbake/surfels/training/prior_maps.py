@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from gsbake.capture.photos.undistortion import remap_tables
 from gsbake.errors import BadInputError
 from gsbake.geometry.cameras import Camera, CameraSet
-from gsbake.surfels.training.views import TrainView
+from gsbake.surfels.views import TrainView
 
 Floats = NDArray[np.float32]
 #: Folders beside the photos.

@@ -19,14 +19,14 @@ from gsbake.config.schema import Coupling, DistanceField, Loss, Train
 from gsbake.config.schema import Surfels as SurfelSettings
 from gsbake.kernel_threads import configure
 from gsbake.monitor import SILENT, Monitor, Rule, decide_skip
-from gsbake.surfels.fields.field import Field
+from gsbake.surfels.field import Field
 from gsbake.surfels.fields.registry import save_field
 from gsbake.surfels.model import Surfels
 from gsbake.surfels.training.corrections import Correction
+from gsbake.surfels.training.photos import exposure_spread, load_views
 from gsbake.surfels.training.pose_refinement import Aligner, exposure_rule, pose_rule
 from gsbake.surfels.training.prior_maps import add_priors
 from gsbake.surfels.training.trainer import Plan, Trainer
-from gsbake.surfels.training.views import exposure_spread, load_views
 
 #: Checkpoints of other versions are ignored.
 CHECKPOINT_VERSION = 5

@@ -15,22 +15,22 @@ import torch
 from torch import Tensor
 
 from gsbake.imaging.metrics import decibels
+from gsbake.surfels.adam import Adam
 from gsbake.surfels.densification.clone_split import Statistics, densify, prune, reset_opacity
 from gsbake.surfels.densification.policy import PolicyInputs
 from gsbake.surfels.densification.registry import DENSIFICATION, PRUNING
 from gsbake.surfels.densification.seeding import place_anew, seed_gaps
-from gsbake.surfels.fields.field import Field, TrainingStep
+from gsbake.surfels.field import Field, TrainingStep
 from gsbake.surfels.fields.samples import SamplesField
+from gsbake.surfels.finite import first_non_finite
+from gsbake.surfels.gbuffer import rasterise, rendered_image
 from gsbake.surfels.losses.image import image_losses
 from gsbake.surfels.losses.terms import ImageWeights
 from gsbake.surfels.model import Surfels
-from gsbake.surfels.raster.gbuffer import rasterise, rendered_image
 from gsbake.surfels.raster.rasterise import Rendered
 from gsbake.surfels.spacing import typical_spacing
-from gsbake.surfels.training.adam import Adam
 from gsbake.surfels.training.early_stopping import has_plateaued
-from gsbake.surfels.training.finite import first_non_finite
-from gsbake.surfels.training.views import TrainView
+from gsbake.surfels.views import TrainView
 
 #: Shares of the run: start of the SDF losses, start and end of densification.
 SDF_START, DENSIFY_START, DENSIFY_END = 1 / 30, 1 / 60, 0.6

@@ -11,13 +11,13 @@ import torch
 
 from gsbake.config.schema import Coupling, DistanceField, Loss, Train
 from gsbake.surfels.couplings.inputs import CouplingInputs
+from gsbake.surfels.field import TrainingStep
 from gsbake.surfels.fields.continuous import ContinuousField
-from gsbake.surfels.fields.field import TrainingStep
 from gsbake.surfels.fields.registry import make_field
+from gsbake.surfels.gbuffer import rasterise
 from gsbake.surfels.initialisation import fibonacci_sphere, spacing
 from gsbake.surfels.model import Surfels, create
-from gsbake.surfels.raster.gbuffer import rasterise
-from gsbake.surfels.training.views import TrainView, camera_tensors
+from gsbake.surfels.views import TrainView, camera_tensors
 from tests.support.cameras import look_at
 
 RADIUS, SIZE = 0.6, 40

@@ -11,9 +11,9 @@ import torch
 from gsbake.surfels.couplings.combined import COUPLINGS, combined_losses
 from gsbake.surfels.couplings.extra_views import view_between
 from gsbake.surfels.couplings.priors import fit_scale_and_shift
-from gsbake.surfels.fields.field import TrainingStep
-from gsbake.surfels.raster.gbuffer import rasterise
-from gsbake.surfels.training.views import TrainView
+from gsbake.surfels.field import TrainingStep
+from gsbake.surfels.gbuffer import rasterise
+from gsbake.surfels.views import TrainView
 from tests.surfels.couplings.scene import RADIUS, ball, field_of, inputs, normals_of, views
 
 

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 import torch
 
+from gsbake.surfels.adam import Adam
 from gsbake.surfels.densification.clone_split import Statistics, densify, prune, reset_opacity
 from gsbake.surfels.densification.policy import PolicyInputs
 from gsbake.surfels.initialisation import fibonacci_sphere, spacing
 from gsbake.surfels.model import Surfels, create, quaternion_from_normal
-from gsbake.surfels.training.adam import Adam
 
 
 def ball(n: int = 200, shading: str = "colour") -> Surfels:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import torch
 
+from gsbake.surfels.adam import Adam
 from gsbake.surfels.densification.seeding import place_anew, seed_gaps, thin
 from gsbake.surfels.fields.registry import make_field
-from gsbake.surfels.training.adam import Adam
 from tests.surfels.fields.test_continuous import RADIUS, ball, profile
 
 

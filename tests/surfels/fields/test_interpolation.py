@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from gsbake.surfels.fields.interpolation import BLOCKS, CORNERS, DENSE, HASHED, Level, Levels, interpolate
+from gsbake.surfels.fields.interpolation import interpolate
 from gsbake.surfels.fields.interpolation_reference import corner_rows, interpolate_reference
+from gsbake.surfels.fields.levels import BLOCKS, CORNERS, DENSE, HASHED, Level, Levels
 
 LOWER, UPPER = np.array([-1, -0.5, 0], np.float32), np.array([1, 1.5, 1], np.float32)
 

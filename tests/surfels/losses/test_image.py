@@ -11,13 +11,13 @@ from torch import Tensor
 from gsbake import kernel_threads
 from gsbake.shading.environment import EnvironmentLight
 from gsbake.shading.light_tables import LightTables
+from gsbake.surfels.gbuffer import rendered_image
 from gsbake.surfels.losses import photometric as similarity
 from gsbake.surfels.losses import terms as losses
 from gsbake.surfels.losses.image import image_losses
 from gsbake.surfels.losses.terms import ImageWeights
-from gsbake.surfels.raster.gbuffer import rendered_image
 from gsbake.surfels.raster.projection import Pinhole
-from gsbake.surfels.training.views import TrainView
+from gsbake.surfels.views import TrainView
 
 ALL = ImageWeights(0.2, normal=0.7, mask=0.3, distortion=3.0, smoothness=0.5)
 #: More rows than one strip of any pass, and widths that are no multiple of eight.

@@ -16,7 +16,7 @@ from gsbake.surfels.losses.terms import silhouette_distance
 from gsbake.surfels.model import create
 from gsbake.surfels.raster.projection import Pinhole
 from gsbake.surfels.training.trainer import Plan, Trainer
-from gsbake.surfels.training.views import TrainView
+from gsbake.surfels.views import TrainView
 
 VIEW = Pinhole(64, 48, 50.0, 50.0, 32.0, 24.0)
 

@@ -17,12 +17,12 @@ from gsbake.shading.prefilter import prefilter_operator
 from gsbake.shading.split_sum import shade
 from gsbake.surfels import spherical_harmonics as harmonics
 from gsbake.surfels.densification.clone_split import Statistics
+from gsbake.surfels.gbuffer import view_directions
 from gsbake.surfels.losses import terms as losses
 from gsbake.surfels.model import create
 from gsbake.surfels.raster.cuda.projection import project
-from gsbake.surfels.raster.gbuffer import view_directions
 from gsbake.surfels.raster.projection import Pinhole
-from gsbake.surfels.training.views import TrainView
+from gsbake.surfels.views import TrainView
 
 PINHOLE = Pinhole(37, 29, 40.0, 44.0, 17.3, 15.2)
 

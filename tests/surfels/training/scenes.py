@@ -9,11 +9,11 @@ import torch
 from torch import Tensor
 
 from gsbake.geometry.cameras import Camera
+from gsbake.surfels.gbuffer import rasterise, rendered_image
 from gsbake.surfels.initialisation import fibonacci_sphere, spacing
 from gsbake.surfels.model import Surfels, create
-from gsbake.surfels.raster.gbuffer import rasterise, rendered_image
 from gsbake.surfels.raster.projection import Pinhole
-from gsbake.surfels.training.views import TrainView
+from gsbake.surfels.views import TrainView
 from tests.support.cameras import look_at_rotation
 
 SIZE = 96

@@ -11,7 +11,7 @@ from gsbake.surfels.model import create
 from gsbake.surfels.raster.projection import Pinhole
 from gsbake.surfels.training.early_stopping import MAX_PSNR_GAIN, WINDOW, has_plateaued
 from gsbake.surfels.training.trainer import COOLDOWN_SHARE, Plan, Trainer
-from gsbake.surfels.training.views import TrainView
+from gsbake.surfels.views import TrainView
 
 STEPS = 200
 

@@ -32,7 +32,7 @@ from gsbake.surfels.training.pose_refinement import (
     trial_improves,
 )
 from gsbake.surfels.training.trainer import Plan, Trainer
-from gsbake.surfels.training.views import TrainView
+from gsbake.surfels.views import TrainView
 from tests.surfels.training.scenes import BACK, ball, camera_of, photographed, pixels_apart, view_from
 
 PHOTOS, STEPS = 12, 80

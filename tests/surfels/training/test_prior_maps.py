@@ -16,7 +16,7 @@ from gsbake.config.schema import Coupling
 from gsbake.errors import BadInputError
 from gsbake.geometry.cameras import CameraSet
 from gsbake.surfels.training.prior_maps import add_priors
-from gsbake.surfels.training.views import TrainView, camera_tensors
+from gsbake.surfels.views import TrainView, camera_tensors
 from tests.support.cameras import look_at
 
 

@@ -24,11 +24,11 @@ from gsbake.surfels.densification.refinement import prune_and_densify
 from gsbake.surfels.fields.samples import SamplesField
 from gsbake.surfels.initialisation import fibonacci_sphere, initialise_surfels, spacing
 from gsbake.surfels.model import Surfels, create
-from gsbake.surfels.raster.render import SurfelRenderer
+from gsbake.surfels.renderer import SurfelRenderer
+from gsbake.surfels.training.photos import load_views
 from gsbake.surfels.training.run import train_surfels
 from gsbake.surfels.training.session import TrainOptions
 from gsbake.surfels.training.trainer import Plan, Trainer
-from gsbake.surfels.training.views import load_views
 from gsbake.surfels.transfer import TRANSFERS
 from tests.support.cameras import look_at
 from tests.support.recorder import Recorder

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from gsbake.surfels.training.adam import Adam
+from gsbake.surfels.adam import Adam
 
 
 def test_matches_torch() -> None:

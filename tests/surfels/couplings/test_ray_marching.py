@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 import torch
 
-from gsbake.surfels.fields.field import Field
-from gsbake.surfels.fields.ray_marching import alphas, make_rays, march, sample_depths, sphere_trace, weights
-from gsbake.surfels.training.views import TrainView, camera_tensors
+from gsbake.surfels.couplings.ray_marching import alphas, make_rays, march, sample_depths, sphere_trace, weights
+from gsbake.surfels.field import Field
+from gsbake.surfels.views import TrainView, camera_tensors
 from tests.support.cameras import look_at
 
 RADIUS, SIZE = 0.6, 32
@@ -80,7 +80,7 @@ def test_marched_depth_and_normal(transfer: str) -> None:
 def test_sphere_tracing_meets_the_surface() -> None:
     rays = make_rays(view(), torch.arange(SIZE * SIZE), *BOX)
     truth = true_depth(rays)
-    z, hit = sphere_trace(Ball(), rays)
+    z, hit = sphere_trace(Ball().value, rays)
     grazing = (truth > 0) & ((rays.at(truth[:, None])[:, 0] * rays.direction).sum(1) / (RADIUS * rays.length) > -0.3)
     assert bool((hit == (truth > 0))[~grazing & ((truth > 0) | (rays.at(z[:, None])[:, 0].norm(dim=1) > 0.65))].all())
     assert float((z - truth)[hit & ~grazing & (truth > 0)].abs().max()) < 0.02

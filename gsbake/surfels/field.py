@@ -19,7 +19,7 @@ from torch import Tensor
 from gsbake.geometry.sparse_lattice import BlockLattice
 from gsbake.surfels.model import Surfels
 from gsbake.surfels.raster.rasterise import Rendered
-from gsbake.surfels.training.views import TrainView
+from gsbake.surfels.views import TrainView
 
 #: Slope below which a gradient has no direction.
 MIN_SLOPE = 1e-6

@@ -19,8 +19,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from gsbake.surfels.fields.field import Field
-from gsbake.surfels.training.views import TrainView
+from gsbake.surfels.views import TrainView
 
 #: Steps of sphere tracing.
 TRACE_STEPS = 10
@@ -111,12 +110,12 @@ def weights(alpha: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-def sphere_trace(field: Field, rays: Rays) -> tuple[Tensor, Tensor]:
-    """Depth (m,) at which each ray meets the zero level set, and whether it does."""
+def sphere_trace(value: Callable[[Tensor], Tensor], rays: Rays) -> tuple[Tensor, Tensor]:
+    """Depth (m,) at which each ray meets the zero level set, and whether it does; `value` is the signed distance (n,) at points (n, 3)."""
     z = rays.near.clone()
     f = torch.ones_like(z)
     for _ in range(TRACE_STEPS):
-        f = field.value(rays.at(z[:, None])[:, 0])
+        f = value(rays.at(z[:, None])[:, 0])
         z = (z + f / rays.length).clamp_min(NEAR)
     return z, (f.abs() < 0.02) & (z < rays.far) & (rays.near < rays.far)
 

@@ -14,7 +14,7 @@ from torch import Tensor
 from gsbake.surfels.model import Surfels
 from gsbake.surfels.raster.kernel import AUX_PLANES
 from gsbake.surfels.raster.rasterise import Rendered, render
-from gsbake.surfels.training.views import TrainView
+from gsbake.surfels.views import TrainView
 
 if TYPE_CHECKING:
     from gsbake.shading.light_tables import LightTables

@@ -9,9 +9,9 @@ import torch
 from numpy.typing import NDArray
 
 from gsbake.geometry.cameras import Camera
+from gsbake.surfels.gbuffer import rasterise, rendered_image
 from gsbake.surfels.model import Surfels
-from gsbake.surfels.raster.gbuffer import rasterise, rendered_image
-from gsbake.surfels.training.views import TrainView, camera_tensors
+from gsbake.surfels.views import TrainView, camera_tensors
 
 Image = NDArray[np.float32]
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import torch
 
+from gsbake.surfels.gbuffer import rasterise
 from gsbake.surfels.initialisation import fibonacci_sphere, spacing
 from gsbake.surfels.model import Surfels, create
-from gsbake.surfels.raster.gbuffer import rasterise
-from gsbake.surfels.training.views import TrainView, camera_tensors
+from gsbake.surfels.views import TrainView, camera_tensors
 from tests.support.cameras import look_at
 
 RADIUS, SIZE = 0.6, 64

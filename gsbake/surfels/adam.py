@@ -14,8 +14,8 @@ from numba import njit
 from torch import Tensor
 
 from gsbake.kernel_threads import run_chunks
+from gsbake.surfels.finite import first_non_finite
 from gsbake.surfels.raster.blocks import JIT
-from gsbake.surfels.training.finite import first_non_finite
 
 EPSILON = 1e-15
 
