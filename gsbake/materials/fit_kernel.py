@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numba import njit, prange
 
-from gsbake.materials.reflection_kernel import reflected_radiance, specular_visibility
+from gsbake.shading.reflection_kernel import reflected_radiance, specular_visibility
 from gsbake.shading.split_sum_kernel import (
     _CLAMP_TERM,
     _FLAGS,

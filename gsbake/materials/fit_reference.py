@@ -28,9 +28,9 @@ from gsbake.materials.photo_batch import (
     VISIBILITY,
 )
 from gsbake.materials.pixels import Pixels
-from gsbake.materials.reflection_kernel import MIN_BLOCKED
 from gsbake.shading import brdf
 from gsbake.shading.light_tables import LightTables
+from gsbake.shading.reflection_kernel import MIN_BLOCKED
 from gsbake.shading.split_sum import (
     mirror_weight,
     prefiltered_light,

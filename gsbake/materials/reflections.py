@@ -1,9 +1,7 @@
 """Ray-traced reflections of the object on itself: one reflected ray per pixel, traced once, as mesh and cameras do not change.
 
 A smooth lobe reflects the environment where the ray is unoccluded, else the texel that it hits. How far a rough lobe follows that ray is
-decided in shading (`gsbake.materials.reflection_kernel.specular_visibility`).
-
-Whitted, *An improved illumination model for shaded display*, CACM 1980.
+decided in shading (`gsbake.shading.reflection_kernel.specular_visibility`).
 """
 
 from __future__ import annotations
@@ -16,6 +14,7 @@ from numpy.typing import NDArray
 
 from gsbake.geometry.raycast import RayCaster
 from gsbake.materials.pixels import Pixels
+from gsbake.shading.reflections import trace_reflections
 from gsbake.texturing.texels import Texels
 
 
@@ -36,15 +35,9 @@ class ReflectionTracer:
     def trace(self, pixels: Pixels) -> Pixels:
         """The pixels with the texel that each reflected ray hits."""
         position, shading = (np.einsum("nk,nkd->nd", pixels.bilinear, x[pixels.texel]) for x in (self.position, self.normal))
-        shading /= np.maximum(np.linalg.norm(shading, axis=1, keepdims=True), 1e-20)
         dominant = pixels.texel[np.arange(len(pixels)), pixels.bilinear.argmax(1)]
-        corner = self.caster.vertices[self.caster.faces[self.texels.face[dominant]]]
-        geometric = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
-        geometric /= np.maximum(np.linalg.norm(geometric, axis=1, keepdims=True), 1e-20)
-        ray = 2 * np.einsum("nk,nk->n", shading, pixels.view)[:, None] * shading - pixels.view
-        above = np.flatnonzero(np.einsum("nk,nk->n", geometric, ray) > 0)  # below the geometric horizon it would start inside
-        hits = self.caster.first_hit(position[above] + self.offset * geometric[above], ray[above])
+        sent, hits = trace_reflections(self.caster, self.texels.face[dominant], position, shading, pixels.view, self.offset)
         uv = np.einsum("nk,nkd->nd", hits.bary[hits.hit], self.uv[self.caster.faces[hits.face[hits.hit]]])
         reflected = np.full(len(pixels), -1, np.int64)
-        reflected[above[hits.hit]] = self.texels.containing(uv)
+        reflected[sent[hits.hit]] = self.texels.containing(uv)
         return replace(pixels, reflected_texel=reflected)

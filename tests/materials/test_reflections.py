@@ -20,10 +20,10 @@ from gsbake.materials.fit_surface import FitSurface
 from gsbake.materials.options import FitSchedule, Priors
 from gsbake.materials.photo_batch import EMISSION, METAL_COLOUR, METALLIC, NORMAL, OCCLUSION, ROUGHNESS
 from gsbake.materials.pixels import PixelReader, Pixels
-from gsbake.materials.reflection_kernel import specular_visibility
 from gsbake.materials.reflections import ReflectionTracer
 from gsbake.materials.visibility import Visibility
 from gsbake.shading.environment import EnvironmentLight
+from gsbake.shading.reflection_kernel import specular_visibility
 from gsbake.shading.split_sum import shade, transmitted_share
 from gsbake.texturing.texels import rasterise
 from tests.support.cameras import look_at

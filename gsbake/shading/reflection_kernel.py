@@ -1,7 +1,8 @@
-"""Inline Numba functions of the material fit's kernels: what the specular lobe sees of the object itself.
+"""Inline Numba functions for fits of materials: what the specular lobe sees of the object itself.
 
 Where it is blocked follows from ambient occlusion and from one traced ray. What it sees there follows from the light transport of the texel
-that the ray meets: its diffuse radiosity, its emission, and the environment that it reflects in turn. `fit_reference` has the PyTorch twin.
+that the ray meets: its diffuse radiosity, its emission, and the environment that it reflects in turn. The PyTorch twin is
+`gsbake.materials.fit_reference`.
 """
 
 from __future__ import annotations
