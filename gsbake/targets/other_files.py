@@ -2,33 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from gsbake.gltf.document import decode_image, image_format
+from gsbake.gltf.document import decode_image
 from gsbake.gltf.write import GltfMesh, GltfTextures
 from gsbake.imaging.png import encode_png
-
-SUFFIXES = {"png": "png", "jpeg": "jpg"}
-
-
-@dataclass(frozen=True)
-class Images:
-    """Encoded images of a material by role ("base_color", "orm", "normal", "emissive") with their files' suffixes; what is constant."""
-
-    files: dict[str, tuple[bytes, str]]
-    roughness: float | None = None
-    metallic: float | None = None
-
-    @staticmethod
-    def of(textures: GltfTextures, factors: tuple[float, float] | None) -> Images:
-        """The images of a material whose roughness and metallic are `factors`, or in the ORM image where that is None."""
-        roles = {"base_color": textures.base_color, "orm": textures.orm, "normal": textures.normal, "emissive": textures.emissive}
-        files = {role: (content, SUFFIXES[image_format(content)]) for role, content in roles.items() if content is not None}
-        return Images(files) if factors is None else Images(files, *factors)
+from gsbake.targets.material_images import Images
+from gsbake.targets.usd import write_usd
 
 
 def write_other(
@@ -38,8 +21,6 @@ def write_other(
     images = Images.of(textures, factors)
     if form == "obj":
         return write_obj(out, stem, mesh, images, metric=extras.get("scale") == "metres")
-    from gsbake.targets.usd import write_usd
-
     return write_usd(out, stem, mesh, images, package=form == "usdz", metric=extras.get("scale") == "metres")
 
 

@@ -9,15 +9,13 @@ from __future__ import annotations
 import os
 import tempfile
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from gsbake.errors import BadInputError
 from gsbake.gltf.write import GltfMesh
-
-if TYPE_CHECKING:
-    from gsbake.targets.other_files import Images
+from gsbake.targets.material_images import Images
 
 #: {input of the surface: (image, its output, kind)}; the kinds are names of Sdf types.
 INPUTS = {
