@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gsbake.capture.photos.exposure import TiePointExposure
+from gsbake.capture.exposure import TiePointExposure
 from gsbake.capture.photos.roles import held_out
 from gsbake.capture.posed_photos import PosedPhotos
 from gsbake.imaging.srgb import decode_bytes

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gsbake.capture.photos.exposure import MAX_SPREAD
+from gsbake.capture.exposure import MAX_SPREAD
 from gsbake.texturing.normal_map import DenseSamples
 
 #: Gains between photos below this factor count as view dependence, not exposure: dividing them out would remove reflections.
@@ -23,7 +23,7 @@ def constant_exposure(gains: NDArray[Any], explained: float, tie_point_spread: f
     """Whether all photos have one exposure, and the evidence.
 
     `gains` (photos, channels; 1 = none) are solved on the surface; `explained` is the share of the photos' differences there that they
-    explain; `tie_point_spread` is the factor within which nine tenths of the photos agree at tie points (`capture.photos.exposure`).
+    explain; `tie_point_spread` is the factor within which nine tenths of the photos agree at tie points (`capture.exposure`).
     """
     spread = float(np.exp(np.abs(np.log(gains)).max()))
     needed = MIN_EXPLAINED if tie_point_spread is None else MIN_EXPLAINED_WITH_TIE_POINTS

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from gsbake.capture.photos.exposure import MAX_SPREAD
+from gsbake.capture.exposure import MAX_SPREAD
 from gsbake.geometry.raycast import RayCaster
 from gsbake.texturing.normal_map import sample_dense_mesh, vertex_normals
 from gsbake.texturing.skip_rules import MAX_GAIN_SPREAD, MIN_EXPLAINED, constant_exposure, normals_agree

@@ -8,9 +8,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
-
-from gsbake.capture.photos.decode import MAX_MEGAPIXELS, Bytes, RawPhoto, UnreadablePhotoError, apply_orientation, read_mask
 from gsbake.capture.sources import list_masks
 from gsbake.errors import BadInputError
 
@@ -41,28 +38,3 @@ def match_masks(folder: Path, photos: dict[str, Path]) -> dict[str, Path]:
         names = ", ".join(unmatched[:3]) + (f" and {len(unmatched) - 3} more" if len(unmatched) > 3 else "")
         raise BadInputError(f"In {folder} no photo belongs to {names}; name masks after their photos (a.png or a.jpg.png for a.jpg).")
     return found
-
-
-def read_photo_mask(
-    photo: RawPhoto, name: str, mask_file: Path | None, invert: bool, max_megapixels: float = MAX_MEGAPIXELS
-) -> Bytes | None:
-    """The mask (h, w) of a decoded photo at the photo's size, 255 = object, or None.
-
-    A mask made for the stored photo, before its EXIF orientation, is rotated with it.
-    Raises BadInputError when the mask is unreadable or differs in size from its photo.
-    """
-    if mask_file is None:
-        return photo.alpha
-    try:
-        mask, mask_orientation = read_mask(mask_file, max_megapixels)
-    except UnreadablePhotoError as error:
-        raise BadInputError(f"The mask {mask_file} of photo {name} cannot be read ({error}); replace or remove it.") from error
-    size = (photo.width, photo.height)
-    if (mask.shape[1], mask.shape[0]) != size and photo.orientation >= 5 and mask_orientation == 1 and mask.shape == size:
-        mask = np.asarray(apply_orientation(mask, photo.orientation), np.uint8)
-    if (mask.shape[1], mask.shape[0]) != size:
-        raise BadInputError(
-            f"The mask {mask_file} has {mask.shape[1]}x{mask.shape[0]} pixels but its photo {name} has {size[0]}x{size[1]}; "
-            "make masks at the size of the photos."
-        )
-    return np.asarray(255 - mask if invert else mask, np.uint8)

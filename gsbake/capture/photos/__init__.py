@@ -1,1 +1,1 @@
-"""Single photos: decoding, EXIF, quality, redundancy, exposure, undistortion."""
+"""Single photos: decoding, EXIF, quality, redundancy, undistortion."""

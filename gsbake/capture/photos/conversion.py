@@ -7,10 +7,22 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from gsbake.capture.masks.matching import read_photo_mask
-from gsbake.capture.photos.decode import UnreadablePhotoError, read_header, read_photo, to_working_size
+import numpy as np
+
+from gsbake.capture.photos.decode import (
+    MAX_MEGAPIXELS,
+    Bytes,
+    RawPhoto,
+    UnreadablePhotoError,
+    apply_orientation,
+    read_header,
+    read_mask,
+    read_photo,
+    to_working_size,
+)
 from gsbake.capture.photos.exif import camera_key, focal_pixels, gps_position
 from gsbake.capture.photos.quality import Quality, measure_quality
+from gsbake.errors import BadInputError
 from gsbake.imaging.png import write_png
 
 
@@ -56,6 +68,31 @@ def decoded_bytes(what: Conversion) -> int:
         with suppress(UnreadablePhotoError):
             size += read_header(what.mask, what.max_megapixels).decoded_bytes
     return size
+
+
+def read_photo_mask(
+    photo: RawPhoto, name: str, mask_file: Path | None, invert: bool, max_megapixels: float = MAX_MEGAPIXELS
+) -> Bytes | None:
+    """The mask (h, w) of a decoded photo at the photo's size, 255 = object, or None.
+
+    A mask made for the stored photo, before its EXIF orientation, is rotated with it.
+    Raises BadInputError when the mask is unreadable or differs in size from its photo.
+    """
+    if mask_file is None:
+        return photo.alpha
+    try:
+        mask, mask_orientation = read_mask(mask_file, max_megapixels)
+    except UnreadablePhotoError as error:
+        raise BadInputError(f"The mask {mask_file} of photo {name} cannot be read ({error}); replace or remove it.") from error
+    size = (photo.width, photo.height)
+    if (mask.shape[1], mask.shape[0]) != size and photo.orientation >= 5 and mask_orientation == 1 and mask.shape == size:
+        mask = np.asarray(apply_orientation(mask, photo.orientation), np.uint8)
+    if (mask.shape[1], mask.shape[0]) != size:
+        raise BadInputError(
+            f"The mask {mask_file} has {mask.shape[1]}x{mask.shape[0]} pixels but its photo {name} has {size[0]}x{size[1]}; "
+            "make masks at the size of the photos."
+        )
+    return np.asarray(255 - mask if invert else mask, np.uint8)
 
 
 def convert(what: Conversion) -> ConvertedPhoto:

@@ -113,7 +113,7 @@ def read_tracks(folder: Path) -> tuple[Any, dict[str, NDArray[np.int64]]]:
 
 
 def _open(folder: Path) -> Any:
-    from gsbake.capture.sfm.colmap import pycolmap
+    from gsbake.capture.colmap import pycolmap
 
     try:
         return pycolmap.Reconstruction(str(folder))

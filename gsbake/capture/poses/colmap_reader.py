@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
+from gsbake.capture.colmap import pycolmap
 from gsbake.capture.poses.colmap_model import cloud
-from gsbake.capture.sfm.colmap import pycolmap
 from gsbake.limited_process import limit_memory, serve
 
 

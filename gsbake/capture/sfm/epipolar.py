@@ -15,8 +15,8 @@ from pathlib import Path
 
 import numpy as np
 
+from gsbake.capture.colmap import pycolmap
 from gsbake.capture.photos.undistortion import image_plane
-from gsbake.capture.sfm.colmap import pycolmap
 from gsbake.geometry.cameras import Array, Camera
 
 #: Smallest number of verified matches per photo, in the mean, that poses are judged by.

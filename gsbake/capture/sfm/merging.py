@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gsbake.capture.sfm.colmap import pycolmap, repeatable_mapping
+from gsbake.capture.colmap import pycolmap, repeatable_mapping
 
 Doubles = NDArray[np.float64]
 

@@ -21,8 +21,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from gsbake.capture.colmap import pycolmap, repeatable_mapping
 from gsbake.capture.sfm import pairs as pairing
-from gsbake.capture.sfm.colmap import pycolmap, repeatable_mapping
 from gsbake.capture.sfm.feature_cache import Descriptors, FeatureCache, Keypoints, photo_key
 from gsbake.capture.sfm.matching import Matches, match_pairs
 from gsbake.capture.sfm.merging import merge_all, new_photos

@@ -16,7 +16,7 @@ import numpy as np
 from blake3 import blake3
 from numpy.typing import NDArray
 
-from gsbake.capture.sfm.colmap import pycolmap
+from gsbake.capture.colmap import pycolmap
 from gsbake.capture.sfm.feature_cache import FeatureCache
 from gsbake.capture.sfm.pairs import Pair
 

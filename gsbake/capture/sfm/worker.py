@@ -19,9 +19,9 @@ from typing import Any
 
 import numpy as np
 
+from gsbake.capture.colmap import pycolmap, repeatable_mapping
 from gsbake.capture.poses.colmap_model import camera_of, cloud
 from gsbake.capture.poses.up_axis import up_direction, upright_rotation
-from gsbake.capture.sfm.colmap import pycolmap, repeatable_mapping
 from gsbake.capture.sfm.epipolar import epipolar_error
 from gsbake.capture.sfm.feature_cache import FeatureCache
 from gsbake.capture.sfm.pairs import exhaustive, neighbouring_views

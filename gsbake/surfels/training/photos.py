@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import torch
 
-from gsbake.capture.photos.exposure import TiePointExposure
+from gsbake.capture.exposure import TiePointExposure
 from gsbake.capture.posed_photos import PosedPhotos
 from gsbake.geometry.cameras import Camera
 from gsbake.imaging.srgb import decode_bytes

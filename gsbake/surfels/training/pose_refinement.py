@@ -17,7 +17,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gsbake.capture.photos.exposure import MAX_SPREAD
+from gsbake.capture.exposure import MAX_SPREAD
 from gsbake.geometry.cameras import CameraSet
 from gsbake.monitor import Rule
 from gsbake.surfels.training import alignment as align
@@ -92,7 +92,7 @@ def pose_rule(rule: Rule, cameras: CameraSet, size: int) -> tuple[Rule, str]:
 
 
 def exposure_rule(rule: Rule, spread: float | None) -> tuple[Rule, str]:
-    """The `rule` of exposure refinement for photos with this `spread` of tie points (`capture.photos.exposure`, None: too few of them), and
+    """The `rule` of exposure refinement for photos with this `spread` of tie points (`capture.exposure`, None: too few of them), and
     the reason where it differs."""
     if rule != "auto":
         return rule, ""

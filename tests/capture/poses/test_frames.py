@@ -11,10 +11,10 @@ import cv2
 import numpy as np
 import pytest
 
+from gsbake.capture.colmap import pycolmap
 from gsbake.capture.photos.decode import apply_orientation
 from gsbake.capture.poses.frames import PhotoIndex, PhotoSize, fit_to_photo, rotate_upright
 from gsbake.capture.poses.given import read_poses
-from gsbake.capture.sfm.colmap import pycolmap
 from gsbake.errors import BadInputError
 from gsbake.geometry.cameras import Camera, CameraSet, Similarity
 

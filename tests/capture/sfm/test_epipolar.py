@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 import pytest
 
+from gsbake.capture.colmap import pycolmap
 from gsbake.capture.photos.undistortion import distort, image_plane
-from gsbake.capture.sfm.colmap import pycolmap
 from gsbake.capture.sfm.epipolar import MIN_MATCHES, epipolar_error, sampson_distances
 from gsbake.geometry.cameras import Array, Camera
 

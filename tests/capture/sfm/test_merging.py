@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from gsbake.capture.sfm.colmap import pycolmap
+from gsbake.capture.colmap import pycolmap
 from gsbake.capture.sfm.merging import common_points, merge, merge_all
 from gsbake.capture.sfm.reconstruction import FeatureOptions, Lens, SfmPipeline, largest
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from gsbake.capture.photos.exposure import MAX_SPREAD
+from gsbake.capture.exposure import MAX_SPREAD
 from gsbake.capture.photos.roles import held_out
 from gsbake.capture.photos.undistortion import image_plane
 from gsbake.capture.sfm.epipolar import sampson_distances

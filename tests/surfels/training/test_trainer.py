@@ -12,7 +12,7 @@ import pytest
 import torch
 from scipy.spatial import cKDTree
 
-from gsbake.capture.photos.exposure import TiePointExposure
+from gsbake.capture.exposure import TiePointExposure
 from gsbake.capture.photos.roles import held_out
 from gsbake.capture.posed_photos import PosedPhotos
 from gsbake.checkpoint import load_checkpoint, save_checkpoint

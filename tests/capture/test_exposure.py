@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gsbake.capture.photos.exposure import MIN_POINTS, TiePointExposure
+from gsbake.capture.exposure import MIN_POINTS, TiePointExposure
 from gsbake.capture.poses.colmap_model import read_tracks
 from gsbake.geometry.cameras import Camera
 from gsbake.imaging.srgb import decode_bytes, encode_bytes
@@ -56,7 +56,7 @@ def test_the_spread_is_that_of_most_photos() -> None:
 
 
 def test_tracks_of_a_model_are_read(tmp_path: Path) -> None:
-    from gsbake.capture.sfm.colmap import pycolmap
+    from gsbake.capture.colmap import pycolmap
 
     options = pycolmap.SyntheticDatasetOptions()
     options.num_points3D = 50

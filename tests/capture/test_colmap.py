@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).resolve().parents[3]
+ROOT = Path(__file__).resolve().parents[2]
 
 
 @pytest.mark.parametrize("writer", ["cv2.imwrite(path, image)", "PIL.Image.fromarray(image).save(path)", "zlib.compress(image, 9)"])
@@ -18,7 +18,7 @@ def test_png_is_written_after_pycolmap(tmp_path: Path, writer: str) -> None:
     code = f"""
 import sys
 sys.path.insert(0, {str(ROOT)!r})
-from gsbake.capture.sfm.colmap import pycolmap
+from gsbake.capture.colmap import pycolmap
 import zlib, numpy as np, cv2, PIL.Image
 image = np.random.default_rng(0).integers(0, 255, (300, 300, 3), np.uint8)
 path = {str(tmp_path / "a.png")!r}
@@ -30,7 +30,7 @@ for _ in range(3):
 
 
 def test_zlib_is_imported_first() -> None:
-    tree = ast.parse((ROOT / "gsbake/capture/sfm/colmap.py").read_text())
+    tree = ast.parse((ROOT / "gsbake/capture/colmap.py").read_text())
     imports = [a.name for node in tree.body if isinstance(node, ast.Import) for a in node.names]
     assert imports.index("zlib") < imports.index("pycolmap")
 
@@ -54,7 +54,7 @@ def test_sigterm_is_left_to_the_stage(handler: str, code: int) -> None:
 import os, signal, sys
 sys.path.insert(0, {str(ROOT)!r})
 {handler}
-from gsbake.capture.sfm.colmap import pycolmap
+from gsbake.capture.colmap import pycolmap
 os.kill(os.getpid(), signal.SIGTERM)
 """
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=120, check=False)
