@@ -11,7 +11,7 @@ from typing import Any
 
 import torch
 
-from gsbake.imaging.srgb import GAMMA, LINEAR_THRESHOLD, OFFSET, SCALE, SLOPE, SRGB_THRESHOLD
+from gsbake.imaging.srgb import GAMMA, LINEAR_THRESHOLD, OFFSET, SCALE, SLOPE
 
 
 class _Encode(torch.autograd.Function):
@@ -33,8 +33,3 @@ class _Encode(torch.autograd.Function):
 def linear_to_srgb(linear: torch.Tensor) -> torch.Tensor:
     """sRGB in [0, 1] of linear values, any shape; the gradient of clipped values is that of the nearer end."""
     return _Encode.apply(linear)
-
-
-def srgb_to_linear(srgb: torch.Tensor) -> torch.Tensor:
-    """Linear values of sRGB values, any shape; differentiable, not clipped (the linear segment continues below 0)."""
-    return torch.where(srgb > SRGB_THRESHOLD, ((srgb.clamp_min(SRGB_THRESHOLD) + OFFSET) / SCALE).pow(GAMMA), srgb / SLOPE)

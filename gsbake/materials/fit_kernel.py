@@ -36,7 +36,6 @@ from gsbake.shading.split_sum_kernel import (
 )
 
 _0, _1, _2, _HALF = np.float32(0), np.float32(1), np.float32(2), np.float32(0.5)
-_U1 = np.uint64(1)
 # sRGB curve (IEC 61966-2-1).
 _THRESHOLD, _SLOPE, _SCALE, _OFFSET = np.float32(0.0031308), np.float32(12.92), np.float32(1.055), np.float32(0.055)
 _POWER = np.float32(1 / 2.4)

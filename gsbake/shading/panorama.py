@@ -1,4 +1,4 @@
-"""Equirectangular environment images: conventions, sampling and HDR export.
+"""Equirectangular environment images: conventions and sampling.
 
 Images are (h, 2h, 3) with the zenith in row 0; the centre of pixel (i, j) (row, column) is at u = (j + ½)/2h from left to right and
 v = 1 − (i + ½)/h from bottom to top. Two conventions map (u, v) to directions; both show the world from inside, not mirrored:
@@ -14,13 +14,11 @@ glTF's (x, y, z) is Blender's (x, −z, y), as its importer converts meshes: bot
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gsbake.errors import UsageError
 from gsbake.shading.cubemap import Array
 
 Convention = Literal["blender", "gltf"]
@@ -56,16 +54,3 @@ def sample(image: NDArray[np.floating], dirs: Array, convention: Convention = "b
     left, right, below = col % width, (col + 1) % width, np.minimum(row + 1, height - 1)
     top = (1.0 - fx) * image[row, left] + fx * image[row, right]
     return np.asarray((1.0 - fy) * top + fy * ((1.0 - fx) * image[below, left] + fx * image[below, right]))
-
-
-def write_hdr(path: Path | str, image: NDArray[np.floating]) -> None:
-    """Write linear RGB (h, w, 3) as a Radiance RGBE file. Raises UsageError when the file cannot be written."""
-    import OpenImageIO as oiio
-
-    pixels = np.ascontiguousarray(image, dtype=np.float32)
-    out = oiio.ImageOutput.create(str(path))
-    spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], 3, "float")
-    written = out is not None and out.open(str(path), spec) and out.write_image(pixels) and out.close()
-    if not written:
-        reason = out.geterror() if out is not None else oiio.geterror()
-        raise UsageError(f"Cannot write the environment image {path}: {reason.strip()}; check the folder and the free disk space.")

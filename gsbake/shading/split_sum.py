@@ -64,11 +64,6 @@ def shade(
     return _reference(normal, view, albedo, roughness, metallic, visibility_d, visibility_s, tables)
 
 
-def transmitted_share(normal: torch.Tensor, view: torch.Tensor, roughness: torch.Tensor) -> torch.Tensor:
-    """Share (n,) of diffuse reflection that a dielectric's specular layer lets through, 1 − D."""
-    return 1.0 - brdf.split_sum(soft_cosine((unit(normal) * view).sum(dim=1)), roughness).dielectric
-
-
 def reflectance(split: brdf.SplitSum, metal_colour: torch.Tensor, metallic: torch.Tensor) -> torch.Tensor:
     """Directional albedo (n, 3) of the specular lobe of materials of `metallic` (n,); `metal_colour` (n, 3) is albedo times metallic."""
     metal = metallic.unsqueeze(1)

@@ -61,14 +61,6 @@ def crease_quadrics(point: Doubles, edges: Ints, across: Doubles) -> Doubles:
     return total
 
 
-def evaluate(quadric: Doubles, point: Doubles) -> Doubles:
-    """Values (n,) of quadrics (n, 22) at points (n, 5)."""
-    a = np.zeros((len(quadric), DIMENSIONS, DIMENSIONS))
-    a[:, ROWS, COLUMNS] = quadric[:, :15]
-    a[:, COLUMNS, ROWS] = quadric[:, :15]
-    return np.asarray(np.einsum("ni,nij,nj->n", point, a, point) + 2 * _dot(quadric[:, 15:20], point) + quadric[:, 20])
-
-
 def _packed(a: Doubles, b: Doubles, c: Doubles, factor: Doubles, weight: Doubles) -> Doubles:
     """Quadrics (n, 22) of A, b and c times `factor`, with `weight`."""
     rows = np.concatenate([a[:, ROWS, COLUMNS], b, c[:, None]], 1)

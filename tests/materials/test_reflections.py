@@ -24,9 +24,10 @@ from gsbake.materials.reflections import ReflectionTracer
 from gsbake.materials.visibility import Visibility
 from gsbake.shading.environment import EnvironmentLight
 from gsbake.shading.reflection_kernel import specular_visibility
-from gsbake.shading.split_sum import shade, transmitted_share
+from gsbake.shading.split_sum import shade
 from gsbake.texturing.texels import rasterise
 from tests.support.cameras import look_at
+from tests.support.split_sum import transmitted_share
 
 Doubles = NDArray[np.float64]
 SIZE = 64

@@ -22,10 +22,10 @@ from gsbake.materials.pixels import PixelReader, Pixels
 from gsbake.materials.visibility import ROTATIONS, Visibility, directions, unoccluded_irradiance
 from gsbake.shading import cubemap
 from gsbake.shading.environment import EnvironmentLight
-from gsbake.shading.split_sum import transmitted_share
 from gsbake.texturing.texels import Texels, rasterise
 from tests.support.cameras import look_at
 from tests.support.monte_carlo import render
+from tests.support.split_sum import transmitted_share
 
 Doubles = NDArray[np.float64]
 WHITE = EnvironmentLight.from_function(lambda d: np.ones((len(d), 3)), 16).radiance().detach().numpy()

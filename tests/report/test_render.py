@@ -14,8 +14,8 @@ from gsbake.imaging.srgb import decode, encode
 from gsbake.report.lights import PROCEDURAL_LIGHTS, LitShader, procedural
 from gsbake.report.render import Asset, Renderer, unlit
 from gsbake.shading.environment import EnvironmentLight
-from gsbake.shading.split_sum import transmitted_share
 from tests.report.shapes import ball, front_camera, quad
+from tests.support.split_sum import transmitted_share
 
 
 def test_srgb_known_values() -> None:

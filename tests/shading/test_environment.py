@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from gsbake.errors import BadInputError, UsageError
+from gsbake.errors import BadInputError
 from gsbake.geometry.vectors import unit
 from gsbake.imaging import srgb_torch
 from gsbake.shading import cubemap, neutral_light, panorama
@@ -102,18 +102,6 @@ def test_bad_files_are_named(tmp_path: Path) -> None:
         EnvironmentLight.from_radiance(np.ones((6, 4, 5, 3)))
     with pytest.raises(BadInputError, match="negative"):
         EnvironmentLight.from_radiance(-np.ones((6, 4, 4, 3)))
-    with pytest.raises(UsageError, match="Cannot write"):
-        panorama.write_hdr(tmp_path / "none" / "light.hdr", np.ones((2, 4, 3)))
-
-
-def test_hdr_file(tmp_path: Path) -> None:
-    import OpenImageIO as oiio
-
-    image = np.random.default_rng(1).exponential(3.0, (16, 32, 3)).astype(np.float32)
-    panorama.write_hdr(tmp_path / "light.hdr", image)
-    back = np.asarray(oiio.ImageBuf(str(tmp_path / "light.hdr")).get_pixels(oiio.FLOAT), dtype=np.float32)
-    # RGBE shares one exponent: 8 bits of the largest channel.
-    assert (np.abs(back - image) <= image.max(axis=-1, keepdims=True) / 128).all()
 
 
 def test_srgb() -> None:
@@ -122,10 +110,8 @@ def test_srgb() -> None:
     expected = [12.92 * x if x <= 0.0031308 else 1.055 * x ** (1 / 2.4) - 0.055 for x in linear.tolist()]
     np.testing.assert_allclose(coded.numpy(), expected, atol=1e-12)
     assert coded[4].item() == pytest.approx(0.5, abs=1e-5)
-    torch.testing.assert_close(srgb_torch.srgb_to_linear(coded), linear, rtol=0, atol=1e-7)
     inside = torch.tensor([0.0005, 0.002, 0.004, 0.3, 0.99], dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(srgb_torch.linear_to_srgb, (inside,))
-    assert torch.autograd.gradcheck(srgb_torch.srgb_to_linear, (torch.tensor([0.01, 0.2, 0.9], dtype=torch.float64, requires_grad=True),))
     wide = torch.tensor([-0.5, 0.0, 1.0, 7.0], dtype=torch.float64, requires_grad=True)
     out = srgb_torch.linear_to_srgb(wide)
     assert out.tolist() == pytest.approx([0.0, 0.0, 1.0, 1.0])

@@ -2,18 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, Protocol
 
 from torch import Tensor
 
 from gsbake.surfels.model import Surfels
-
-
-class Colours(Protocol):
-    """Colours of a marched field."""
-
-    def __call__(self, points: Tensor, normals: Tensor, directions: Tensor, /) -> Tensor:
-        """sRGB (n, 3) in 0..1 at points (n, 3) with unit normals (n, 3), seen along unit directions (n, 3)."""
 
 
 class CoupledField(Protocol):
@@ -32,8 +26,8 @@ class CoupledField(Protocol):
         """Size of the finest cell (unit frame)."""
 
     @property
-    def radiance(self) -> Colours | None:
-        """Colours of the field's own, where a coupling marches them."""
+    def radiance(self) -> Callable[[Tensor, Tensor, Tensor], Tensor] | None:
+        """sRGB (n, 3) of the field's own at points (n, 3) with unit normals (n, 3), seen along unit directions (n, 3); None without."""
 
     def value(self, points: Tensor, /) -> Tensor:
         """Signed distance (n,) at points (n, 3)."""

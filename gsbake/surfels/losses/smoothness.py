@@ -16,7 +16,7 @@ from gsbake.surfels.raster.blocks import JIT
 from gsbake.surfels.raster.lanes import EXP2_COEFFICIENTS, LANES, broadcast, exp2, load, select, store, sum_lanes
 
 STRIP = 64
-_ZERO, _ONE = np.float32(0.0), np.float32(1.0)
+_ZERO = np.float32(0.0)
 _U1, _U8 = np.uint64(1), np.uint64(LANES)
 #: 2^(this · |∇grey|) is exp(−10 |∇grey|).
 EDGE = np.float32(-10 / np.log(2))
