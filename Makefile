@@ -64,11 +64,13 @@ demo: setup ## Bake the built-in capture with the smallest profile
 docs: setup ## Build the documentation into site/ (open site/index.html)
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet --strict
 
-check: setup ## Lint and types
+check: setup ## Lint, types, order of the layers, dead code
 	$(BIN)/ruff check .
 	$(BIN)/mypy
+	$(BIN)/lint-imports --no-logo --no-cache
+	$(BIN)/vulture
 
-test: check node ## Lint, types and the quick tests, in two processes: WORKERS=2
+test: check node ## The checks and the quick tests, in two processes: WORKERS=2
 	$(BIN)/pytest $(QUICK)
 
 coverage: setup node ## The quick tests with the share of lines they run, which takes about half as long again
