@@ -24,7 +24,7 @@ from pathlib import Path
 from benchmarks.charts import COLOURS, Panel, Series, write
 from benchmarks.step import profile
 from gsbake.api import RunOptions, open_session
-from gsbake.kernel_threads import configure
+from gsbake.kernels.threads import configure
 from gsbake.pipeline.machine import default_threads
 from gsbake.synth.capture import write_capture
 

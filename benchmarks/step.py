@@ -22,7 +22,7 @@ import torch
 
 from benchmarks.raster import sphere
 from gsbake.config.schema import Profile
-from gsbake.kernel_threads import configure, thread_count
+from gsbake.kernels.threads import configure, thread_count
 from gsbake.shading import light_tables as tables
 from gsbake.shading import split_sum_kernel as light_kernels
 from gsbake.shading.environment import EnvironmentLight

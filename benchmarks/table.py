@@ -26,7 +26,7 @@ import numpy as np
 
 from benchmarks.raster import sphere
 from benchmarks.step import profile
-from gsbake.kernel_threads import configure, thread_count
+from gsbake.kernels.threads import configure, thread_count
 from gsbake.surfels.raster.rasterise import render
 from gsbake.surfels.raster.reference import render_reference
 

@@ -16,6 +16,16 @@ def run(ctx: Context) -> dict[str, Any]:
     return bake_textures(poses, surfels, mesh, ctx.out, options, seed=ctx.seed, threads=ctx.threads, monitor=ctx)
 
 
+#: Modules with the kernels of this stage, and with those of the material fit.
+KERNELS = (
+    "gsbake.texturing.texels", "gsbake.texturing.packing", "gsbake.texturing.ambient_occlusion", "gsbake.texturing.gather_kernel",
+    "gsbake.texturing.view_fusion",
+)  # fmt: skip
+FIT_KERNELS = (
+    "gsbake.materials.visibility", "gsbake.materials.fit_kernel", "gsbake.materials.linear_shading", "gsbake.materials.remaining_shading",
+)  # fmt: skip
+
+
 STAGE = Stage(
     name="bake",
     version=45,
@@ -29,4 +39,5 @@ STAGE = Stage(
     ),
     uses_device=True,
     seeded=True,
+    kernels=lambda settings: KERNELS + FIT_KERNELS if settings.bake.materials == "fit" else KERNELS,
 )  # fmt: skip

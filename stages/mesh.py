@@ -21,6 +21,14 @@ def run(ctx: Context) -> dict[str, Any]:
     )  # fmt: skip
 
 
+#: Modules with the kernels of this stage.
+KERNELS = (
+    "gsbake.meshing.fusion_kernel", "gsbake.meshing.depth_views", "gsbake.meshing.hole_filling", "gsbake.geometry.sparse_lattice",
+    "gsbake.meshing.marching_cubes", "gsbake.meshing.refinement.normals", "gsbake.geometry.surface_distance",
+    "gsbake.meshing.refinement.photometric_kernel",
+)  # fmt: skip
+
+
 STAGE = Stage(
     name="mesh",
     version=8,
@@ -32,4 +40,5 @@ STAGE = Stage(
         "mesh.*", "surfels.projected_depth", "train.max_size", "stereo.max_size", "skip.empty_cells", "export.max_triangles",
     ),
     uses_device=True,
+    kernels=lambda settings: KERNELS,
 )  # fmt: skip

@@ -18,6 +18,10 @@ def run(ctx: Context) -> dict[str, Any]:
     )  # fmt: skip
 
 
+#: Modules with the kernels of this stage.
+KERNELS = ("gsbake.capture.hull.visual_hull", "gsbake.capture.sfm.matching", "gsbake.capture.hull.ray_distance")
+
+
 STAGE = Stage(
     name="poses",
     version=14,
@@ -27,4 +31,5 @@ STAGE = Stage(
     needs=("ingest",),
     settings=("poses.*", "skip.redundant_photos"),
     seeded=True,
+    kernels=lambda settings: KERNELS,
 )

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from gsbake.pipeline.stage import Context, Stage
+from gsbake.stages.train import KERNELS
 
 
 def run(ctx: Context) -> dict[str, Any]:
@@ -33,4 +34,5 @@ STAGE = Stage(
     ),
     uses_device=True,
     seeded=True,
+    kernels=lambda settings: KERNELS,
 )  # fmt: skip

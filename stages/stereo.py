@@ -16,6 +16,13 @@ def run(ctx: Context) -> dict[str, Any]:
     )
 
 
+#: Modules with the kernels of this stage.
+KERNELS = (
+    "gsbake.mvs.patchmatch", "gsbake.mvs.depth_bounds", "gsbake.capture.hull.softness", "gsbake.mvs.consistency", "gsbake.mvs.fusion",
+    "gsbake.mvs.mirror_images", "gsbake.mvs.carving",
+)  # fmt: skip
+
+
 STAGE = Stage(
     name="stereo",
     version=11,
@@ -25,4 +32,5 @@ STAGE = Stage(
     needs=("poses",),
     settings=("stereo.*",),
     seeded=True,
+    kernels=lambda settings: KERNELS,
 )

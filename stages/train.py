@@ -21,6 +21,14 @@ def run(ctx: Context) -> dict[str, Any]:
     )  # fmt: skip
 
 
+#: Modules with the kernels of this stage.
+KERNELS = (
+    "gsbake.surfels.raster.kernel", "gsbake.surfels.raster.projection", "gsbake.surfels.losses.photometric",
+    "gsbake.surfels.losses.geometry", "gsbake.surfels.raster.binning", "gsbake.surfels.spherical_harmonics",
+    "gsbake.surfels.losses.projection", "gsbake.surfels.adam",
+)  # fmt: skip
+
+
 STAGE = Stage(
     name="train",
     version=12,
@@ -35,4 +43,5 @@ STAGE = Stage(
     ),
     uses_device=True,
     seeded=True,
+    kernels=lambda settings: KERNELS,
 )  # fmt: skip

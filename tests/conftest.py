@@ -8,5 +8,5 @@ import os
 for _pool in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OPENCV_FOR_THREADS_NUM"):
     os.environ.setdefault(_pool, "2")
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # spinning threads make each of two processes on two cores several times slower
-os.environ.setdefault("GSBAKE_WARM_UP", "never")  # a small bake of its own before the first run
+os.environ.setdefault("GSBAKE_COMPILE", "never")  # `make test` compiles them ahead of the tests
 os.environ.setdefault("NUMBA_THREADING_LAYER_PRIORITY", "omp workqueue tbb")  # an old TBB on the machine would only warn

@@ -36,7 +36,7 @@ class QuietDisplay(Observer):
 
 
     def preparing(self, done: int, total: int, text: str) -> None:
-        """Kernels are compiled, at stage `done` of `total`; `text` names the stage, empty at the end."""
+        """A stage waits for its kernels, of which `done` of `total` modules are compiled; `text` names it, empty when it goes on."""
 
 
 class PlainDisplay(QuietDisplay):
@@ -56,8 +56,11 @@ class PlainDisplay(QuietDisplay):
         self.console.print(cell(f"{_clock(time.monotonic() - self._begin)}  {text}"))
 
     def preparing(self, done: int, total: int, text: str) -> None:
-        """Print a line per stage while kernels are compiled."""
-        self.line(_PREPARED if not text else f"kernels: compiling those of {text}, {done} of {total} stages (once per installation)")
+        """Print once that a stage waits for its kernels, and when it goes on."""
+        waiting = text and f"kernels: compiling those of {text} (once per installation)"
+        if waiting != self._waiting:
+            self._waiting = waiting
+            self.line(waiting or _PREPARED)
 
     def run_started(self, stages: list[Stage]) -> None:
         """Start the clock."""

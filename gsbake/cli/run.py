@@ -10,9 +10,9 @@ from typing import Any
 from gsbake.api import Result, Session
 from gsbake.cli.display import choose_display, close_display
 from gsbake.cli.inspect import plan_document, print_plan
+from gsbake.cli.kernels import compiling
 from gsbake.cli.options import Options
 from gsbake.cli.output import print_json, print_text
-from gsbake.cli.warm_up import compile_kernels
 from gsbake.live.server import LiveView
 from gsbake.live.state import LiveState
 from gsbake.pipeline.plan import StageState
@@ -33,8 +33,7 @@ def run_pipeline(options: Options, target: str | None) -> None:
             print_plan(states)
         return
     try:
-        compile_kernels(session, target, display)
-        with serving(state, session):
+        with compiling(session, target, display), serving(state, session):
             result = session.run(target)
     finally:
         close_display(display)

@@ -12,9 +12,10 @@ from __future__ import annotations
 
 from typing import Any
 
-import numba as nb
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
+from gsbake.kernels.declaration import kernel
 
 Floats = NDArray[np.float32]
 Ints = NDArray[np.int32]
@@ -80,7 +81,7 @@ class BlockLattice:
         return out
 
 
-@nb.njit(cache=True)
+@kernel("f8[:, ::1], f8, b1[:, :, ::1]")
 def _mark_blocks(scaled: Any, radius: float, marked: Any) -> None:
     """Mark blocks with samples within `radius` of `scaled` (n, 3); lengths in cells."""
     for p in range(scaled.shape[0]):
@@ -96,7 +97,7 @@ def _mark_blocks(scaled: Any, radius: float, marked: Any) -> None:
                     marked[a, b, c] = True
 
 
-@nb.njit(cache=True)
+@kernel("i4[:, :, ::1], f4[:, :, :, ::1], i8[::1], f4[:, :, ::1]")
 def gather_samples(index: Any, values: Any, start: Any, out: Any) -> None:
     """Copy the samples from lattice sample `start` (3,) on into the dense `out`; samples of missing blocks are not written."""
     for i in range(out.shape[0]):

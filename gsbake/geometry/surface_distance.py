@@ -15,6 +15,8 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from gsbake.kernels.declaration import kernel
+
 Doubles = NDArray[np.float64]
 
 #: Points of one call of the kernel.
@@ -109,7 +111,7 @@ def _triangle_distance(x: Any, y: Any, z: Any, corners: Any) -> Any:
     return rx * rx + ry * ry + rz * rz
 
 
-@nb.njit(cache=True, nogil=True, error_model="numpy")
+@kernel("f8[:, ::1], f8[:, :, ::1], f8[:, ::1], f8[:, ::1], f8[::1]", nogil=True, error_model="numpy")
 def _distances(points: Any, corners: Any, lower: Any, upper: Any, out: Any) -> None:
     """Write the distances `out` (n,) of points (n, 3) to triangles (f, 3, 3) in a tree of boxes (m, 3)."""
     leaves = len(lower) // 2

@@ -83,7 +83,7 @@ def draw(out: Path, source: Path, transfer: str) -> NDArray[np.float32]:
 
 def _surfels(source: Path, transfer: str, camera: Any) -> NDArray[np.float32]:
     from gsbake.checkpoint import load_checkpoint
-    from gsbake.kernel_threads import configure
+    from gsbake.kernels.threads import configure
     from gsbake.surfels.model import Surfels
     from gsbake.surfels.renderer import SurfelRenderer
     from gsbake.surfels.transfer import transfer_by_name

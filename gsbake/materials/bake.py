@@ -17,7 +17,7 @@ from gsbake.errors import BadInputError
 from gsbake.geometry.ply import read_mesh
 from gsbake.geometry.raycast import RayCaster
 from gsbake.imaging.exr import write_exr
-from gsbake.kernel_threads import configure
+from gsbake.kernels.threads import configure
 from gsbake.materials.delighting import find_irradiance, remove_shading
 from gsbake.materials.fitting import RAY_OFFSET, SMOOTHING_RADIUS, FitSettings, fit_materials
 from gsbake.monitor import SILENT, Monitor, Rule, decide_skip

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from numba import njit, prange
 
+from gsbake.kernels.declaration import kernel
 from gsbake.shading.reflection_kernel import reflected_radiance, specular_visibility
 from gsbake.shading.split_sum_kernel import (
     _CLAMP_TERM,
@@ -58,7 +59,11 @@ def srgb_and_slope(linear: Any) -> Any:
     return _SLOPE * linear, _SLOPE
 
 
-@njit(parallel=True, **_FLAGS)
+@kernel(
+    "i4[:, ::1], f4[:, ::1], f4[:, ::1], f4[:, ::1], f4[:, ::1], f4[::1], i4[::1], f4[:, ::1], f4[:, ::1], f4[:, ::1], f4[::1], i8[::1], "
+    "i8[::1], Array(f4, 3, 'C', readonly=True), f4, f4, f4, f4[:, ::1], f4[:, :, ::1], f8[:, ::1]",
+    parallel=True, **_FLAGS,
+)
 def shade_and_differentiate(
     texel: Any, bilinear: Any, normal: Any, view: Any, colour: Any, weight: Any, reflected: Any,
     values: Any, transport: Any, table: Any, knots: Any, sizes: Any, offsets: Any, lut: Any,
@@ -235,7 +240,7 @@ def _shade_chunk(
     sums[2] += weight_sum
 
 
-@njit(parallel=True, **_FLAGS)
+@kernel("i4[::1], i8[::1], i4[::1], f4[::1], f4[:, ::1], f4[:, ::1], f4[:, ::1]", parallel=True, **_FLAGS)
 def gather_gradient(touched: Any, start: Any, pixel: Any, share: Any, gradient: Any, values: Any, out: Any) -> None:
     """Set rows `touched` (m,) of `out` (texels, PARAMETERS) to the gradient of the texels' parameters `values` (texels, PARAMETERS).
 
@@ -276,7 +281,11 @@ def _sign(x: Any) -> Any:
     return np.float32(x > _0) - np.float32(x < _0)
 
 
-@njit(parallel=True, **_FLAGS)
+@kernel(
+    "f4[:, ::1], f4[:, ::1], f4[:, ::1], f4[:, ::1], f4[:, ::1], f4[:, ::1], i8[::1], i4[::1], f4[::1], f4[::1], f4, f4[:, ::1], f4[::1], "
+    "f4[::1], f4, f4, f4, f4, f4",
+    parallel=True, **_FLAGS,
+)
 def adam_step(
     raw: Any, values: Any, new_values: Any, data: Any, first: Any, second: Any, start: Any, neighbour: Any, smoothness: Any,
     mean_weight: Any, offset_weight: Any, common: Any, common_weight: Any, rate: Any, beta1: Any, beta2: Any, correction1: Any,
@@ -325,7 +334,11 @@ def adam_step(
                 new_values[t, c] = r if c >= 5 else _1 / (_1 + math.exp(-r))
 
 
-@njit(parallel=True, **_FLAGS)
+@kernel(
+    "f4[:, ::1], f4[:, ::1], i4[::1], f4[:, ::1], f4[:, ::1], f4[:, ::1], f4[::1], i8[::1], i8[::1], Array(f4, 3, 'C', readonly=True), "
+    "f4[:, ::1], f4[:, ::1]",
+    parallel=True, **_FLAGS,
+)
 def incident_light(
     normal: Any, view: Any, reflected: Any, local: Any, transport: Any, table: Any, knots: Any, sizes: Any, offsets: Any, lut: Any,
     diffuse: Any, bounced: Any,
@@ -350,7 +363,11 @@ def incident_light(
             reflected_radiance(transport, np.uint64(reflected[i]), x, y, z, table, knots, sizes, offsets, lut, bounced[i])
 
 
-@njit(parallel=True, **_FLAGS)
+@kernel(
+    "i8[::1], f4[:, ::1], f4[:, ::1], i4[::1], f4[:, ::1], f4[:, ::1], f4[:, ::1], f4[::1], f4[:, ::1], f4[::1], i8[::1], i8[::1], "
+    "Array(f4, 3, 'C', readonly=True), f4[:, ::1], f4[:, ::1], f4[:, ::1], f4[:, ::1]",
+    parallel=True, **_FLAGS,
+)
 def linear_shading(
     texel: Any, normal: Any, view: Any, reflected: Any, local: Any, wide: Any, bounced: Any, rough: Any, table: Any, knots: Any,
     sizes: Any, offsets: Any, lut: Any, diffuse: Any, specular: Any, scaled: Any, edge: Any,
@@ -392,7 +409,7 @@ def linear_shading(
             edge[i, ch] = light * bias
 
 
-@njit(parallel=True, **_FLAGS)
+@kernel("f4[:, ::1], i4[:, ::1], f4[:, ::1], f4[:, ::1]", parallel=True, **_FLAGS)
 def interpolate_taps(values: Any, texel: Any, bilinear: Any, out: Any) -> None:
     """`out` (n, c): `values` (texels, c) at the taps `texel` (n, 4) with the weights `bilinear` (n, 4)."""
     for i in prange(texel.shape[0]):

@@ -20,10 +20,11 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 from numpy.typing import NDArray
 
 from gsbake.imaging.srgb import encode
+from gsbake.kernels.declaration import kernel
 
 Floats = NDArray[np.float64]
 
@@ -109,7 +110,10 @@ class BaseColourSolver:
         return base
 
 
-@njit(parallel=True, nogil=True, cache=True, error_model="numpy")
+@kernel(
+    "i8[::1], f4[:, ::1], f4[:, ::1], f4[:, ::1], f4[:, ::1], f4[:, ::1], f8, i8, b1, f8[:, ::1]",
+    parallel=True, nogil=True, error_model="numpy",
+)
 def solve_base_colours(
     texel: Any, slope: Any, offset: Any, colour: Any, weight: Any, curve: Any, lowest: Any, rounds: Any, robust: Any, base: Any
 ) -> None:

@@ -28,6 +28,7 @@ import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
 
+from gsbake.kernels.declaration import kernel
 from gsbake.materials.delighting import harmonics, nearby_pairs
 from gsbake.shading.cubemap import directions
 
@@ -108,7 +109,10 @@ def _solve(pairs: _Pairs, widening: float) -> tuple[Doubles, float]:
     return found, float(agreement.sum())
 
 
-@njit(parallel=True, nogil=True, cache=True)
+@kernel(
+    "i4[::1], i4[::1], f4[:, ::1], f4[::1], f4[::1], f4[:, ::1], f8, f8[:, :, :, ::1], f8[:, :, ::1], f8[:, ::1], f8[::1]",
+    parallel=True, nogil=True,
+)
 def normal_equations(
     first: Any, second: Any, points: Any, share: Any, scale: Any, found: Any, wider: Any, matrices: Any, rights: Any, weights: Any,
     agreement: Any,

@@ -23,13 +23,14 @@ from typing import Any
 
 import numpy as np
 import scipy.sparse
-from numba import njit, prange
+from numba import prange
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from gsbake.geometry.raycast import RayCaster
 from gsbake.geometry.vectors import unit
+from gsbake.kernels.declaration import kernel
 from gsbake.shading import cubemap
 from gsbake.texturing.ambient_occlusion import smooth_over_surface
 from gsbake.texturing.texels import Texels
@@ -67,7 +68,7 @@ def _cells(count: int, size: int) -> scipy.sparse.csr_matrix:
     return scipy.sparse.csr_matrix((weight.astype(np.float32), (rows, np.tile(column, ROTATIONS))), shape=(ROTATIONS * count, len(centre)))
 
 
-@njit(parallel=True, nogil=True, cache=True, error_model="numpy")
+@kernel("f4[:, ::1], i8[::1], f4[:, :, :], f4[:, ::1], f4[::1]", parallel=True, nogil=True, error_model="numpy")
 def unoccluded_irradiance(normal: Any, rotation: Any, copies: Any, cells: Any, out: Any) -> None:
     """`out` (n,): irradiance / π of surfaces with unit `normal` (n, 3) under `cells` (ROTATIONS, count), each summed over the directions
     `copies` (ROTATIONS, count, 3) of its own `rotation` (n,)."""

@@ -10,12 +10,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
 from gsbake.geometry.cameras import Camera
 from gsbake.imaging.distance import distance_to_zero
+from gsbake.kernels.declaration import kernel
 
 Floats = NDArray[np.float32]
 
@@ -131,7 +131,7 @@ def _cosine(camera: Camera, normal: Floats) -> Floats:
         return np.where((length > 0.5) & np.isfinite(value), value, 0).astype(np.float32)
 
 
-@nb.njit(cache=True)
+@kernel("f4[:, ::1], f4[:, ::1], f4, f4")
 def _has_consistent_neighbours(depth: Any, cosine: Any, tolerance: Any, pixel: Any) -> Any:
     """Whether at least two of the eight neighbours lie on the same layer: within `tolerance` / 2 plus the slope's depth change."""
     height, width = depth.shape

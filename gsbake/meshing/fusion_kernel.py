@@ -16,6 +16,7 @@ import numba as nb
 import numpy as np
 
 from gsbake.geometry.sparse_lattice import EDGE
+from gsbake.kernels.declaration import kernel
 
 #: Bits of `observed`: the sample lies in front of or near a measured depth; the sample projects outside a mask.
 OBSERVED_BY_DEPTH, OBSERVED_BY_MASK = 1, 2
@@ -26,7 +27,7 @@ BLOCK_VISIBLE, BLOCK_UNOBSERVED, BLOCK_OCCLUDED = 0, 1, 2
 TILE = 8
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel("f4[:, ::1], f4[:, ::1], f4", nogil=True)
 def max_depth_tiles(inverse_depth: Any, mask_distance: Any, truncation: Any) -> Any:
     """Maximum z-depth that each tile of 8 x 8 pixels affects: -1 = no depth, inf = the tile has pixels outside the mask."""
     height, width = inverse_depth.shape
@@ -84,7 +85,11 @@ def _classify_block(
     return BLOCK_OCCLUDED if pz - radius > farthest else BLOCK_VISIBLE
 
 
-@nb.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(
+    "i8, i8, i4[:, ::1], f4[::1], f4, f4, f4[:, ::1], f4[::1], f4[::1], f4[:, ::1], f4[:, ::1], f4[:, ::1], f4[:, ::1], f4[:, ::1], f4, "
+    "f4, f4[:, :, :, ::1], f4[:, :, :, ::1], u1[:, :, :, ::1], u2[:, :, :, ::1], i4[::1]",
+    nogil=True, error_model="numpy",
+)
 def fuse_view(
     start: int,
     stop: int,
@@ -192,7 +197,7 @@ def fuse_view(
                             observed[n, i, j, k] |= OBSERVED_BY_DEPTH
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel("f4[:, ::1], f4[:, ::1], f8[::1, :], f8[::1], f8[::1], f8, b1[:, :, ::1]", nogil=True)
 def mark_blocks_near_depth(
     inverse_depth: Any, mask_distance: Any, to_lattice: Any, origin: Any, intrinsics: Any, radius: float, marked: Any
 ) -> None:

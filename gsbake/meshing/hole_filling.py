@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation
 
 from gsbake.geometry.sparse_lattice import EDGE, BlockLattice, Floats
-from gsbake.kernel_threads import run_chunks
+from gsbake.kernels.declaration import kernel
+from gsbake.kernels.threads import run_chunks
 
 #: Minimum slope (per sample) in conductivities; it keeps the transition a few samples wide.
 MIN_SLOPE = 0.01
@@ -89,7 +90,10 @@ def _block_of_sample(index: Any, coords: Any, row: int, i: int, j: int, k: int) 
     return np.int64(index[a, b, c])
 
 
-@nb.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(
+    "i8, i8, i4[:, :, ::1], i4[:, ::1], i8[::1], f4[:, :, :, ::1], b1[:, :, :, ::1], f4[:, :, :, ::1], i8, f4",
+    nogil=True, error_model="numpy",
+)
 def _half_sweep(
     start: int, stop: int, index: Any, coords: Any, rows: Any, values: Any, unknown: Any, conductivity: Any, parity: int, rate: float
 ) -> None:
@@ -123,7 +127,7 @@ def _half_sweep(
                         values[row, i, j, k] += rate * (total / weight_sum - values[row, i, j, k])
 
 
-@nb.njit(cache=True, nogil=True, error_model="numpy")
+@kernel("i8, i8, i4[:, :, ::1], i4[:, ::1], i8[::1], f4[:, :, :, ::1], f4[:, :, :, ::1]", nogil=True, error_model="numpy")
 def _conductivity(start: int, stop: int, index: Any, coords: Any, rows: Any, values: Any, out: Any) -> None:
     """1 / |∇f| by central differences, one-sided at the boundary."""
     for n in range(start, stop):

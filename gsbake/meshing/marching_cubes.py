@@ -10,12 +10,12 @@ from __future__ import annotations
 
 from typing import Any
 
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 from skimage.measure import marching_cubes
 
 from gsbake.geometry.sparse_lattice import EDGE, BlockLattice, Floats, gather_samples
+from gsbake.kernels.declaration import kernel
 
 #: Samples along a super-block's edge, without the layer shared with the next one: 1 MB of field.
 SUPER_BLOCK = 8 * EDGE
@@ -23,7 +23,7 @@ SUPER_BLOCK = 8 * EDGE
 MIN_MAGNITUDE = 2e-3
 
 
-@nb.njit(cache=True)
+@kernel("f4[:, :, ::1], i8[::1], f8, f8, f4[:, :, ::1]")
 def upsample_coarse(coarse: Any, start: Any, ratio: float, scale: float, out: Any) -> None:
     """Fill the dense `out`, whose first sample is fine sample `start`, with the trilinear `coarse` lattice times `scale`, clamped to ±1.
 

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from gsbake.geometry.sparse_lattice import EDGE, BlockLattice
-from gsbake.kernel_threads import run_chunks
+from gsbake.kernels.threads import run_chunks
 from gsbake.meshing.depth_views import DepthView, Floats
 from gsbake.meshing.fusion_kernel import OBSERVED_BY_DEPTH, OBSERVED_BY_MASK, fuse_view, mark_blocks_near_depth, max_depth_tiles
 from gsbake.meshing.hole_filling import minimise_area, sign_change_blocks, solve_laplace

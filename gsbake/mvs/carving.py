@@ -20,7 +20,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
@@ -29,6 +28,7 @@ from gsbake.capture.hull.rays import camera_arrays, concatenate_images, half_ste
 from gsbake.capture.hull.softness import SOFT
 from gsbake.capture.hull.visual_hull import Hull
 from gsbake.geometry.cameras import Camera
+from gsbake.kernels.declaration import kernel
 from gsbake.mvs.mirror_images import behind_hard_parts
 from gsbake.mvs.ncc import FASTMATH
 
@@ -81,7 +81,10 @@ class CarvedHull:
     silhouette_violations: int
 
 
-@nb.njit(fastmath=FASTMATH, error_model="numpy", nogil=True, cache=True)
+@kernel(
+    "f4[:, :, ::1], f8[::1], f8, f8, f4[::1], i8[::1], i8[:, ::1], f8[:, ::1], f8[:, :, ::1], f4[:, :, ::1], f4[:, :, ::1]",
+    fastmath=FASTMATH, error_model="numpy", nogil=True,
+)
 def _count_votes(
     field: Any, lower: Any, cell: float, band: float, depth: Any, starts: Any, sizes: Any, intrinsics: Any, poses: Any,
     free: Any, surface: Any,
@@ -109,7 +112,10 @@ def _count_votes(
                         surface[i, j, k] += np.float32(1)
 
 
-@nb.njit(fastmath=FASTMATH, error_model="numpy", nogil=True, cache=True)
+@kernel(
+    "i8[::1, :], b1[:, :, ::1], f8[::1], f8, i8[:, ::1], f8[:, ::1], f8[:, :, ::1], f8[:, ::1], i8[::1]",
+    fastmath=FASTMATH, error_model="numpy", nogil=True,
+)
 def _count_empty_rays(
     cells: Any, left: Any, lower: Any, cell: float, sizes: Any, intrinsics: Any, poses: Any, centres: Any, out: Any
 ) -> None:

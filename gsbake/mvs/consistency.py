@@ -12,11 +12,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
 from gsbake.geometry.cameras import Camera
+from gsbake.kernels.declaration import kernel
 from gsbake.mvs.ncc import FASTMATH
 from gsbake.mvs.pyramids import relative_pose
 
@@ -39,7 +39,11 @@ class Consistency:
     scatter: Floats
 
 
-@nb.njit(fastmath=FASTMATH, error_model="numpy", nogil=True, cache=True)
+@kernel(
+    "f4[:, :, ::1], u1[:, ::1], f4[::1], i8, i8[:, ::1], f4[:, ::1], f4[:, :, ::1], f4[:, ::1], f4[:, ::1], u1[::1], i8[::1], f4, f4, f4, "
+    "f4, u1[:, ::1], u1[:, ::1], f4[:, :, ::1], f4[:, ::1]",
+    fastmath=FASTMATH, error_model="numpy", nogil=True,
+)
 def _check(
     plane: Any, valid: Any, intrinsics: Any, others: Any, sizes: Any, other_intrinsics: Any, rotations: Any, translations: Any,
     other_planes: Any, other_valid: Any, starts: Any, share: Any, pixels: Any, cosine: Any, violation_margin: Any,

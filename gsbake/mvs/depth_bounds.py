@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from gsbake.capture.hull.rays import trilinear
 from gsbake.capture.hull.visual_hull import Hull
 from gsbake.geometry.cameras import Array, Camera
+from gsbake.kernels.declaration import kernel
 from gsbake.mvs.ncc import FASTMATH
 
 Floats = NDArray[np.float32]
@@ -36,7 +37,7 @@ def _crossing(field: Any, origin: Any, direction: Any, start: float, stop: float
     return -1.0
 
 
-@nb.njit(error_model="numpy", nogil=True, cache=True)
+@kernel("u1[:, ::1], f8[:, :, ::1], f8[::1], f8, f4[:, :, ::1], f8[::1], f8, f8, f8[:, ::1], f8[:, ::1]", error_model="numpy", nogil=True)
 def _bounds(
     inside: Any, rays: Any, centre: Any, ball: float, field: Any, lower: Any, cell: float, margin: float, near: Any, far: Any
 ) -> None:

@@ -9,10 +9,10 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any
 
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from gsbake.kernels.declaration import kernel
 from gsbake.mvs.depth_maps import DepthMap
 from gsbake.mvs.ncc import FASTMATH
 from gsbake.mvs.point_cloud import StereoCloud
@@ -22,7 +22,7 @@ from gsbake.mvs.pyramids import relative_pose
 SAME_POINT_TOLERANCE = 0.006
 
 
-@nb.njit(fastmath=FASTMATH, error_model="numpy", nogil=True, cache=True)
+@kernel("f4[:, ::1], f4[::1], f4[:, ::1], f4[::1], f4[:, ::1], u1[:, ::1], f4", fastmath=FASTMATH, error_model="numpy", nogil=True)
 def _mark_visible(points: Any, intrinsics: Any, rotation: Any, translation: Any, depth: Any, used: Any, share: Any) -> None:
     """Mark in `used` (h, w) the pixels that see one of `points` (n, 3) of another camera's frame."""
     height, width = depth.shape

@@ -19,6 +19,8 @@ from gsbake.capture.hull.rays import camera_arrays
 from gsbake.capture.hull.softness import SOFT
 from gsbake.capture.hull.visual_hull import Hull
 from gsbake.geometry.cameras import Camera
+from gsbake.kernels.declaration import kernel
+from gsbake.kernels.threads import run_chunks
 from gsbake.mvs.depth_maps import DepthMap
 
 Floats = NDArray[np.float32]
@@ -38,16 +40,19 @@ def _cell_at(origin: Any, ray: Any, depth: float, cell: float) -> Any:
     )
 
 
-@nb.njit(parallel=True, error_model="numpy", cache=True)
+@kernel(
+    "i8, i8, f4[:, ::1], f8[::1], f8[:, ::1], f8[::1], f4[:, :, ::1], b1[:, :, ::1], f8[::1], f8, f8, b1[:, ::1]",
+    nogil=True, error_model="numpy",
+)
 def _behind_hard(
-    depth: Any, intrinsics: Any, pose: Any, centre: Any, field: Any, hard: Any, lower: Any, cell: float, deepest: float
-) -> NDArray[np.bool_]:
-    """Kernel of `behind_hard_parts` for one photo; `deepest` is the signed distance from which a depth counts."""
+    lo: int, hi: int, depth: Any, intrinsics: Any, pose: Any, centre: Any, field: Any, hard: Any, lower: Any, cell: float, deepest: float,
+    out: Any,
+) -> None:  # fmt: skip
+    """Kernel of `behind_hard_parts` for the rows lo..hi of one photo; `deepest` is the signed distance from which a depth counts."""
     n = field.shape[0]
     origin = centre - lower
-    out = np.zeros(depth.shape, np.bool_)
-    for v in nb.prange(depth.shape[0]):
-        ray = np.empty(3)
+    ray = np.empty(3)
+    for v in range(lo, hi):
         for u in range(depth.shape[1]):
             there = depth[v, u]
             if not there > 0:
@@ -68,7 +73,6 @@ def _behind_hard(
                     out[v, u] = hard[i, j, k]
                     break
                 here += step
-    return out
 
 
 def behind_hard_parts(hull: Hull, softness: Floats, cameras: Sequence[Camera], depths: Sequence[Floats]) -> list[NDArray[np.bool_]]:
@@ -79,10 +83,13 @@ def behind_hard_parts(hull: Hull, softness: Floats, cameras: Sequence[Camera], d
     """
     hard = ndimage.maximum_filter(softness, 2 * SOFT_BORDER + 1) < SOFT
     lower, cell = np.asarray(hull.lower, float), float(hull.cell)
-    return [
-        _behind_hard(np.asarray(depth, np.float32), intrinsics, pose, centre, hull.field, hard, lower, cell, -MIN_DEPTH * cell)
-        for depth, intrinsics, pose, centre in zip(depths, *camera_arrays(cameras)[1:], strict=True)
-    ]
+    found = []
+    for depth, *camera in zip((np.asarray(d, np.float32) for d in depths), *camera_arrays(cameras)[1:], strict=True):
+        out = np.zeros(depth.shape, np.bool_)
+        args = (depth, *camera, hull.field, hard, lower, cell, -MIN_DEPTH * cell, out)
+        run_chunks(lambda lo, hi, args=args: _behind_hard(lo, hi, *args), len(depth))  # type: ignore[misc]
+        found.append(out)
+    return found
 
 
 def without_mirror_images(maps: Sequence[DepthMap], hull: Hull, softness: Floats) -> tuple[list[DepthMap], float]:

@@ -15,6 +15,7 @@ from typing import Any
 import numba as nb
 import numpy as np
 
+from gsbake.kernels.declaration import kernel
 from gsbake.mvs.ncc import FASTMATH, RADIUS, ncc_cost, patch_statistics
 
 #: Minimum cosine between a plane's normal and the viewing ray.
@@ -85,7 +86,11 @@ def _mean_cost(
     return (first + second) * np.float32(0.5) if best_views == 2 else first
 
 
-@nb.njit(fastmath=FASTMATH, error_model="numpy", nogil=True, cache=True)
+@kernel(
+    "f4[:, :, ::1], f4[:, ::1], u1[:, ::1], f4[:, ::1], u1[:, ::1], u1[:, ::1], f4[::1], UniTuple(f4[::1], 4), "
+    "Tuple((f4[:, ::1], u4[::1], i8[::1], i8[:, ::1])), i8, b1, i8",
+    fastmath=FASTMATH, error_model="numpy", nogil=True,
+)
 def evaluate_planes(
     planes: Any, cost: Any, chosen_views: Any, high: Any, grey: Any, inside: Any, intrinsics: Any, pattern: Any, views: Any,
     best_views: int, select_views: bool, checkerboard: int,
@@ -130,7 +135,11 @@ def evaluate_planes(
                     chosen_views[v, u] = chosen
 
 
-@nb.njit(fastmath=FASTMATH, error_model="numpy", nogil=True, cache=True)
+@kernel(
+    "i8, i8, f4[:, :, ::1], f4[:, ::1], u1[:, ::1], f4[:, ::1], f4[:, ::1], u1[:, ::1], u1[:, ::1], f4[::1], UniTuple(f4[::1], 4), "
+    "Tuple((f4[:, ::1], u4[::1], i8[::1], i8[:, ::1])), i8, f4, f4, i8, i8",
+    fastmath=FASTMATH, error_model="numpy", nogil=True,
+)
 def sweep(
     colour: int, seed: int, planes: Any, cost: Any, chosen_views: Any, low: Any, high: Any, grey: Any, inside: Any, intrinsics: Any,
     pattern: Any, views: Any, best_views: int,
@@ -205,7 +214,11 @@ def sweep(
             cost[v, u] = best
 
 
-@nb.njit(fastmath=FASTMATH, error_model="numpy", nogil=True, cache=True)
+@kernel(
+    "f4[:, :, ::1], f4[:, ::1], u1[:, ::1], f4[:, ::1], f4[:, ::1], u1[:, ::1], u1[:, ::1], f4[::1], UniTuple(f4[::1], 4), "
+    "Tuple((f4[:, ::1], u4[::1], i8[::1], i8[:, ::1])), i8, f4, f4, i8, f4, i8",
+    fastmath=FASTMATH, error_model="numpy", nogil=True,
+)
 def refine_planes(
     planes: Any, cost: Any, chosen_views: Any, low: Any, high: Any, grey: Any, inside: Any, intrinsics: Any, pattern: Any, views: Any,
     best_views: int, pixel: Any, step: Any, iterations: int, max_cost: Any, checkerboard: int,
@@ -258,7 +271,7 @@ def refine_planes(
             cost[v, u] = best
 
 
-@nb.njit(fastmath=FASTMATH, error_model="numpy", nogil=True, cache=True)
+@kernel("f4[:, :, ::1], f4[:, ::1], f4[:, ::1], f4[::1], f4", fastmath=FASTMATH, error_model="numpy", nogil=True)
 def interpolate_planes(planes: Any, cost: Any, high: Any, intrinsics: Any, share: Any) -> None:
     """Set pixels of the second colour to the mean plane and cost of those neighbours that agree with the cheapest one.
 

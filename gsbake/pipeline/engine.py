@@ -71,6 +71,8 @@ class Engine:
         self.store = Store(request.out)
         self.planner = Planner(request, self.store)
         self.events = EventLog(request.out / "events.jsonl")
+        #: Called before a stage starts to compute, with a function that raises InterruptedRun on a stop request.
+        self.before_stage: Callable[[Stage, Callable[[], None]], None] = lambda stage, check: None
         #: Stages that the present or last run has finished, whether or not it went on to the end.
         self.finished: list[StageState] = []
 
@@ -159,6 +161,7 @@ class Engine:
             if fetched is not None:
                 self.observer.stage_reused(fetched)
                 return fetched
+            self.before_stage(stage, stop.check)
             self.events.write("stage started", stage=stage.name, key=cache_key.digest, reasons=list(state.reasons))
             self.observer.stage_started(state)
             artifact = self._execute(stage, state, cache_key, artifacts, stop, lease)

@@ -35,7 +35,12 @@ _THREAD_POOL_VARIABLES = (
 
 def default_threads() -> int:
     """Number of physical cores that this process may use, limited by CPU affinity and container quota."""
-    limits = [psutil.cpu_count(logical=False) or psutil.cpu_count() or 1]
+    return max(1, min(psutil.cpu_count(logical=False) or 1, available_cores()))
+
+
+def available_cores() -> int:
+    """Number of logical cores that this process may use, limited by CPU affinity and container quota."""
+    limits = [psutil.cpu_count() or 1]
     if hasattr(os, "sched_getaffinity"):
         limits.append(len(os.sched_getaffinity(0)))
     with suppress(OSError, ValueError):  # cgroup v2: "max 100000" or "150000 100000"

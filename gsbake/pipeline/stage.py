@@ -6,7 +6,7 @@ that the engine publishes atomically), and returns its results for the manifest.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -45,3 +45,4 @@ class Stage:
     summary: str = ""  # what came out in a few words, with results in braces: "{photos} photos, {masks} masks"
     uses_device: bool = False  # the backend (cpu or cuda) is part of the cache key
     seeded: bool = False  # the seed is part of the cache key
+    kernels: Callable[[Any], Sequence[str]] = lambda settings: ()  # modules whose compiled kernels it calls, for these settings

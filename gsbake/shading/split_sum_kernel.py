@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numba import njit, prange
 
+from gsbake.kernels.declaration import kernel
 from gsbake.shading.octahedral import MIN_L1_NORM
 
 #: No fast-math flags: Numba optimises the body of a parallel loop once for the process that compiles it and once more for the copy on the
@@ -167,7 +168,11 @@ def _table_slopes(lut: Any, row: Any, col: Any, fx: Any, fy: Any, k: Any) -> Any
     return (b - a) + fy * ((e - d) - (b - a)), (d - a) + fx * ((e - b) - (d - a))
 
 
-@njit(parallel=True, **_FLAGS)
+@kernel(
+    "f4[:, ::1], f4[:, ::1], f4[:, ::1], f4[::1], f4[::1], f4[::1], f4[::1], f4[:, ::1], f4[::1], i8[::1], i8[::1], "
+    "Array(f4, 3, 'C', readonly=True), f4[:, ::1]",
+    parallel=True, **_FLAGS,
+)
 def forward(
     normal: Any, view: Any, albedo: Any, roughness: Any, metallic: Any, visibility_d: Any, visibility_s: Any,
     table: Any, knots: Any, sizes: Any, offsets: Any, lut: Any, out: Any,

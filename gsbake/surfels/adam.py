@@ -10,17 +10,17 @@ from typing import Any
 
 import numpy as np
 import torch
-from numba import njit
 from torch import Tensor
 
-from gsbake.kernel_threads import run_chunks
+from gsbake.kernels.declaration import kernel
+from gsbake.kernels.threads import run_chunks
 from gsbake.surfels.finite import first_non_finite
 from gsbake.surfels.raster.blocks import JIT
 
 EPSILON = 1e-15
 
 
-@njit(**JIT)
+@kernel("i8, i8, f4[::1], f4[::1], f4[::1], f4[::1], f4, f4", **JIT)
 def _update(lo, hi, value, grad, first, second, root, rate):  # type: ignore[no-untyped-def]
     """Update elements lo..hi; `root` is 1/√(1 − β₂ⁿ), `rate` the rate over 1 − β₁ⁿ. Returns 0, or NaN when anything is not finite."""
     probe = np.float32(0.0)

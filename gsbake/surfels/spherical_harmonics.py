@@ -13,7 +13,8 @@ import torch
 from numba import njit
 from torch import Tensor
 
-from gsbake.kernel_threads import run_chunks
+from gsbake.kernels.declaration import kernel
+from gsbake.kernels.threads import run_chunks
 from gsbake.surfels.raster.blocks import JIT
 
 SH0 = 0.28209479177387814  # Y_00
@@ -54,7 +55,7 @@ def _basis(position, centre, i, degree, basis):  # type: ignore[no-untyped-def]
         basis[6], basis[8] = _3 * (_TWO * z * z - x * x - y * y), _4 * (x * x - y * y)
 
 
-@njit(**JIT)
+@kernel("i8, i8, f4[:, :, ::1], f4[:, ::1], f4[::1], i8, f4[:, ::1]", **JIT)
 def _forward(lo, hi, sh, position, centre, degree, out):  # type: ignore[no-untyped-def]
     basis = np.zeros(9, np.float32)
     for i in range(np.uint64(lo), np.uint64(hi)):
@@ -66,7 +67,7 @@ def _forward(lo, hi, sh, position, centre, degree, out):  # type: ignore[no-unty
             out[i, c] = value
 
 
-@njit(**JIT)
+@kernel("i8, i8, f4[:, ::1], f4[::1], i8, f4[:, ::1], f4[:, :, ::1]", **JIT)
 def _backward(lo, hi, position, centre, degree, grad, g_sh):  # type: ignore[no-untyped-def]
     basis = np.zeros(9, np.float32)
     for i in range(np.uint64(lo), np.uint64(hi)):

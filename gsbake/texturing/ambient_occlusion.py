@@ -12,11 +12,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from gsbake.geometry.raycast import RayCaster
+from gsbake.kernels.declaration import kernel
+from gsbake.kernels.threads import run_chunks
 from gsbake.texturing.texels import Texels
 
 Floats = NDArray[np.float32]
@@ -44,17 +45,17 @@ def occlusion(
     blocked = np.zeros(len(p), np.int32)
     directions = np.zeros((len(p), 3), np.float32)
     for k in range(rays):
-        _directions(n, k, rays, directions)
+        run_chunks(lambda lo, hi, k=k: _directions(lo, hi, n, k, rays, directions), len(n))  # type: ignore[misc]
         blocked += caster.occluded(p, directions)
         if each is not None:
             each(k + 1, rays)
     return (1 - blocked / max(rays, 1)).astype(np.float32)
 
 
-@numba.njit(cache=True, parallel=True, error_model="numpy")
-def _directions(normal: Floats, k: int, rays: int, out: Floats) -> None:
-    """The k-th of `rays` cosine-weighted directions (n, 3) about each `normal` (n, 3)."""
-    for i in numba.prange(normal.shape[0]):
+@kernel("i8, i8, f4[:, ::1], i8, i8, f4[:, ::1]", nogil=True, error_model="numpy")
+def _directions(lo: int, hi: int, normal: Floats, k: int, rays: int, out: Floats) -> None:
+    """Write the k-th of `rays` cosine-weighted directions about the normals lo..hi of `normal` (n, 3) to `out` (n, 3)."""
+    for i in range(lo, hi):
         h = np.uint32(i) * np.uint32(747796405) + np.uint32(2891336453)
         h = ((h >> ((h >> np.uint32(28)) + np.uint32(4))) ^ h) * np.uint32(277803737)
         h = (h >> np.uint32(22)) ^ h
@@ -77,17 +78,18 @@ def _directions(normal: Floats, k: int, rays: int, out: Floats) -> None:
 def smooth_over_surface(texels: Texels, value: Floats, position: NDArray[Any], normal: NDArray[Any], radius: float) -> Floats:
     """`value` (n,) or (n, c), not negative, averaged over neighbouring texels within `radius` (mesh units) with similar normals."""
     values = texels.image(value, np.nan)
-    out = _filter(values, texels.image(position), texels.image(normal), np.float32(radius))
+    positions, normals, reach, out = texels.image(position), texels.image(normal), np.float32(radius), values.copy()
+    run_chunks(lambda lo, hi: _filter(lo, hi, values, positions, normals, reach, out), len(values))
     return np.asarray(out.reshape(-1, out.shape[2])[texels.index].reshape(value.shape), np.float32)
 
 
-@numba.njit(cache=True, parallel=True, error_model="numpy")
-def _filter(value: Floats, position: Floats, normal: Floats, radius: np.float32) -> Floats:
-    """Mean of `value` (s, s, c; NaN where empty) over neighbouring texels, weighted by distance and similarity of normals."""
+@kernel("i8, i8, f4[:, :, ::1], f4[:, :, ::1], f4[:, :, ::1], f4, f4[:, :, ::1]", nogil=True, error_model="numpy")
+def _filter(lo: int, hi: int, value: Floats, position: Floats, normal: Floats, radius: np.float32, out: Floats) -> None:
+    """Write the mean of `value` (s, s, c; NaN where empty) over neighbouring texels, weighted by distance and similarity of normals, to the
+    rows lo..hi of `out`, a copy of `value`."""
     size, channels = value.shape[0], value.shape[2]
-    out = value.copy()
-    for j in numba.prange(size):
-        total = np.empty(channels)
+    total = np.empty(channels)
+    for j in range(lo, hi):
         for i in range(size):
             if not value[j, i, 0] >= 0:
                 continue
@@ -110,4 +112,3 @@ def _filter(value: Floats, position: Floats, normal: Floats, radius: np.float32)
             if weight > 0:
                 for c in range(channels):
                     out[j, i, c] = total[c] / weight
-    return out

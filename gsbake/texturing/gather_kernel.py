@@ -9,6 +9,8 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from gsbake.kernels.declaration import kernel
+
 Floats = NDArray[np.float32]
 Codes = NDArray[np.uint16]
 Doubles = NDArray[np.float64]
@@ -40,8 +42,14 @@ def _sample(image: Floats, x: float, y: float, c: int) -> float:
     return min(max(total, low), high)
 
 
-@numba.njit(cache=True, parallel=True, error_model="numpy")
+@kernel(
+    "i8, i8, f4[:, ::1], f4[:, ::1], f8[:, ::1], f8[::1], f8[::1], f4[:, :, ::1], f4[:, ::1], f4[:, ::1], f4[:, ::1], f8, f8, i2, "
+    "u2[:, :, ::1], f4[:, ::1], i2[:, ::1]",
+    nogil=True, error_model="numpy",
+)
 def gather(
+    lo: int,
+    hi: int,
     position: Floats,  # (n, 3)
     normal: Floats,  # (n, 3) unit
     pose: Doubles,  # (3, 4) texels' frame -> camera
@@ -58,14 +66,14 @@ def gather(
     weights: Floats,  # (n, keep)
     views: NDArray[np.int16],  # (n, keep)
 ) -> int:
-    """Store this view in `values`, `weights` and `views` where it is among a texel's best; returns the number of texels it shows."""
+    """Store this view in `values`, `weights` and `views` where it is among the best of the texels lo..hi; returns how many it shows."""
     height, width, channels = image.shape
     depth_h, depth_w = depth.shape
     scale_x, scale_y = depth_w / width, depth_h / height
     focal = np.sqrt(lens[0] * lens[1])
     keep = weights.shape[1]
     shown = 0
-    for n in numba.prange(position.shape[0]):
+    for n in range(lo, hi):
         px, py, pz = position[n, 0], position[n, 1], position[n, 2]
         vx, vy, vz = centre[0] - px, centre[1] - py, centre[2] - pz
         away = np.sqrt(vx * vx + vy * vy + vz * vz)

@@ -16,6 +16,8 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from gsbake.kernels.declaration import kernel
+
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
@@ -36,7 +38,7 @@ class Packed:
     scale: float
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel("f8[:, ::1], i8[:, ::1], f8, f8, u1[:, ::1]", error_model="numpy")
 def _draw(uv: Floats, faces: Ints, cell: float, reach: float, out: NDArray[np.uint8]) -> None:
     """Mark cells of `out` (h, w) whose square, grown by `reach` (in uv units), overlaps a triangle; uv starts at (reach, reach)."""
     height, width = out.shape
@@ -69,7 +71,7 @@ def _draw(uv: Floats, faces: Ints, cell: float, reach: float, out: NDArray[np.ui
                     out[j, i] = 1
 
 
-@numba.njit(cache=True)
+@kernel("u1[:, ::1]")
 def _bits(bitmap: NDArray[np.uint8]) -> NDArray[np.uint64]:
     """Rows of a 0/1 bitmap (h, w) as 64-bit words (h, ceil(w / 64)), lowest bit first."""
     height, width = bitmap.shape
@@ -114,7 +116,7 @@ def _longest_run(row: NDArray[np.uint64], cells: int, value: int) -> int:
     return longest
 
 
-@numba.njit(cache=True)
+@kernel("u8[:, ::1], i8[::1], u8[:, ::1], i8, i8, i8, i8")
 def _place(
     occupied: NDArray[np.uint64], longest_free: NDArray[np.int64], rows: NDArray[np.uint64], width: int, cells: int, first: int, limit: int
 ) -> tuple[int, int]:
@@ -153,7 +155,7 @@ def _place(
     return -1, -1
 
 
-@numba.njit(cache=True)
+@kernel("u8[:, ::1], i8[::1], u8[:, ::1], i8, i8, i8")
 def _fill(occupied: NDArray[np.uint64], longest_free: NDArray[np.int64], rows: NDArray[np.uint64], x: int, y: int, cells: int) -> None:
     """Mark a chart placed at (x, y)."""
     word, shift = x >> 6, np.uint64(x & 63)

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from gsbake.geometry.cameras import Camera
 from gsbake.geometry.raycast import RayCaster
+from gsbake.kernels.threads import run_chunks
 from gsbake.texturing.gather_kernel import gather
 from gsbake.texturing.view_fusion import fuse, solve_gains
 
@@ -88,12 +89,13 @@ class ProjectionBlender:
         edge = edge_weights(depth, EDGE_STEP * self._diagonal, EDGE_MARGIN * max(small.width, small.height))
         pose = np.concatenate([camera.R, camera.t[:, None]], 1)
         lens = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
-        shown = gather(
+        args = (
             self._position, self._normal, pose, camera.centre, lens, np.ascontiguousarray(pixels), np.ascontiguousarray(mask),
             depth, edge, DEPTH_SLACK * self._diagonal, weight, np.int16(self._count), self._values, self._weights, self._view,
         )  # fmt: skip
+        shown = run_chunks(lambda lo, hi: gather(lo, hi, *args), len(self._position))
         self._count += 1
-        return int(shown)
+        return sum(shown)
 
     def result(self, solve_exposure: bool = False) -> ProjectedTexture:
         """Fuse the views added. `solve_exposure` first divides out a gain per view and channel (for photos, not for materials)."""

@@ -15,6 +15,9 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from gsbake.kernels.declaration import kernel
+from gsbake.kernels.threads import run_chunks
+
 Floats = NDArray[np.float32]
 Doubles = NDArray[np.float64]
 
@@ -43,7 +46,10 @@ class Texels:
 
     def interpolate(self, values: NDArray[Any], faces: NDArray[Any]) -> Floats:
         """Vertex `values` (v, c) over `faces` (f, 3), interpolated at each texel: (n, c) float32."""
-        return _interpolate(np.ascontiguousarray(values, np.float32), np.ascontiguousarray(faces, np.int32), self.face, self.bary)
+        v, f = np.ascontiguousarray(values, np.float32), np.ascontiguousarray(faces, np.int32)
+        out = np.zeros((len(self), v.shape[1]), np.float32)
+        run_chunks(lambda lo, hi: _interpolate(lo, hi, v, f, self.face, self.bary, out), len(self))
+        return out
 
     @cached_property
     def lookup(self) -> NDArray[np.int64]:
@@ -97,7 +103,7 @@ def _overlaps(uv: NDArray[Any], faces: NDArray[Any], size: int) -> tuple[int, ND
     return count, later
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel("f8[:, ::1], i4[:, ::1], i4[:, ::1], f4[:, :, ::1], f4[:, ::1]", error_model="numpy")
 def _draw(uv: Doubles, faces: NDArray[np.int32], owner: NDArray[np.int32], bary: Floats, distance: Floats) -> None:
     """Fill `owner`, `bary` and `distance` (texels to the triangle, 0 inside) with the nearest triangle within `BORDER`."""
     size = owner.shape[0]
@@ -135,7 +141,7 @@ def _draw(uv: Doubles, faces: NDArray[np.int32], owner: NDArray[np.int32], bary:
                         bary[j, i, k] = weight[k]
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel("f8[:, ::1], i4[:, ::1], i4[:, ::1], b1[::1]", error_model="numpy")
 def _overlapping(uv: Doubles, faces: NDArray[np.int32], owner: NDArray[np.int32], later: NDArray[np.bool_]) -> int:
     """Texel centres deeper than `MARGIN` in more than one triangle; `owner` (s, s) of -1 is scratch, `later` (f,) marks the later ones."""
     size = owner.shape[0]
@@ -187,15 +193,12 @@ def _nearest_on_outline(corner: Doubles, x: float, y: float, weight: Doubles) ->
     return np.sqrt(best)
 
 
-@numba.njit(cache=True, parallel=True, error_model="numpy")
-def _interpolate(values: Floats, faces: NDArray[np.int32], face: NDArray[np.int32], bary: Floats) -> Floats:
-    """`values` (v, c) at texels given by `face` (n,) and `bary` (n, 3)."""
-    count, channels = face.shape[0], values.shape[1]
-    out = np.zeros((count, channels), np.float32)
-    for n in numba.prange(count):
-        for c in range(channels):
+@kernel("i8, i8, f4[:, ::1], i4[:, ::1], i4[::1], f4[:, ::1], f4[:, ::1]", nogil=True, error_model="numpy")
+def _interpolate(lo: int, hi: int, values: Floats, faces: NDArray[np.int32], face: NDArray[np.int32], bary: Floats, out: Floats) -> None:
+    """Write `values` (v, c) at the texels lo..hi, given by `face` (n,) and `bary` (n, 3), to `out` (n, c)."""
+    for n in range(lo, hi):
+        for c in range(values.shape[1]):
             total = np.float32(0)
             for k in range(3):
                 total += bary[n, k] * values[faces[face[n], k], c]
             out[n, c] = total
-    return out

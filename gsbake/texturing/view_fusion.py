@@ -9,6 +9,9 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from gsbake.kernels.declaration import kernel
+from gsbake.kernels.threads import run_chunks
+
 Floats = NDArray[np.float32]
 Codes = NDArray[np.uint16]
 
@@ -43,20 +46,17 @@ def _median(value: NDArray[np.float64], weight: NDArray[np.float64], count: int,
     return value[order[count - 1]]
 
 
-@numba.njit(cache=True, parallel=True, error_model="numpy")
-def fuse(values: Codes, weights: Floats, views: NDArray[np.int16], gains: Floats) -> tuple[Floats, NDArray[np.int32], Floats]:
-    """Fused values (n, c), number of views (n,) and confidence (n,) 0..1.
-
-    `values` (n, keep, c) are coded as `gather` does; `weights` (n, keep); `views` (n, keep); `gains` (views, c).
-    """
-    count, keep, channels = values.shape
-    out = np.zeros((count, channels), np.float32)
-    view_count = np.zeros(count, np.int32)
-    confidence = np.zeros(count, np.float32)
-    for n in numba.prange(count):
-        root = np.zeros((channels, keep))
-        weight = np.zeros(keep)
-        order = np.zeros(keep, np.int64)
+@kernel(
+    "i8, i8, u2[:, :, ::1], f4[:, ::1], i2[:, ::1], f4[:, ::1], f4[:, ::1], i4[::1], f4[::1]", nogil=True, error_model="numpy"
+)
+def _fuse(
+    lo: int, hi: int, values: Codes, weights: Floats, views: NDArray[np.int16], gains: Floats, out: Floats, view_count: NDArray[np.int32],
+    confidence: Floats,
+) -> None:  # fmt: skip
+    """Kernel of `fuse` for the texels lo..hi."""
+    keep, channels = values.shape[1], values.shape[2]
+    root, weight, deviation, order = np.zeros((channels, keep)), np.zeros(keep), np.zeros(keep), np.zeros(keep, np.int64)
+    for n in range(lo, hi):
         m = 0
         for k in range(keep):
             if weights[n, k] > 0:
@@ -67,7 +67,7 @@ def fuse(values: Codes, weights: Floats, views: NDArray[np.int16], gains: Floats
         view_count[n] = m
         if m == 0:
             continue
-        deviation = np.zeros(keep)
+        deviation[:m] = 0.0
         for c in range(channels):
             centre = _median(root[c], weight, m, order)
             for k in range(m):
@@ -89,6 +89,16 @@ def fuse(values: Codes, weights: Floats, views: NDArray[np.int16], gains: Floats
         for c in range(channels):
             out[n, c] /= max(total, 1e-12)
         confidence[n] = 1 - np.exp(-support)
+
+
+def fuse(values: Codes, weights: Floats, views: NDArray[np.int16], gains: Floats) -> tuple[Floats, NDArray[np.int32], Floats]:
+    """Fused values (n, c), number of views (n,) and confidence (n,) 0..1.
+
+    `values` (n, keep, c) are coded as `gather` does; `weights` (n, keep); `views` (n, keep); `gains` (views, c).
+    """
+    count, _, channels = values.shape
+    out, view_count, confidence = np.zeros((count, channels), np.float32), np.zeros(count, np.int32), np.zeros(count, np.float32)
+    run_chunks(lambda lo, hi: _fuse(lo, hi, values, weights, views, gains, out, view_count, confidence), count)
     return out, view_count, confidence
 
 

@@ -10,8 +10,8 @@ import psutil
 import pytest
 import torch
 
-from gsbake import kernel_threads
 from gsbake.config.schema import Profile
+from gsbake.kernels import threads as kernel_threads
 from gsbake.shading.environment import EnvironmentLight
 from gsbake.surfels.finite import first_non_finite
 from gsbake.surfels.initialisation import fibonacci_sphere, spacing

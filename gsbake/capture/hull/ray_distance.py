@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 from gsbake.capture.hull.rays import trilinear
 from gsbake.capture.hull.visual_hull import Hull
 from gsbake.geometry.cameras import Camera
+from gsbake.kernels.declaration import kernel
+from gsbake.kernels.threads import run_chunks
 
 #: Least and greatest step along a ray in cells: finer steps find no other minimum of a trilinear field, wider ones may skip a thin part.
 _LEAST_STEP, _GREATEST_STEP = 0.5, 4.0
@@ -44,13 +46,14 @@ def _least_on_ray(field: Any, origin: Any, ray: Any, cell: float, focal: float, 
     return least
 
 
-@nb.njit(parallel=True, error_model="numpy", cache=True)
-def _least_distance(field: Any, rays: Any, origin: Any, cell: float, focal: float, greatest: float) -> Any:
-    """Kernel of `ray_distance`; `field` in cells, `rays` (h, w, 3) and `origin` (3,) in its lattice."""
+@kernel("i8, i8, f4[:, :, ::1], f8[:, :, ::1], f8[::1], f8, f8, f8, f4[:, ::1]", nogil=True, error_model="numpy")
+def _least_distance(
+    lo: int, hi: int, field: Any, rays: Any, origin: Any, cell: float, focal: float, greatest: float, out: Any
+) -> None:
+    """Kernel of `ray_distance` for the rows lo..hi of squares; `field` in cells, `rays` (h, w, 3) and `origin` (3,) in its lattice."""
     height, width, _ = rays.shape
-    out = np.empty((height, width), np.float32)
     reach = greatest + 0.75 * _SQUARE  # from the middle of a square to its corners
-    for square in nb.prange(-(-height // _SQUARE)):
+    for square in range(lo, hi):
         top = square * _SQUARE
         bottom = min(top + _SQUARE, height)
         for left in range(0, width, _SQUARE):
@@ -59,7 +62,6 @@ def _least_distance(field: Any, rays: Any, origin: Any, cell: float, focal: floa
             for v in range(top, bottom):
                 for u in range(left, right):
                     out[v, u] = middle if abs(middle) > reach else _least_on_ray(field, origin, rays[v, u], cell, focal, -greatest)
-    return out
 
 
 def ray_distance(hull: Hull, camera: Camera, greatest: float) -> NDArray[np.float32]:
@@ -70,4 +72,8 @@ def ray_distance(hull: Hull, camera: Camera, greatest: float) -> NDArray[np.floa
     """
     field = (hull.field / hull.cell).astype(np.float32)
     origin = (np.asarray(camera.centre, float) - hull.lower) / hull.cell - 0.5
-    return np.asarray(_least_distance(field, camera.rays() / hull.cell, origin, float(hull.cell), camera.fx, greatest))
+    rays = camera.rays() / hull.cell
+    out = np.empty(rays.shape[:2], np.float32)
+    args = (field, rays, origin, float(hull.cell), camera.fx, float(greatest), out)
+    run_chunks(lambda lo, hi: _least_distance(lo, hi, *args), -(-len(rays) // _SQUARE))
+    return out

@@ -11,7 +11,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
@@ -20,6 +19,8 @@ from gsbake.capture.hull.rays import camera_arrays, concatenate_images, half_ste
 from gsbake.capture.hull.visual_hull import MAX_INCONSISTENT_SHARE, Hull, silhouette_distance
 from gsbake.capture.photos.decode import Bytes
 from gsbake.geometry.cameras import Camera
+from gsbake.kernels.declaration import kernel
+from gsbake.kernels.threads import run_chunks
 
 Floats = NDArray[np.float32]
 
@@ -30,15 +31,20 @@ SOFT = 1.1
 EDGE_BAND, BALL_DEPTH, LONGEST_CHORD, SMOOTHING = 1.5, 0.75, 200, 1.0
 
 
-@nb.njit(parallel=True, error_model="numpy", cache=True)
+@kernel(
+    "i8, i8, i8[:, ::1], b1[:, :, ::1], f8[::1], f8, f4[::1], i8[::1], i8[:, ::1], f8[:, ::1], f8[:, :, ::1], f8[:, ::1], i8, f8, i8, "
+    "f4[::1]",
+    nogil=True, error_model="numpy",
+)
 def _shortest_chords(
-    cells: Any, solid: Any, lower: Any, cell: float, distance: Any, starts: Any, sizes: Any, intrinsics: Any, poses: Any, centres: Any,
-    ranks: int, band: float, longest: int,
-) -> Floats:  # fmt: skip
-    """Kernel of `shortest_chords`; `distance` are the concatenated silhouette distances in pixels, the photo `v` from `starts[v]` on."""
-    out = np.empty(cells.shape[0], np.float32)
-    for m in nb.prange(cells.shape[0]):
-        shortest = np.full(ranks, 2 * longest, np.int64)
+    lo: int, hi: int, cells: Any, solid: Any, lower: Any, cell: float, distance: Any, starts: Any, sizes: Any, intrinsics: Any, poses: Any,
+    centres: Any, ranks: int, band: float, longest: int, out: Any,
+) -> None:  # fmt: skip
+    """Kernel of `shortest_chords` for the cells lo..hi; `distance` are the concatenated silhouette distances in pixels, the photo `v` from
+    `starts[v]` on."""
+    shortest = np.empty(ranks, np.int64)
+    for m in range(lo, hi):
+        shortest[:] = 2 * longest
         i, j, k = cells[m, 0] + 0.5, cells[m, 1] + 0.5, cells[m, 2] + 0.5
         x, y, z = lower[0] + i * cell, lower[1] + j * cell, lower[2] + k * cell
         for v in range(poses.shape[0]):
@@ -54,7 +60,6 @@ def _shortest_chords(
                     slot -= 1
                 shortest[slot] = steps
         out[m] = 0.5 * shortest[ranks - 1]
-    return out
 
 
 def shortest_chords(cells: NDArray[np.int64], hull: Hull, cameras: Sequence[Camera], masks: Sequence[Bytes]) -> Floats:
@@ -64,10 +69,13 @@ def shortest_chords(cells: NDArray[np.int64], hull: Hull, cameras: Sequence[Came
     without such a ray have too.
     """
     ranks = 1 + int(MAX_INCONSISTENT_SHARE * len(masks) + 0.5)
-    return np.asarray(_shortest_chords(
-        cells, hull.field < 0, np.asarray(hull.lower, float), float(hull.cell),
-        *concatenate_images([silhouette_distance(mask) for mask in masks]), *camera_arrays(cameras), ranks, EDGE_BAND, LONGEST_CHORD,
-    ))  # fmt: skip
+    out = np.empty(len(cells), np.float32)
+    args = (
+        np.ascontiguousarray(cells), hull.field < 0, np.asarray(hull.lower, float), float(hull.cell),
+        *concatenate_images([silhouette_distance(mask) for mask in masks]), *camera_arrays(cameras), ranks, EDGE_BAND, LONGEST_CHORD, out,
+    )  # fmt: skip
+    run_chunks(lambda lo, hi: _shortest_chords(lo, hi, *args), len(cells))
+    return out
 
 
 def surface_softness(hull: Hull, cameras: Sequence[Camera], masks: Sequence[Bytes]) -> Floats:

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
@@ -21,6 +20,8 @@ from gsbake.capture.hull.rays import camera_arrays, concatenate_images
 from gsbake.capture.photos.decode import Bytes
 from gsbake.geometry.cameras import Array, Camera
 from gsbake.imaging.distance import distance_to_zero
+from gsbake.kernels.declaration import kernel
+from gsbake.kernels.threads import run_chunks
 
 if TYPE_CHECKING:
     from gsbake.capture.posed_photos import PosedPhotos
@@ -37,12 +38,15 @@ _MAX_RANKED = 8
 _EXACT_BAND = 6.0
 
 
-@nb.njit(parallel=True, error_model="numpy", cache=True)
+@kernel(
+    "i8, i8, f4[::1], i8[::1], i8[:, ::1], f8[:, ::1], f8[:, :, ::1], f8[::1], f8, f8, i8, i8, f4[:, :, ::1]",
+    nogil=True, error_model="numpy",
+)
 def _carve(
-    distance: Floats, starts: NDArray[np.int64], sizes: NDArray[np.int64], intrinsics: Array, poses: Array, lower: Array, cell: float,
-    n: int, max_inconsistent_share: float, max_ranked: int, min_visible: int,
-) -> Floats:  # fmt: skip
-    """Signed distance (n, n, n) at cell centres; negative inside.
+    lo: int, hi: int, distance: Floats, starts: NDArray[np.int64], sizes: NDArray[np.int64], intrinsics: Array, poses: Array,
+    lower: Array, cell: float, max_inconsistent_share: float, max_ranked: int, min_visible: int, out: Floats,
+) -> None:  # fmt: skip
+    """Write the signed distance at cell centres, negative inside, to the layers lo..hi of `out` (n, n, n).
 
     distance: concatenated signed pixel distances (positive outside) of all views; starts (v,), sizes (v, 2) as h, w;
     intrinsics (v, 4) fx, fy, cx, cy; poses (v, 3, 4) world→camera.
@@ -50,9 +54,9 @@ def _carve(
     views = starts.shape[0]
     max_inconsistent = min(int(max_inconsistent_share * views + 0.5), max_ranked - 1)
     far = _EXACT_BAND * cell
-    out = np.empty((n, n, n), np.float32)
-    for i in nb.prange(n):
-        largest = np.empty(max_ranked, np.float64)
+    n = out.shape[1]
+    largest = np.empty(max_ranked, np.float64)
+    for i in range(lo, hi):
         x = lower[0] + (i + 0.5) * cell
         for j in range(n):
             y = lower[1] + (j + 0.5) * cell
@@ -92,7 +96,6 @@ def _carve(
                 else:
                     allowed = min(int(max_inconsistent_share * visible + 0.5), max_ranked - 1, visible - 1)
                     out[i, j, k] = largest[allowed]
-    return out
 
 
 def silhouette_distance(mask: Bytes) -> Floats:
@@ -130,10 +133,13 @@ def carve(
     min_visible = max(2, int(np.ceil(min_visible_share * len(fields))))
     wide = max_inconsistent_share > MAX_INCONSISTENT_SHARE
     ranked = max(_MAX_RANKED, int(max_inconsistent_share * len(fields) + 0.5) + 1) if wide else _MAX_RANKED
-    return _carve(
-        flat, starts[order], sizes[order], intrinsics[order], poses[order], np.asarray(centre, float) - radius, cell, resolution,
-        max_inconsistent_share, ranked, min_visible,
+    out = np.empty((resolution, resolution, resolution), np.float32)
+    args = (
+        flat, starts[order], sizes[order], intrinsics[order], poses[order], np.asarray(centre, float) - radius, cell,
+        max_inconsistent_share, ranked, min_visible, out,
     )  # fmt: skip
+    run_chunks(lambda lo, hi: _carve(lo, hi, *args), resolution)
+    return out
 
 
 def _large_components(inside: NDArray[np.bool_], share: float = 0.05) -> NDArray[np.bool_]:

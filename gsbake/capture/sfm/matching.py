@@ -11,9 +11,10 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
+
+from gsbake.kernels.declaration import kernel
 
 Floats = NDArray[np.float32]
 Matches = NDArray[np.uint32]
@@ -28,7 +29,7 @@ _BLOCK = 256
 _LANES = 64
 
 
-@nb.njit(nogil=True, cache=True)
+@kernel("f4[:, ::1], i8, i4[::1], f4[::1], f4[::1], i4[::1], f4[::1], f4[::1]", nogil=True)
 def _two_best(
     products: Floats, start: int, row: NDArray[np.int32], row_first: Floats, row_second: Floats,
     column: NDArray[np.int32], column_first: Floats, column_second: Floats,

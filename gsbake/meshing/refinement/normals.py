@@ -10,13 +10,13 @@ from __future__ import annotations
 
 from typing import Any
 
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.linalg import cg
 
-from gsbake.kernel_threads import run_chunks
+from gsbake.kernels.declaration import kernel
+from gsbake.kernels.threads import run_chunks
 from gsbake.meshing.cleanup import Faces, Vertices
 from gsbake.meshing.depth_views import DepthView, Floats
 
@@ -107,7 +107,10 @@ def integrate_normals(
     return vertices + np.clip(displacement, -max_displacement, max_displacement)[:, None] * normal
 
 
-@nb.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(
+    "i8, i8, f4[:, ::1], f4[:, ::1], f4[::1], f4[:, ::1], f4[:, ::1], f4[:, :, ::1], f4, f4[:, ::1], f4[::1]",
+    nogil=True, error_model="numpy",
+)
 def _accumulate(
     start: int,
     stop: int,

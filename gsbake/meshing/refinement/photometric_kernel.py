@@ -9,9 +9,9 @@ from __future__ import annotations
 
 from typing import Any
 
-import numba as nb
 import numpy as np
 
+from gsbake.kernels.declaration import kernel
 from gsbake.mvs.ncc import FASTMATH, OUT_OF_VIEW_COST, RADIUS, ncc_cost, patch_statistics
 
 #: Minimum variance of a patch (grey levels squared): twice the camera's noise.
@@ -20,7 +20,11 @@ MIN_VARIANCE = np.float32(3.0)
 MAX_COST = np.float32(0.4)
 
 
-@nb.njit(fastmath=FASTMATH, error_model="numpy", nogil=True, cache=True)
+@kernel(
+    "i8, i8, f4[:, ::1], f4[:, ::1], i8[::1], f4[::1], u1[:, ::1], u1[:, ::1], f4[::1], UniTuple(f4[::1], 4), "
+    "Tuple((f4[:, ::1], u4[::1], i8[::1], i8[:, ::1])), i8, f4[::1], f4[::1], f4[::1]",
+    fastmath=FASTMATH, error_model="numpy", nogil=True,
+)
 def measure_displacements(
     start: int, stop: int, points: Any, normals: Any, visible: Any, steps: Any, grey: Any, inside: Any, intrinsics: Any, pattern: Any,
     views: Any, best_of: int, displacement: Any, curvatures: Any, cost: Any,

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from gsbake.geometry.cameras import Camera
 from gsbake.geometry.raycast import RayCaster
-from gsbake.kernel_threads import run_chunks
+from gsbake.kernels.threads import run_chunks
 from gsbake.meshing.cleanup import Faces, Vertices
 from gsbake.meshing.refinement.normals import unique_edges, vertex_normals
 from gsbake.meshing.refinement.photometric_kernel import measure_displacements

@@ -13,7 +13,7 @@ import torch
 from numba import njit
 from torch import Tensor
 
-from gsbake.kernel_threads import run_chunks
+from gsbake.kernels.threads import run_chunks
 from gsbake.surfels.fields.interpolation_reference import interpolate_reference
 from gsbake.surfels.fields.levels import CORNERS, DENSE, EDGE, HASHED, PRIMES, Levels
 from gsbake.surfels.raster.blocks import JIT

@@ -12,7 +12,7 @@ import numpy as np
 from numba import njit
 
 from gsbake.imaging import srgb
-from gsbake.kernel_threads import run_chunks
+from gsbake.kernels.threads import run_chunks
 from gsbake.shading import brdf
 from gsbake.shading import split_sum_kernel as kernels
 from gsbake.shading.light_tables import LightTables

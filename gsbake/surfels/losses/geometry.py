@@ -11,9 +11,9 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import njit
 
-from gsbake.kernel_threads import run_chunks
+from gsbake.kernels.declaration import kernel
+from gsbake.kernels.threads import run_chunks
 from gsbake.surfels.losses.photometric import BYTE
 from gsbake.surfels.raster.blocks import JIT
 from gsbake.surfels.raster.lanes import LANES, broadcast, lane_column, lane_row, load, log, select, sqrt, store, sum_lanes
@@ -32,7 +32,7 @@ _U1, _U8 = np.uint64(1), np.uint64(LANES)
 _DEPTH, _DISTORTION, _B1, _B2, _ALPHA, _MEDIAN = range(6)
 
 
-@njit(**JIT)
+@kernel("i8, i8, f4[::1], i8, i8, i8, u1[::1], b1, f4[::1], f4[::1], f4[:, ::1], f4[::1], f4[::1], f4[::1], f4[:, ::1]", **JIT)
 def _strips(  # type: ignore[no-untyped-def]
     lo, hi, planes, channels, height, width, mask, masked, g_picture, background, rot, camera, weights, grad, sums
 ):

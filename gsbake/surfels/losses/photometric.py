@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from gsbake.kernel_threads import run_chunks
+from gsbake.kernels.declaration import kernel
+from gsbake.kernels.threads import run_chunks
 from gsbake.surfels.raster.blocks import JIT
 from gsbake.surfels.raster.lanes import LANES, broadcast, load, select, store, sum_lanes
 
@@ -57,7 +58,7 @@ def _window(rows, y, height, first, slot, nothing):  # type: ignore[no-untyped-d
         rows[k] = first + np.uint64(at % TAPS) * slot if 0 <= at < height else nothing
 
 
-@njit(**JIT)
+@kernel("i8, i8, f4[::1], f4[::1], u1[::1], u1[::1], f4[::1], i8, i8, f4, f4[::1], f4[::1], f4[::1], f4[::1]", **JIT)
 def _strips(  # type: ignore[no-untyped-def]
     lo, hi, picture, alpha, rgb, mask, background, height, width, share, grad, l1_rows, ssim_rows, k
 ):

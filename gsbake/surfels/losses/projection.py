@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 import torch
-from numba import njit
 from torch import Tensor
 
-from gsbake.kernel_threads import run_chunks
+from gsbake.kernels.declaration import kernel
+from gsbake.kernels.threads import run_chunks
 from gsbake.surfels.losses import terms as losses
 from gsbake.surfels.losses.geometry import ALPHA_SURFACE
 from gsbake.surfels.losses.terms import PROJECTION_ERROR_MAX
@@ -22,7 +22,7 @@ NEAREST, RANGE, WHOLE = np.float32(1e-3), np.float32(PROJECTION_ERROR_MAX), np.f
 _ZERO, _HALF, _ONE = np.float32(0.0), np.float32(0.5), np.float32(1.0)
 
 
-@njit(**JIT)
+@kernel("i8, i8, f4[:, ::1], f4[:, ::1], f4[::1], b1[::1], f4[:, ::1], f4[:, ::1], f4[:, ::1], f4[::1], f4[::1], f4[::1]", **JIT)
 def _forward(lo, hi, position, normal, sdf, visible, depth, alpha, rot, t, camera, sign):  # type: ignore[no-untyped-def]
     """Summed error and number of the surfels that count; `sign` (n,) receives each one's ∂|D − z|/∂z."""
     h, w = depth.shape
@@ -59,7 +59,7 @@ def _forward(lo, hi, position, normal, sdf, visible, depth, alpha, rot, t, camer
     return total, count
 
 
-@njit(**JIT)
+@kernel("i8, i8, f4[:, ::1], f4[::1], f4[:, ::1], f4, f4[::1], f4[:, ::1], f4[:, ::1], f4[::1]", **JIT)
 def _backward(lo, hi, normal, sdf, rot, factor, sign, g_position, g_normal, g_sdf):  # type: ignore[no-untyped-def]
     for i in range(lo, hi):
         g = factor * sign[i]

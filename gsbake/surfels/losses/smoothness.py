@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from gsbake.kernel_threads import run_chunks
+from gsbake.kernels.threads import run_chunks
 from gsbake.surfels.losses.photometric import BYTE
 from gsbake.surfels.raster.blocks import JIT
 from gsbake.surfels.raster.lanes import EXP2_COEFFICIENTS, LANES, broadcast, exp2, load, select, store, sum_lanes

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numba import njit
 
-from gsbake.kernel_threads import thread_count
+from gsbake.kernels.declaration import kernel
+from gsbake.kernels.threads import thread_count
 from gsbake.surfels.raster.blocks import JIT, TILE
 from gsbake.surfels.raster.lanes import prefetch
 
@@ -18,7 +18,7 @@ SHIFT = TILE.bit_length() - 1
 PREFETCH_DISTANCE = 8
 
 
-@njit(**JIT)
+@kernel("i8[::1], i4[:, ::1], i8, i8[::1], i8[::1], i4[::1], i8[::1]", **JIT)
 def fill_tiles(order, box, tiles_x, offsets, cursor, ids, slots):  # type: ignore[no-untyped-def]
     """Counting sort: append each surfel, front to back, to the lists of the tiles that its box overlaps."""
     last = order.shape[0] - 1
@@ -38,7 +38,7 @@ def fill_tiles(order, box, tiles_x, offsets, cursor, ids, slots):  # type: ignor
                 slot += 1
 
 
-@njit(**JIT)
+@kernel("i4[:, ::1], b1[::1], i8, i8[::1], i8[::1]", **JIT)
 def count_tiles(box, visible, tiles_x, per_tile, per_surfel):  # type: ignore[no-untyped-def]
     """Count (tile, surfel) pairs per tile and per surfel; box (n, 4) int32: xmin, xmax, ymin, ymax in pixels, clipped, inclusive."""
     for g in range(box.shape[0]):

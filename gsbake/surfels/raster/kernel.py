@@ -16,12 +16,13 @@ Per-pixel arithmetic uses `lanes`. Fast math excludes "nnan": a NaN would pass e
 from __future__ import annotations
 
 import math
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any
 
 import numpy as np
 from numba import njit
 
+from gsbake.kernels.declaration import also_built_by, kernel
 from gsbake.surfels.raster.blocks import BLOCKS_ACROSS, BLOCKS_DOWN, JIT, TILE, pack, unpack
 from gsbake.surfels.raster.lanes import (
     BLOCK_X,
@@ -77,7 +78,10 @@ def forward_kernel(channels: int) -> Any:
     o_t, o_z, o_d, o_b1, o_b2, o_m, o_f = (np.uint64(i * LANES) for i in range(7))
     zero, half, one, two = np.float32(0.0), np.float32(0.5), np.float32(1.0), np.float32(2.0)
 
-    @njit(**JIT)
+    @kernel(
+        "i8[::1], i8, i8, i8[::1], i4[::1], f4[:, ::1], i4[:, ::1], f4[::1], f4[:, ::1], i8, i8, i8, f4[:, :, ::1], i8[::1], f4[::1]",
+        **JIT,
+    )
     def forward(order, lo, hi, starts, ids, geo, box, opacity, features, width, height, tiles_x, out, ends, constants):  # type: ignore[no-untyped-def]
         s = np.empty(total_size, np.float32)
         ones, p1, p2 = broadcast(constants[0]), broadcast(constants[1]), broadcast(constants[2])
@@ -218,7 +222,11 @@ def backward_kernel(channels: int) -> Any:
     acc_size = (FEATURE_OFFSET + channels) * LANES
     zero, half, one, two = np.float32(0.0), np.float32(0.5), np.float32(1.0), np.float32(2.0)
 
-    @njit(**JIT)
+    @kernel(
+        "i8[::1], i8, i8, i8[::1], i4[::1], i8[::1], f4[:, ::1], i4[:, ::1], f4[::1], f4[:, ::1], i8, i8, i8, f4[:, :, ::1], i8[::1], "
+        "f4[:, :, ::1], f4[:, ::1], f4[::1]",
+        **JIT,
+    )
     def backward(  # type: ignore[no-untyped-def]
         order, lo, hi, starts, ids, slots, geo, box, opacity, features, width, height, tiles_x, out, ends, grad, result, constants
     ):
@@ -389,7 +397,7 @@ def backward_kernel(channels: int) -> Any:
     return call
 
 
-@njit(**JIT)
+@kernel("i8, i8, i8[::1], f4[:, ::1], f4[:, ::1]", **JIT)
 def sum_slots(lo, hi, offsets, result, sums):  # type: ignore[no-untyped-def]
     """Sum each surfel's gradient slots (contiguous in `result`) into `sums` (n, SLOT + channels)."""
     n_j = result.shape[1]
@@ -399,3 +407,8 @@ def sum_slots(lo, hi, offsets, result, sums):  # type: ignore[no-untyped-def]
         for k in range(offsets[g], offsets[g + 1]):
             for j in range(n_j):
                 sums[g, j] += result[k, j]
+
+
+#: Features of the surfels in the profiles for assets: colours or a material, and the normals.
+USUAL_CHANNELS = (6,)
+also_built_by(__name__, *(partial(build, channels) for channels in USUAL_CHANNELS for build in (forward_kernel, backward_kernel)))

@@ -19,7 +19,8 @@ import torch
 from numba import njit
 from torch import Tensor
 
-from gsbake.kernel_threads import run_chunks
+from gsbake.kernels.declaration import kernel
+from gsbake.kernels.threads import run_chunks
 from gsbake.surfels.raster.blocks import FASTMATH
 from gsbake.surfels.raster.kernel import ALPHA_MIN
 
@@ -75,7 +76,11 @@ def _extent(a, b, c, az, bz, cz, r2, focal, principal, size):  # type: ignore[no
     return focal * (mid - half) + principal, focal * (mid + half) + principal
 
 
-@njit(**_JIT)
+@kernel(
+    "i8, i8, f4[:, ::1], f4[:, ::1], f4[:, ::1], f4[::1], f4[:, ::1], f4[::1], f4, f4, f4, f4, i8, i8, b1, f4[:, ::1], i4[:, ::1], "
+    "b1[::1], f4[:, ::1]",
+    **_JIT,
+)
 def _forward(lo, hi, mu, quat, log_scale, opacity, rot, t, fx, fy, cx, cy, width, height, cull, geo, box, visible, normal):  # type: ignore[no-untyped-def]
     for i in range(lo, hi):
         r00, r01, r02, r10, r11, r12, r20, r21, r22, _w, _x, _y, _z, _n = _rotation(quat[i, 0], quat[i, 1], quat[i, 2], quat[i, 3])
@@ -134,7 +139,11 @@ def _forward(lo, hi, mu, quat, log_scale, opacity, rot, t, fx, fy, cx, cy, width
         visible[i] = box[i, 0] <= box[i, 1] and box[i, 2] <= box[i, 3]
 
 
-@njit(**_JIT)
+@kernel(
+    "i8, i8, f4[:, ::1], f4[:, ::1], f4[:, ::1], f4[:, ::1], f4[::1], f4, f4, b1[::1], f4[:, ::1], f4[:, ::1], f4[:, ::1], f4[:, ::1], "
+    "f4[:, ::1], f4[:, ::1], f4[::1]",
+    **_JIT,
+)
 def _backward(lo, hi, mu, quat, log_scale, rot, t, fx, fy, visible, geo, g_geo, g_normal, g_mu, g_quat, g_scale, g_pose):  # type: ignore[no-untyped-def]
     """g_pose (12,) collects this chunk's share of the gradients of R (row-major) and t."""
     for i in range(lo, hi):

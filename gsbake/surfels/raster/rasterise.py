@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsbake.kernel_threads import run_chunks
+from gsbake.kernels.threads import run_chunks
 from gsbake.surfels.raster.binning import bin_surfels
 from gsbake.surfels.raster.kernel import AUX_PLANES, FEATURE_OFFSET, backward_kernel, forward_kernel, sum_slots
 from gsbake.surfels.raster.projection import Pinhole, Project

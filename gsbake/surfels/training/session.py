@@ -17,7 +17,7 @@ from gsbake.capture.posed_photos import PosedPhotos
 from gsbake.checkpoint import DamagedCheckpointError, load_checkpoint, save_checkpoint
 from gsbake.config.schema import Coupling, DistanceField, Loss, Train
 from gsbake.config.schema import Surfels as SurfelSettings
-from gsbake.kernel_threads import configure
+from gsbake.kernels.threads import configure
 from gsbake.monitor import SILENT, Monitor, Rule, decide_skip
 from gsbake.surfels.field import Field
 from gsbake.surfels.fields.registry import save_field

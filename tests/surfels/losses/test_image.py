@@ -8,7 +8,7 @@ import torch
 from skimage.metrics import structural_similarity
 from torch import Tensor
 
-from gsbake import kernel_threads
+from gsbake.kernels import threads as kernel_threads
 from gsbake.shading.environment import EnvironmentLight
 from gsbake.shading.light_tables import LightTables
 from gsbake.surfels.gbuffer import rendered_image

@@ -10,6 +10,11 @@ import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
+from typing import TypeVar
+
+import numba
+
+T = TypeVar("T")
 
 _configured = 0
 
@@ -28,10 +33,8 @@ def configure(threads: int) -> None:
 
 
 def thread_count() -> int:
-    """Threads of the kernels: the configured number, else torch's."""
-    import torch
-
-    return _configured or max(1, torch.get_num_threads())
+    """Threads of the kernels: the configured number, else Numba's (NUMBA_NUM_THREADS, which the engine sets, or all cores)."""
+    return _configured or int(numba.get_num_threads())
 
 
 @lru_cache(maxsize=4)
@@ -39,16 +42,17 @@ def _pool(pid: int, threads: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(threads, thread_name_prefix="gsbake-kernel")
 
 
-def run_chunks(call: Callable[[int, int], object], count: int, chunks_per_thread: int = 6, minimum: int = 1) -> None:
-    """Run `call(start, stop)` over 0..count in chunks of at least `minimum` items on all threads; exceptions are re-raised."""
+def run_chunks(call: Callable[[int, int], T], count: int, chunks_per_thread: int = 6, minimum: int = 1) -> list[T]:
+    """Run `call(start, stop)` over 0..count in chunks of at least `minimum` items on all threads; the results in order.
+
+    Exceptions are re-raised.
+    """
     threads = thread_count()
     if count <= 0:
-        return
+        return []
     size = max(minimum, -(-count // (threads * chunks_per_thread)))
     if threads == 1 or count <= size:
-        call(0, count)
-        return
+        return [call(0, count)]
     pool = _pool(os.getpid(), threads)
     futures = [pool.submit(call, lo, min(lo + size, count)) for lo in range(0, count, size)]
-    for future in futures:
-        future.result()
+    return [future.result() for future in futures]

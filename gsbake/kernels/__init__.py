@@ -1,0 +1,1 @@
+"""Compiled kernels: how they are declared, and their compilation in processes of its own."""
