@@ -11,10 +11,12 @@ ROOT = Path(__file__).resolve().parents[2]
 TABLES = (ROOT / "docs/reference/architecture.md").read_text(encoding="utf-8")
 
 
+CONTRACTS = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["importlinter"]["contracts"]
+
+
 def contract_rows(container: str) -> list[set[str]]:
     """Names in each layer of a package's contract, from the top. It must name every folder and module."""
-    contracts = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["importlinter"]["contracts"]
-    found = next(c for c in contracts if c["type"] == "layers" and c["containers"] == [container])
+    found = next(c for c in CONTRACTS if c["type"] == "layers" and c["containers"] == [container])
     assert found["exhaustive"]
     return [set(re.findall(r"\w+", layer)) for layer in found["layers"]]
 
@@ -30,6 +32,13 @@ def test_the_table_has_the_rows_of_the_contract() -> None:
     """The contract in turn fails for a folder or module that it does not name."""
     assert table_rows("gsbake/__main__.py", "gsbake/") == contract_rows("gsbake")
     assert table_rows("training/", "") == contract_rows("gsbake.surfels")
+
+
+def test_every_folder_of_the_library_is_kept_from_the_engine() -> None:
+    found = next(c for c in CONTRACTS if c.get("forbidden_modules") == ["gsbake.pipeline"])
+    rows = contract_rows("gsbake")
+    library = set().union(*rows[rows.index({"publish"}) + 1 : rows.index({"pipeline"})])
+    assert {name.removeprefix("gsbake.") for name in found["source_modules"]} == library
 
 
 def test_the_library_does_not_import_the_stages() -> None:

@@ -1,9 +1,9 @@
 """Levels of feature tables: the one form of all grids of the fields.
 
-A level holds samples at lattice corners, each with D features, of which a point blends eight. Levels
-differ in how a corner finds its row: dense (row-major), hashed (Müller et al., *Instant neural graphics primitives*, SIGGRAPH 2022), by a
-table of corners (a sparse octree), or by a table of blocks of 8³ corners (sparse voxels). A level with one sample along an axis does not
-depend on it: planes and lines of a factorised tensor are such levels.
+A level holds samples at lattice corners, each with D features, of which a point blends eight. Levels differ in how a corner finds its
+row: dense (row-major), hashed (Müller et al., *Instant neural graphics primitives*, SIGGRAPH 2022), by a table of corners (a sparse
+octree), or by a table of blocks of 8³ corners (sparse voxels). A level with one sample along an axis does not depend on it: planes and
+lines of a factorised tensor are such levels.
 """
 
 from __future__ import annotations
