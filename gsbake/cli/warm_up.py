@@ -94,7 +94,7 @@ def compile_kernels(session: Session, target: str | None, display: Line) -> bool
             raise
         except GsbakeError:
             return False
-    record.write_text("")
+    record.touch()
     display.preparing(1, 1, "")
     return True
 

@@ -151,7 +151,7 @@ class Lease:
         holder = LeaseHolder.current()
         temporary = self.path.with_name(f".{self.path.name}.{holder.token}.tmp")
         try:
-            temporary.write_text(json.dumps(asdict(holder)), encoding="utf-8")
+            temporary.write_bytes(json.dumps(asdict(holder)).encode())
             _link(temporary, self.path)
         except (FileExistsError, FileNotFoundError):  # another holder, which may also have cleaned up
             return False

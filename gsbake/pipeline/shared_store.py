@@ -252,7 +252,7 @@ class SharedStore:
     def set_quota(self, size: int | None, scratch: Path) -> None:
         """Set or remove the limit for all machines. Raises PermissionError for a read-only store."""
         path = scratch / _SETTINGS
-        path.write_text(json.dumps({"quota_bytes": size}))
+        path.write_bytes(json.dumps({"quota_bytes": size}).encode())
         self._write(path, f"{self._root}/{_SETTINGS}")
 
     # -- files -----------------------------------------------------------------------------------------------------------------------------

@@ -281,7 +281,7 @@ def _well_formed(files: object) -> bool:
     """Whether a manifest's list of files has digests and sizes, and names inside the artifact's folder only."""
     if not isinstance(files, dict):
         return False
-    inside = all(not name.startswith("/") and ".." not in name.split("/") for name in files)
+    inside = all(not name.startswith("/") and ".." not in name.split("/") and not {"\\", ":"} & set(name) for name in files)
     entries = [entry if isinstance(entry, dict) else {} for entry in files.values()]
     return inside and all(isinstance(e.get("digest"), str) and isinstance(e.get("bytes"), int) for e in entries)
 

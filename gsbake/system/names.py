@@ -36,7 +36,7 @@ def same_file_key(name: str) -> str:
 
 
 def _ends_well(name: str) -> bool:
-    return bool(name) and name[-1] not in ". " and not name.startswith(" ")
+    return bool(name) and name[-1] not in ". "
 
 
 def _is_device(name: str) -> bool:

@@ -39,8 +39,8 @@ def start(tmp_path: Path) -> Iterator[Start]:
         environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(BARE), str(ROOT)]), "BARE_LOG": str(tmp_path / "bare.log")}
         processes.append(
             subprocess.Popen(
-                [sys.executable, "-c", code, *map(str, arguments)], cwd=ROOT, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
-                text=True,
+                [sys.executable, "-c", code, *map(str, arguments)],
+                cwd=ROOT, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
             )  # fmt: skip
         )
         return processes[-1]
