@@ -64,9 +64,13 @@ demo: setup ## Bake the built-in capture with the smallest profile
 docs: setup ## Build the documentation into site/ (open site/index.html)
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet --strict
 
-check: setup ## Lint, types, order of the layers, dead code
+# The types of everything for this system, and for macOS and Windows of what depends on the system (tests/system/test_one_place.py keeps it
+# there). Caches apart, or each would throw the others' away.
+check: setup ## Lint, types on three systems, order of the layers, dead code
 	$(BIN)/ruff check .
 	$(BIN)/mypy
+	@for system in darwin win32; do $(BIN)/mypy --platform $$system --cache-dir .mypy_cache/$$system -p gsbake.system -p gsbake.pipeline \
+		-m gsbake.limited_process -m gsbake.capture.sfm.process || exit 1; done
 	$(BIN)/lint-imports --no-logo --no-cache
 	$(BIN)/vulture
 

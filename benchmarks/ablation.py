@@ -42,7 +42,7 @@ from gsbake.materials.fit import MaterialFit
 from gsbake.materials.initialisation import DEFAULT_START
 from gsbake.materials.light_intensity import LightAdjustment
 from gsbake.materials.metal_trials import TrialResult
-from gsbake.pipeline.machine import cpu_name
+from gsbake.system.limits import cpu_name
 
 RESULTS = ROOT / "benchmarks" / "results" / "ablation.csv"
 

@@ -1,7 +1,12 @@
-"""gsbake: photos in, relightable game-ready asset out. `gsbake.run` is the command of that name as a function."""
+"""gsbake: photos in, relightable game-ready asset out. `gsbake.run` is the command of that name as a function.
+
+`gsbake.stages` and `gsbake.profiles` lie inside the installed package. In a source checkout their folders lie beside it, and are found
+there.
+"""
 
 from __future__ import annotations
 
+import os
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -9,6 +14,9 @@ if TYPE_CHECKING:
 
 __all__ = ["Result", "__version__", "run"]
 __version__ = "0.1.0"
+
+if not os.path.isdir(os.path.join(__path__[0], "stages")):  # a source checkout
+    __path__.append(os.path.dirname(__path__[0]))
 
 
 def __getattr__(name: str) -> Any:

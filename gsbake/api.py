@@ -31,6 +31,7 @@ from gsbake.pipeline.shared_store import open_shared_store
 from gsbake.pipeline.store import Store
 from gsbake.publish import RESULTS, publish_results
 from gsbake.stages import REGISTRY
+from gsbake.system.names import portable_name
 from gsbake.text import number
 
 #: Stage that runs only where targets are asked for.
@@ -260,7 +261,8 @@ def _default_out(photos: Path | None) -> Path:
     """out/<name of photos>, or the only run in out/. Raises UsageError."""
     if photos is not None:
         folder = photos.resolve()
-        return Path("out") / (folder.parent.name if folder.name in PHOTO_FOLDERS else folder.stem if folder.is_file() else folder.name)
+        name = folder.parent.name if folder.name in PHOTO_FOLDERS else folder.stem if folder.is_file() else folder.name
+        return Path("out") / (portable_name(name) if name else "")
     runs = sorted(path.parent for path in Path("out").glob("*/project.json"))
     if len(runs) == 1:
         return runs[0]

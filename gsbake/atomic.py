@@ -2,27 +2,13 @@
 
 from __future__ import annotations
 
-import errno
 import os
 import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-#: errno values of a file system that does not flush folders; any other failure means that data may be lost.
-CANNOT_SYNC = frozenset({errno.EINVAL, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS, errno.EBADF})
-
-
-def sync(path: Path) -> None:
-    """Flush a file or folder to disk. Raises OSError when that fails; file systems that cannot flush folders are accepted."""
-    handle = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    except OSError as error:
-        if error.errno not in CANNOT_SYNC or not path.is_dir():
-            raise
-    finally:
-        os.close(handle)
+from gsbake.system import disk
 
 
 @contextmanager
@@ -32,8 +18,8 @@ def atomic_replacement(path: Path, *, durable: bool = False) -> Iterator[Path]:
     try:
         yield temporary
         if durable:
-            sync(temporary)
-        temporary.replace(path)
+            disk.sync(temporary)
+        disk.replace(temporary, path)
     except BaseException:
         with suppress(OSError):
             temporary.unlink()

@@ -15,7 +15,8 @@ from blake3 import blake3
 from safetensors import SafetensorError
 from safetensors.torch import load, save
 
-from gsbake.atomic import sync, write_atomic
+from gsbake.atomic import write_atomic
+from gsbake.system.disk import sync
 
 _TENSOR = "tensor"
 _STRUCTURE = "structure"

@@ -6,22 +6,31 @@ about files, one at a time, and is started again after a crash; its main is `ser
 
 from __future__ import annotations
 
+import importlib
 import json
 import os
-import resource
-import selectors
 import signal
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Callable, Mapping
-from typing import Any
+from contextlib import suppress
+from typing import Any, BinaryIO
 
+from gsbake.errors import InterruptedRun
 from gsbake.python_process import python_command, python_environment
+from gsbake.system.exit_codes import ExitCode
+from gsbake.system.limits import limit_address_space, write_no_core
+from gsbake.system.pipes import LineReader, take_standard_streams
+from gsbake.system.processes import exit_with_parent, resident_memory
 
-#: Signals that a fault of the parser raises; any other came from outside and says nothing about the file.
-_CRASHES = frozenset({signal.SIGSEGV, signal.SIGBUS, signal.SIGABRT, signal.SIGFPE, signal.SIGILL, signal.SIGTRAP, signal.SIGSYS})
+_COMMAND = "from gsbake.limited_process import child; child()"
+#: Seconds between looks at the memory of a child that cannot limit it itself.
+_MEMORY_POLL = 0.05
+#: Start of the line in which a child asks to be watched; answers are JSON objects.
+_WATCH = b"memory "
+#: The child's ends of the pipes, once it has taken them.
+_streams: list[BinaryIO] = []
 
 
 class ParserFailedError(Exception):
@@ -37,26 +46,26 @@ class ParserKilledError(Exception):
 
 
 class ParserProcess:
-    """A child that runs `module` and answers requests (JSON lines through `serve`), started at the first request and after a crash."""
+    """A child that runs `main()` of `module` and answers requests (JSON lines, see `serve`), started at the first one and after a crash."""
 
     def __init__(self, module: str, variables: Mapping[str, str] | None = None) -> None:
-        self._command = python_command("-m", module, str(os.getpid()))
+        self._command = python_command("-c", _COMMAND, module, str(os.getpid()))
         self._environment = python_environment(variables)
         self._child: subprocess.Popen[bytes] | None = None
-        self._answers = -1  # read end of a pipe of its own: libraries may print to stdout
+        self._answers: LineReader | None = None
 
     def ask(self, request: Mapping[str, Any], seconds: float) -> dict[str, Any]:
         """The child's answer. Raises ParserFailedError when it crashes, ParserKilledError when it is killed or takes over `seconds`."""
         child = self._running()
         assert child.stdin is not None
-        line = b""
+        line = None
         try:
             child.stdin.write(json.dumps(request).encode() + b"\n")
             child.stdin.flush()
             line = self._answer(time.monotonic() + seconds)
-        except BrokenPipeError:
+        except OSError:  # it has ended; Windows has other words for that than BrokenPipeError
             pass
-        if not line.endswith(b"\n"):
+        if line is None:
             raise self._ended(seconds)
         answer: dict[str, Any] = json.loads(line)
         return answer
@@ -69,32 +78,40 @@ class ParserProcess:
 
     def close(self) -> None:
         """End the child."""
-        if self._child is not None:
-            self._child.kill()
-            self._child.communicate()
-            os.close(self._answers)
-            self._child = None
+        if self._child is None or self._answers is None:
+            return
+        self._child.kill()
+        self._child.wait()
+        self._answers.close()
+        if self._child.stdin is not None:
+            with suppress(OSError):  # what it has not read
+                self._child.stdin.close()
+        self._child = self._answers = None
 
     def _running(self) -> subprocess.Popen[bytes]:
         if self._child is None:
-            self._answers, write = os.pipe()
-            self._child = subprocess.Popen(
-                [*self._command, str(write)], stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, env=self._environment, pass_fds=(write,)
-            )
-            os.close(write)
+            self._child = subprocess.Popen(self._command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=self._environment)
+            assert self._child.stdout is not None
+            self._answers = LineReader(self._child.stdout)
         return self._child
 
-    def _answer(self, deadline: float) -> bytes:
-        """The next line of the child; an incomplete one when it ends or the deadline passes."""
-        line = b""
-        with selectors.DefaultSelector() as selector:
-            selector.register(self._answers, selectors.EVENT_READ)
-            while not line.endswith(b"\n") and selector.select(max(0.0, deadline - time.monotonic())):
-                chunk = os.read(self._answers, 1 << 16)
-                if not chunk:
-                    break
-                line += chunk
-        return line
+    def _answer(self, deadline: float) -> bytes | None:
+        """The next line of the child; None when it ends or the deadline passes.
+
+        Raises ParserFailedError when it takes more memory than its limit, where it has asked for one that the system does not keep.
+        """
+        assert self._answers is not None and self._child is not None
+        limit: int | None = None
+        while not self._answers.ended and (left := deadline - time.monotonic()) > 0:
+            line = self._answers.line(left if limit is None else min(left, _MEMORY_POLL))
+            if line is not None and not line.startswith(_WATCH):
+                return line
+            if line is not None:
+                limit = int(line.removeprefix(_WATCH)) + resident_memory(self._child.pid)
+            elif limit is not None and resident_memory(self._child.pid) > limit:
+                self.close()
+                raise ParserFailedError("took more memory than it may")
+        return None
 
     def _ended(self, seconds: float) -> ParserFailedError | ParserKilledError:
         """The error of a child that did not answer; it is gone afterwards."""
@@ -105,37 +122,38 @@ class ParserProcess:
             return ParserKilledError(f"took longer than {seconds:.0f} s", timed_out=True)
         finally:
             self.close()
-        if code < 0 and -code in _CRASHES:
-            return ParserFailedError(f"was ended by {signal.Signals(-code).name}")
-        return ParserKilledError(f"was ended by {signal.Signals(-code).name}" if code < 0 else f"ended with exit code {code}")
+        found = ExitCode.of(code)
+        if found.crashed:
+            return ParserFailedError(f"was ended by {found}")
+        return ParserKilledError(f"was ended by {found}" if found.signal else f"ended with {found}")
+
+
+def child() -> None:
+    """Entry point of a `ParserProcess` (`python -c … MODULE PARENT`): `main()` of the module, whose imports may print what they like."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle; it ends its children
+    exit_with_parent(int(sys.argv[2]), InterruptedRun.exit_code)
+    write_no_core()
+    _streams[:] = take_standard_streams(quiet=True)
+    importlib.import_module(sys.argv[1]).main()
 
 
 def serve(answer: Callable[[dict[str, Any]], dict[str, Any]]) -> None:
-    """Main of a `ParserProcess` (`… PARENT HANDLE`): answer the requests on stdin until it closes, or until the parent ends."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle; it ends its children
-    exit_with_parent(int(sys.argv[1]))
-    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-    with os.fdopen(int(sys.argv[2]), "wb") as sink:
-        for line in sys.stdin.buffer:
-            sink.write(json.dumps(answer(json.loads(line))).encode() + b"\n")
-            sink.flush()
-
-
-def exit_with_parent(parent: int) -> None:
-    """End this process when its parent ends, so that a killed run leaves no process behind."""
-
-    def poll() -> None:
-        while os.getppid() == parent:
-            time.sleep(0.5)
-        os._exit(75)
-
-    threading.Thread(target=poll, daemon=True).start()
+    """Answer the parent's requests until it closes the pipe."""
+    requests, _ = _streams
+    for line in requests:
+        _send(json.dumps(answer(json.loads(line))).encode())
 
 
 def limit_memory(memory: int) -> None:
-    """Limit this process's address space to `memory` bytes beyond what it has mapped; a later call replaces the limit."""
-    with open("/proc/self/statm", encoding="ascii") as file:
-        mapped = int(file.read().split()[0]) * resource.getpagesize()
-    highest = resource.getrlimit(resource.RLIMIT_AS)[1]
-    limit = mapped + memory if highest == resource.RLIM_INFINITY else min(mapped + memory, highest)
-    resource.setrlimit(resource.RLIMIT_AS, (limit, highest))
+    """Limit this process to `memory` bytes beyond what it has now; a later call replaces the limit.
+
+    Where the system keeps no such limit, the parent watches the process, and ends it.
+    """
+    if not limit_address_space(memory):
+        _send(_WATCH + str(memory).encode())
+
+
+def _send(line: bytes) -> None:
+    _, answers = _streams
+    answers.write(line + b"\n")
+    answers.flush()

@@ -15,8 +15,7 @@ from pathlib import Path
 
 #: PYTHON* variables that cannot make a child run other code.
 _HARMLESS = frozenset({
-    "PYTHONDONTWRITEBYTECODE", "PYTHONHASHSEED", "PYTHONIOENCODING", "PYTHONPYCACHEPREFIX", "PYTHONUTF8", "PYTHONWARNINGS",
-    "PYTHONFAULTHANDLER",
+    "PYTHONDONTWRITEBYTECODE", "PYTHONHASHSEED", "PYTHONPYCACHEPREFIX", "PYTHONUTF8", "PYTHONWARNINGS", "PYTHONFAULTHANDLER",
 })  # fmt: skip
 
 
@@ -28,7 +27,8 @@ def python_command(*arguments: str) -> list[str]:
 def python_environment(variables: Mapping[str, str] | None = None) -> dict[str, str]:
     """Environment of a child, with `variables` on top."""
     kept = {k: v for k, v in os.environ.items() if not k.startswith("PYTHON") or k in _HARMLESS}
-    return {**kept, **(variables or {}), "PYTHONPATH": os.pathsep.join(search_path()), "PYTHONUNBUFFERED": "1"}
+    streams = {"PYTHONUNBUFFERED": "1", "PYTHONIOENCODING": "utf-8:backslashreplace"}  # logs are read as UTF-8 on every system
+    return {**kept, **(variables or {}), **streams, "PYTHONPATH": os.pathsep.join(search_path())}
 
 
 def search_path() -> list[str]:

@@ -10,7 +10,7 @@ from numba.core.dispatcher import Dispatcher
 
 import gsbake
 
-MODULES = [module.name for module in pkgutil.walk_packages(gsbake.__path__, "gsbake.") if not module.name.endswith("__main__")]
+MODULES = [module.name for module in pkgutil.walk_packages(gsbake.__path__[:1], "gsbake.") if not module.name.endswith("__main__")]
 
 
 @pytest.fixture(scope="module")

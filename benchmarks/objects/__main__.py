@@ -25,7 +25,7 @@ from benchmarks.csv_rows import read_rows, write_rows
 from benchmarks.objects.entries import Entry, read_entries
 from benchmarks.timeline import ROOT
 from gsbake.errors import GsbakeError
-from gsbake.pipeline.machine import cpu_name
+from gsbake.system.limits import cpu_name
 
 RESULTS = ROOT / "benchmarks" / "results" / "objects.csv"
 #: The scorer's folder and interpreter, where `make score` has them.

@@ -20,6 +20,7 @@ from gsbake.errors import BadInputError, GsbakeError, UsageError
 from gsbake.pipeline.plan import StageState
 from gsbake.pipeline.store import Store
 from gsbake.publish import RESULTS
+from gsbake.system.names import portable_name, same_file_key
 
 #: Megapixels assumed where no header can be read.
 _USUAL_MEGAPIXELS = 12.0
@@ -80,9 +81,9 @@ def plan_captures(captures: Sequence[Path], options: BatchOptions) -> list[Captu
     named = {path: _name(path) for path in captures}
     seen: dict[str, Path] = {}
     for path, name in named.items():
-        if name in seen:
-            raise UsageError(f"'{seen[name]}' and '{path}' have the same name '{name}' and would share an output folder; rename one.")
-        seen[name] = path
+        other = seen.setdefault(same_file_key(name), path)
+        if other != path:
+            raise UsageError(f"'{other}' and '{path}' have the same name '{name}' and would share an output folder; rename one.")
     return [plan_capture(path, options) for path in named]
 
 
@@ -144,7 +145,7 @@ def _name(photos: Path) -> str:
     name = folder.parent.name if folder.name in PHOTO_FOLDERS else folder.name
     if not name:
         raise UsageError(f"'{photos}' has no name for an output folder; name the folder of a capture.")
-    return name
+    return portable_name(name)
 
 
 def identifier(index: int, name: str) -> str:

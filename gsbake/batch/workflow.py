@@ -9,10 +9,8 @@ from __future__ import annotations
 
 import importlib.util
 import json
-import os
 import shlex
 import shutil
-import signal
 import subprocess
 import time
 from collections.abc import Callable, Sequence
@@ -32,6 +30,7 @@ from gsbake.batch.records import FOLDER, Record, RecordReader
 from gsbake.errors import UsageError
 from gsbake.pipeline.supervise import StopSignals
 from gsbake.python_process import python_command, python_environment
+from gsbake.system.processes import leads_group, start_apart, stop_group
 
 EXECUTORS = ("local", "slurm")
 #: Times that a job is started again which was interrupted or killed.
@@ -95,12 +94,14 @@ def run_workflow(
     progress = _Progress(jobs)
     queue = None if execution.cluster is None else _Queue(prefix)
     with (options.root / FOLDER / "snakemake.log").open("wb") as log:
-        process = subprocess.Popen(
+        process = start_apart(
             python_command("-m", "snakemake", *arguments),
-            cwd=work, stdin=subprocess.DEVNULL, stdout=log, stderr=log, env=python_environment(), start_new_session=True,
+            cwd=work, stdin=subprocess.DEVNULL, stdout=log, stderr=log, env=python_environment(),
         )  # fmt: skip
         started = psutil.Process(process.pid).create_time()
-        _process_file(options.root).write_text(json.dumps({"pid": process.pid, "started": started, "executor": execution.executor}))
+        _process_file(options.root).write_bytes(
+            json.dumps({"pid": process.pid, "started": started, "executor": execution.executor}).encode()
+        )
         stalled = False
         try:
             while process.poll() is None and not stalled:
@@ -111,7 +112,9 @@ def run_workflow(
                 with suppress(subprocess.TimeoutExpired):
                     process.wait(_POLL if queue is None else _SLURM_POLL)
         finally:
-            _end(process, _IDLE_TIMEOUT if stalled or queue is not None else _STOP_TIMEOUT)
+            if process.poll() is None:  # its jobs on this machine write checkpoints
+                stop_group(process.pid, _IDLE_TIMEOUT if stalled or queue is not None else _STOP_TIMEOUT)
+                process.wait()
             if queue is not None:
                 slurm.cancel_jobs(prefix)
     progress.take(reader.new_records(), on_record)
@@ -126,14 +129,10 @@ def end_orphan(root: Path) -> None:
     """Stop the Snakemake of a coordinator that was killed, and its jobs, on this machine or in Slurm's queue; they write checkpoints."""
     body: dict[str, Any] = {}
     with suppress(OSError, ValueError, KeyError, TypeError, psutil.Error):
-        body = json.loads(_process_file(root).read_text())
+        body = json.loads(_process_file(root).read_bytes())
         process = psutil.Process(int(body["pid"]))
-        if abs(process.create_time() - float(body["started"])) < 0.01 and os.getpgid(process.pid) == process.pid:
-            os.killpg(process.pid, signal.SIGTERM)
-            with suppress(psutil.TimeoutExpired):
-                process.wait(_STOP_TIMEOUT)
-            with suppress(ProcessLookupError):
-                os.killpg(process.pid, signal.SIGKILL)
+        if abs(process.create_time() - float(body["started"])) < 0.01 and leads_group(process.pid):
+            stop_group(process.pid, _STOP_TIMEOUT)
     if body.get("executor") == "slurm":
         slurm.cancel_jobs(slurm.job_prefix(root))
     _process_file(root).unlink(missing_ok=True)
@@ -220,14 +219,3 @@ def _prepare(jobs: Sequence[Job], options: BatchOptions, execution: Execution, w
 
 def _process_file(root: Path) -> Path:
     return root / FOLDER / "snakemake.json"
-
-
-def _end(process: subprocess.Popen[bytes], timeout: float) -> None:
-    """Ask Snakemake and its jobs on this machine to stop, which write checkpoints; kill them after `timeout` seconds."""
-    for number, seconds in ((signal.SIGTERM, timeout), (signal.SIGKILL, 5.0)):
-        if process.poll() is not None:
-            return
-        with suppress(ProcessLookupError):
-            os.killpg(process.pid, number)
-        with suppress(subprocess.TimeoutExpired):
-            process.wait(seconds)

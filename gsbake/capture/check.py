@@ -67,7 +67,7 @@ def check_photos(
     (work / "poses").mkdir()
     options = IngestOptions(Ingest(max_size=CHECK_SIZE))
     ingest(photos, work / "ingest", options, masks=masks, poses=poses, threads=threads, monitor=monitor)
-    listing = json.loads((work / "ingest/photos.json").read_text())
+    listing = json.loads((work / "ingest/photos.json").read_text(encoding="utf-8"))
     entries: list[dict[str, Any]] = listing["photos"]
     findings = [*_files(listing), *_pictures(entries), *_light(work / "ingest", entries), *_masks(work / "ingest", entries)]
     found, figures = _cameras(work, entries, threads, monitor)

@@ -98,7 +98,7 @@ class _Estimation:
     def run(self) -> dict[str, Any]:
         """Execute all steps; returns the figures."""
         monitor = self.monitor
-        entries: list[dict[str, Any]] = json.loads((self.ingest / "photos.json").read_text())["photos"]
+        entries: list[dict[str, Any]] = json.loads((self.ingest / "photos.json").read_text(encoding="utf-8"))["photos"]
         solver = PoseSolver(self.ingest, entries, self.scratch, self.options.poses, self.seed, self.threads, monitor, self.cache)
         given = self._use_given(len(entries))
         solved = solver.triangulate() if given else solver.solve()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import shutil
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -33,12 +32,11 @@ from gsbake.geometry.cameras import CameraSet
 from gsbake.geometry.ply import write_cloud
 from gsbake.imaging.png import write_png
 from gsbake.monitor import SILENT, Monitor, Rule, decide_skip
+from gsbake.system.names import portable_name, same_file_key
 from gsbake.text import shortlist
 
 #: Folder of the frames of a video, while they are read.
 FRAMES = "frames"
-#: Longest name of a photo in bytes; file systems allow 255, and suffixes are added.
-MAX_NAME_BYTES = 200
 #: Most processes that read photos.
 MAX_READERS = 8
 
@@ -115,7 +113,7 @@ class _Ingestion:
         guesses = self._guess_masks()
         results = {"poses": "none"} if self.poses is None else self._read_poses(self.poses, list(names))
         entries = self._entries
-        (self.out / "photos.json").write_text(json.dumps({"photos": entries, "skipped": self.skipped}, indent=1))
+        (self.out / "photos.json").write_bytes(json.dumps({"photos": entries, "skipped": self.skipped}, indent=1).encode())
         blur = sorted(e["blur"] for e in entries)
         return {
             "photos": len(entries),
@@ -286,28 +284,20 @@ def _size(photo: ConvertedPhoto) -> PhotoSize:
 
 
 def photo_names(paths: dict[str, Path]) -> dict[str, str]:
-    """Name of each photo by its relative path: the path without suffix, folders joined by "_". Raises BadInputError when two collide.
+    """Name of each photo by its relative path: the path without suffix, folders joined by "_". Raises BadInputError when two collide,
+    on this system or another, which does not tell capitals from small letters.
 
-    Names that are too long for a file, or hold control characters or bytes that are no text, are shortened and end with a digest.
+    Names that some system refuses are shortened and end with a digest.
     """
     names: dict[str, str] = {}
     taken: dict[str, str] = {}
     for relative in paths:
-        name = _file_name(relative.rsplit(".", 1)[0].replace("/", "_"))
-        if name in taken:
-            raise BadInputError(f"The photos {taken[name]} and {relative} would both be called {name}; rename or remove one.")
-        taken[name] = relative
+        name = portable_name(relative.rsplit(".", 1)[0].replace("/", "_"))
+        other = taken.setdefault(same_file_key(name), relative)
+        if other != relative:
+            raise BadInputError(f"The photos {other} and {relative} would both be called {name}; rename or remove one.")
         names[relative] = name
     return names
-
-
-def _file_name(name: str) -> str:
-    """`name` itself where it can be a file's name everywhere, else a shorter one with a digest."""
-    data = os.fsencode(name)
-    if name.isprintable() and len(data) <= MAX_NAME_BYTES:
-        return name
-    safe = "".join(c if c.isprintable() else "_" for c in name)[:40]
-    return f"{safe}_{blake3(data).hexdigest()[:12]}"
 
 
 def _submit_bounded(

@@ -16,8 +16,9 @@ import typer
 
 from gsbake.capture.masks.weights import INSTALL, WEIGHTS
 from gsbake.cli.output import cell, print_json, print_table
-from gsbake.pipeline.machine import cpu_name, cuda_devices, default_threads, resolve_device, torch_cuda_build, versions
+from gsbake.pipeline.machine import cuda_devices, default_threads, resolve_device, torch_cuda_build, versions
 from gsbake.python_process import python_command, python_environment
+from gsbake.system.limits import cpu_name
 from gsbake.text import size
 
 #: {pip package: module that is imported to check it}.

@@ -173,12 +173,12 @@ class CameraSet:
                 for c in self.cameras
             ],
         }
-        path.write_text(json.dumps(body, indent=1))
+        path.write_bytes(json.dumps(body, indent=1).encode())
 
     @staticmethod
     def load(path: Path) -> CameraSet:
         """Read a file written by `save`."""
-        body = json.loads(path.read_text())
+        body = json.loads(path.read_text(encoding="utf-8"))
         similarity = body["to_world"]
         return CameraSet(
             cameras=tuple(

@@ -8,7 +8,6 @@ Wald et al., *Embree: a kernel framework for efficient CPU ray tracing*, SIGGRAP
 
 from __future__ import annotations
 
-import os
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
@@ -19,6 +18,7 @@ from embreex.rtcore_scene import EmbreeScene
 from numpy.typing import ArrayLike, NDArray
 
 from gsbake.geometry.cameras import Camera
+from gsbake.system.limits import usable_processors
 
 #: Rays per call of Embree: small enough for load balancing, large enough to amortise the call.
 CHUNK = 1 << 16
@@ -53,8 +53,7 @@ class RayCaster:
     def __init__(self, vertices: ArrayLike, faces: ArrayLike, threads: int | None = None) -> None:
         self.vertices = np.asarray(vertices, np.float64).reshape(-1, 3)
         self.faces = np.ascontiguousarray(np.asarray(faces).reshape(-1, 3), np.int32)
-        allowed = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-        self._threads = threads or allowed or 1
+        self._threads = threads or usable_processors()
         self._scene: Any = None
         self._centre, self._scale = np.zeros(3), 1.0
         if len(self.faces) == 0:

@@ -7,7 +7,6 @@ section 5.1.5. Double precision; each point is independent, so the result does n
 
 from __future__ import annotations
 
-import os
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -16,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsbake.kernels.declaration import kernel
+from gsbake.system.limits import usable_processors
 
 Doubles = NDArray[np.float64]
 
@@ -38,7 +38,7 @@ def surface_distances(points: Doubles, vertices: Doubles, faces: NDArray[Any]) -
     lower, upper = _boxes(corners)
     points = np.ascontiguousarray(points, np.float64)
     out = np.empty(len(points))
-    with ThreadPoolExecutor(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()) as pool:
+    with ThreadPoolExecutor(usable_processors()) as pool:
         chunks = [slice(start, start + CHUNK) for start in range(0, len(points), CHUNK)]
         list(pool.map(lambda chunk: _distances(points[chunk], corners, lower, upper, out[chunk]), chunks))
     return out

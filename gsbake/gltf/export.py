@@ -90,7 +90,7 @@ def export_asset(
         extras = _extras(options, cameras, mesh, maps, scale)
         data = build_glb(mesh, images, "asset", f"gsbake {__version__}", settings.copyright, extras, maps.factors)
         (out / "asset.glb").write_bytes(data)
-        (out / "cameras.json").write_text(json.dumps(transforms_json(cameras, frame, _source_file_names(ingest)), indent=1))
+        (out / "cameras.json").write_bytes(json.dumps(transforms_json(cameras, frame, _source_file_names(ingest)), indent=1).encode())
         if options.materials != "none":
             _write_light(baked, out, frame)
     with monitor.part("previews"):
@@ -122,7 +122,7 @@ def _size(mesh: GltfMesh, scale: MetricScale) -> dict[str, Any]:
 def _audit(data: bytes, out: Path, settings: Export, monitor: Monitor) -> tuple[int, int]:
     """Audit the asset and write `audit.json`; returns the number of passed rules and of all rules."""
     findings = audit(data, "asset.glb", settings.max_megabytes, settings.max_triangles)
-    (out / "audit.json").write_text(json.dumps(as_json(findings), indent=1))
+    (out / "audit.json").write_bytes(json.dumps(as_json(findings), indent=1).encode())
     for finding in findings:
         if not finding.passed and finding.severity == "warning":
             monitor.warn(f"export: {finding.rule}: {finding.detail}.")
@@ -158,7 +158,7 @@ def _extras(options: ExportOptions, cameras: CameraSet, mesh: GltfMesh, maps: Te
 
 def _source_file_names(ingest: Path) -> dict[str, str]:
     """File name of the user's photo by the photo's name in gsbake."""
-    photos = json.loads((ingest / "photos.json").read_text())["photos"]
+    photos = json.loads((ingest / "photos.json").read_text(encoding="utf-8"))["photos"]
     return {photo["name"]: PurePath(photo["source"]).name for photo in photos}
 
 

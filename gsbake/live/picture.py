@@ -6,7 +6,6 @@ process that serves the page then imports neither torch nor kernels, and trainin
 
 from __future__ import annotations
 
-import os
 import subprocess
 import sys
 from contextlib import suppress
@@ -18,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsbake.python_process import python_command, python_environment
+from gsbake.system.processes import lower_priority
 
 #: Longer side of the picture in pixels; JPEG quality; grey behind the object.
 SIZE, QUALITY, GREY = 384, 85, 0.86
@@ -116,8 +116,7 @@ def main() -> None:
     """Draw one source and write the JPEG to standard output."""
     import cv2
 
-    with suppress(OSError):
-        os.nice(15)
+    lower_priority()
     out, source, transfer = Path(sys.argv[1]), Path(sys.argv[2]), sys.argv[3]
     pixels = np.asarray(np.rint(255 * np.clip(draw(out, source, transfer), 0, 1)), np.uint8)
     done, data = cv2.imencode(".jpg", np.ascontiguousarray(pixels[..., ::-1]), [cv2.IMWRITE_JPEG_QUALITY, QUALITY])

@@ -77,7 +77,7 @@ class DigestCache:
         self._changed = False
         if path is not None:
             with suppress(OSError, ValueError, RecursionError):
-                body = json.loads(path.read_text())
+                body = json.loads(path.read_text(encoding="utf-8"))
                 if isinstance(body, dict):
                     self._entries = body
 

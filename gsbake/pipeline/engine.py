@@ -350,7 +350,7 @@ class Engine:
         folder = self.request.out / "errors"
         folder.mkdir(exist_ok=True)
         path = folder / f"{now().replace(':', '-')[:19]}-{name}.txt"
-        path.write_text(error.details)
+        path.write_bytes(error.details.encode(errors="backslashreplace"))
         return path
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import uuid
 from contextlib import suppress
 from datetime import UTC, datetime
@@ -26,9 +25,5 @@ class EventLog:
     def write(self, event: str, **fields: Any) -> None:
         """Append one event. Write errors are ignored, so that logging cannot end a run."""
         line = json.dumps({"time": now(), "run": self.run, "event": event, **fields}, default=str) + "\n"
-        with suppress(OSError):
-            handle = os.open(self.path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o666)
-            try:
-                os.write(handle, line.encode())
-            finally:
-                os.close(handle)
+        with suppress(OSError), self.path.open("ab", buffering=0) as file:
+            file.write(line.encode())

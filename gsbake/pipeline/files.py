@@ -9,8 +9,9 @@ import uuid
 from contextlib import suppress
 from pathlib import Path
 
-from gsbake.atomic import atomic_replacement, sync
+from gsbake.atomic import atomic_replacement
 from gsbake.errors import BadInputError, GsbakeError, InterruptedRun, UsageError
+from gsbake.system.disk import sync
 
 #: errno values of a full disk or quota.
 DISK_FULL = frozenset({errno.ENOSPC, errno.EDQUOT})

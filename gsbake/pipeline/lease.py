@@ -29,6 +29,8 @@ import psutil
 from filelock import FileLock, Timeout
 
 from gsbake.atomic import write_atomic
+from gsbake.system import disk
+from gsbake.system.limits import boot_id
 
 #: Seconds between heartbeats, and seconds without one after which the lease of another host or boot is stale.
 HEARTBEAT_INTERVAL = 5.0
@@ -57,7 +59,7 @@ class LeaseHolder:
     def read(path: Path) -> LeaseHolder | None:
         """The holder named in a lease file; None when the file is missing or unreadable."""
         try:
-            body = json.loads(path.read_text(encoding="utf-8"))
+            body = json.loads(disk.read(path))
             return LeaseHolder(
                 str(body["host"]), str(body["boot"]), int(body["pid"]), float(body["started"]), int(body["beat"]), str(body["token"])
             )
@@ -149,7 +151,7 @@ class Lease:
         holder = LeaseHolder.current()
         temporary = self.path.with_name(f".{self.path.name}.{holder.token}.tmp")
         try:
-            temporary.write_text(json.dumps(asdict(holder)), encoding="utf-8")
+            temporary.write_bytes(json.dumps(asdict(holder)).encode())
             _link(temporary, self.path)
         except (FileExistsError, FileNotFoundError):  # another holder, which may also have cleaned up
             return False
@@ -166,7 +168,7 @@ class Lease:
         """Remove the lease file if it is (still) the stale one."""
         aside = self.path.with_name(f".{self.path.name}.{uuid.uuid4().hex}.tmp")
         try:
-            self.path.rename(aside)
+            disk.replace(self.path, aside)
         except FileNotFoundError:
             return True
         found = LeaseHolder.read(aside)
@@ -213,16 +215,9 @@ class Lease:
 def _link(source: Path, target: Path) -> None:
     """Create `target` with the content of `source`. Raises FileExistsError when there is one, FileNotFoundError without a source."""
     try:
-        os.link(source, target)
+        disk.link(source, target)
     except (FileExistsError, FileNotFoundError):
         raise
     except OSError:  # a file system without hard links: exclusive creation is the next best
         with target.open("x", encoding="utf-8") as file:
             file.write(source.read_text(encoding="utf-8"))
-
-
-def boot_id() -> str:
-    """Identifier of the machine's current boot."""
-    with suppress(OSError):
-        return Path("/proc/sys/kernel/random/boot_id").read_text().strip()
-    return f"boot-{psutil.boot_time():.0f}"

@@ -5,7 +5,6 @@ from __future__ import annotations
 import ctypes
 import importlib.util
 import math
-import os
 import platform
 import re
 import socket
@@ -19,6 +18,7 @@ from typing import Any
 import psutil
 
 from gsbake.errors import UsageError
+from gsbake.system.limits import cpu_name, usable_processors
 
 #: Libraries whose versions are stored in manifests and shown by `doctor`.
 LIBRARIES = (
@@ -40,11 +40,9 @@ def default_threads() -> int:
 
 def available_cores() -> int:
     """Number of logical cores that this process may use, limited by CPU affinity and container quota."""
-    limits = [psutil.cpu_count() or 1]
-    if hasattr(os, "sched_getaffinity"):
-        limits.append(len(os.sched_getaffinity(0)))
+    limits = [usable_processors()]
     with suppress(OSError, ValueError):  # cgroup v2: "max 100000" or "150000 100000"
-        quota, period = Path("/sys/fs/cgroup/cpu.max").read_text().split()
+        quota, period = Path("/sys/fs/cgroup/cpu.max").read_text(encoding="ascii").split()
         if quota != "max":
             limits.append(math.ceil(int(quota) / int(period)))
     return max(1, min(limits))
@@ -64,7 +62,7 @@ def torch_cuda_build() -> str | None:
     with suppress(ImportError, OSError, ValueError):
         spec = importlib.util.find_spec("torch")
         if spec is not None and spec.origin is not None:
-            text = (Path(spec.origin).parent / "version.py").read_text()
+            text = (Path(spec.origin).parent / "version.py").read_text(encoding="utf-8")
             found = re.search(r"^cuda\b[^=\n]*=\s*'([^']+)'", text, re.MULTILINE)
             return found.group(1) if found else None
     return None
@@ -72,7 +70,7 @@ def torch_cuda_build() -> str | None:
 
 def cuda_devices() -> int:
     """Number of GPUs that the NVIDIA driver reports."""
-    for name in ("libcuda.so.1", "libcuda.so"):
+    for name in ("libcuda.so.1", "libcuda.so", "nvcuda.dll"):
         with suppress(OSError):
             driver = ctypes.CDLL(name)
             count = ctypes.c_int(0)
@@ -128,25 +126,3 @@ def host_info() -> Mapping[str, Any]:
         "cores": psutil.cpu_count(logical=False) or psutil.cpu_count() or 1,
         "memory_bytes": psutil.virtual_memory().total,
     }
-
-
-def cpu_name() -> str:
-    """Model name of the processor."""
-    with suppress(OSError):
-        for line in Path("/proc/cpuinfo").read_text().splitlines():
-            if line.startswith("model name"):
-                return line.split(":", 1)[1].strip()
-    return platform.processor() or platform.machine()
-
-
-def peak_memory() -> int:
-    """Peak resident memory of this process in bytes, without that of the process it was forked from (getrusage includes it)."""
-    with suppress(OSError):
-        found = re.search(r"^VmHWM:\s*(\d+) kB", Path("/proc/self/status").read_text(), re.MULTILINE)
-        if found:
-            return int(found.group(1)) * 1024
-    import resource
-    import sys
-
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak if sys.platform == "darwin" else peak * 1024

@@ -24,12 +24,12 @@ from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
-from gsbake.atomic import sync
 from gsbake.errors import GsbakeError, InterruptedRun, UsageError
 from gsbake.pipeline.digest import file_digest
 from gsbake.pipeline.files import DISK_FULL, NOT_WRITABLE
 from gsbake.pipeline.key import CacheKey
 from gsbake.pipeline.store import MANIFEST, Artifact, parse_manifest
+from gsbake.system import disk
 
 #: Seconds during which a store that does not answer is tried again.
 PATIENCE = 120.0
@@ -252,7 +252,7 @@ class SharedStore:
     def set_quota(self, size: int | None, scratch: Path) -> None:
         """Set or remove the limit for all machines. Raises PermissionError for a read-only store."""
         path = scratch / _SETTINGS
-        path.write_text(json.dumps({"quota_bytes": size}))
+        path.write_bytes(json.dumps({"quota_bytes": size}).encode())
         self._write(path, f"{self._root}/{_SETTINGS}")
 
     # -- files -----------------------------------------------------------------------------------------------------------------------------
@@ -320,10 +320,10 @@ class SharedStore:
         try:
             if self._local:
                 self._patiently(lambda: shutil.copyfile(source, temporary), check)
-                sync(Path(temporary))
+                disk.sync(Path(temporary))
                 if not exclusive or not _link(temporary, path):
-                    os.replace(temporary, path)
-                sync(Path(path).parent)
+                    disk.replace(Path(temporary), Path(path))
+                disk.sync(Path(path).parent)
             else:
                 self._patiently(lambda: self._fs.put_file(str(source), temporary), check)
                 if not exclusive or not self._exists(path, None, check):
@@ -379,7 +379,7 @@ class SharedStore:
 def _link(source: str, target: str) -> bool:
     """Give a file its name unless another has it; False on file systems without hard links."""
     try:
-        os.link(source, target)
+        disk.link(Path(source), Path(target))
     except FileExistsError:
         return True
     except OSError:

@@ -20,10 +20,11 @@ from typing import Any
 
 from blake3 import blake3
 
-from gsbake.atomic import sync, write_atomic
+from gsbake.atomic import write_atomic
 from gsbake.pipeline.digest import DigestCache, tree_digest
 from gsbake.pipeline.files import remove_tree, sync_tree
 from gsbake.pipeline.key import KEY_PREFIX_LENGTH, CacheKey
+from gsbake.system import disk
 
 MANIFEST = "manifest.json"
 #: Name of the folder of parts of a stage's work that later runs use again.
@@ -164,15 +165,15 @@ class Store:
         body = {**manifest, "digest": tree_digest(files), "files": {n: {"digest": files[n], "bytes": sizes[n]} for n in names}}
         body["seal"] = _seal(body)
         write_atomic(temporary / MANIFEST, json.dumps(body, indent=1), durable=True)
-        sync(temporary)
+        disk.sync(temporary)
         if final.exists():  # a damaged artifact, or one of other schema defaults
             old = final.with_name(f"{final.name}.tmp-{uuid.uuid4().hex[:8]}")
-            final.rename(old)
-            temporary.rename(final)
+            disk.replace(final, old)
+            disk.replace(temporary, final)
             remove_tree(old)
         else:
-            temporary.rename(final)
-        sync(final.parent)
+            disk.replace(temporary, final)
+        disk.sync(final.parent)
         return self._artifact(final, body)
 
     def remove_leftovers(self, stage: str, key: str) -> None:
@@ -280,7 +281,7 @@ def _well_formed(files: object) -> bool:
     """Whether a manifest's list of files has digests and sizes, and names inside the artifact's folder only."""
     if not isinstance(files, dict):
         return False
-    inside = all(not name.startswith("/") and ".." not in name.split("/") for name in files)
+    inside = all(not name.startswith("/") and ".." not in name.split("/") and not {"\\", ":"} & set(name) for name in files)
     entries = [entry if isinstance(entry, dict) else {} for entry in files.values()]
     return inside and all(isinstance(e.get("digest"), str) and isinstance(e.get("bytes"), int) for e in entries)
 

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import selectors
 import signal
 import subprocess
 import threading
@@ -21,8 +19,11 @@ import psutil
 from gsbake import errors
 from gsbake.errors import GsbakeError, InterruptedRun
 from gsbake.pipeline.machine import thread_environment
-from gsbake.pipeline.worker import Job
+from gsbake.pipeline.worker import STOP_REQUEST, Job
 from gsbake.python_process import python_command, python_environment
+from gsbake.system import processes
+from gsbake.system.exit_codes import ExitCode
+from gsbake.system.pipes import LineReader
 
 #: Seconds for a stage to acknowledge a stop request, and then to write its checkpoint.
 STOP_TIMEOUT = 5.0
@@ -30,6 +31,8 @@ CHECKPOINT_TIMEOUT = 30.0
 
 #: Seconds between samples of the memory of the worker and its child processes.
 _MEMORY_SAMPLE_INTERVAL = 0.5
+#: Seconds for the last messages of a worker that has ended to arrive.
+_LAST_WORDS = 2.0
 _COMMAND = "from gsbake.pipeline.worker import main; main()"
 _STOPPED = "Stopped on request; the same command resumes the run."
 
@@ -43,7 +46,7 @@ class StageFailed(GsbakeError):
 
 
 class StopSignals:
-    """Context that counts SIGINT, SIGTERM and SIGHUP instead of their default action; has no effect outside the main thread."""
+    """Context that counts the signals of a stop request instead of their default action; has no effect outside the main thread."""
 
     def __init__(self) -> None:
         self.count = 0
@@ -51,8 +54,7 @@ class StopSignals:
 
     def __enter__(self) -> StopSignals:
         if threading.current_thread() is threading.main_thread():
-            for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-                self._old[number] = signal.signal(number, self._on_signal)
+            self._old = processes.set_handlers(self._on_signal)
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
@@ -81,46 +83,27 @@ class Outcome:
 
 
 class Worker:
-    """A worker process and the read end of its message pipe."""
+    """A worker process and the pipes to it."""
 
     def __init__(self, job: Job, log: Path) -> None:
-        read, write = os.pipe()
         with log.open("wb") as sink:
-            self.process = subprocess.Popen(
-                python_command("-c", _COMMAND, str(write)),
-                stdin=subprocess.PIPE, stdout=sink, stderr=sink, env=python_environment(thread_environment(job.threads)),
-                pass_fds=(write,), start_new_session=True,  # Ctrl-C reaches only the supervisor, which passes it on
+            self.process = processes.start_apart(
+                python_command("-c", _COMMAND), stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=sink,
+                env=python_environment(thread_environment(job.threads)),
             )  # fmt: skip
-        os.close(write)
-        assert self.process.stdin is not None
-        with suppress(BrokenPipeError):
-            self.process.stdin.write(job.dumps().encode())
-            self.process.stdin.close()
-        self._read = read
-        os.set_blocking(read, False)
-        self._selector = selectors.DefaultSelector()
-        self._selector.register(read, selectors.EVENT_READ)
-        self._partial_line = b""
+        assert self.process.stdout is not None
+        self._reader = LineReader(self.process.stdout)
+        self._send(job.dumps().encode() + b"\n")
         self.peak = 0
         self._sampled = -_MEMORY_SAMPLE_INTERVAL
 
     def messages(self, timeout: float) -> tuple[list[dict[str, Any]], bool]:
         """Messages received within `timeout` seconds, and whether the worker has ended."""
         ended = self.process.poll() is not None
-        self._selector.select(0 if ended else timeout)
-        chunks = [self._partial_line]
-        while True:
-            try:
-                chunk = os.read(self._read, 1 << 16)
-            except BlockingIOError:
-                break
-            if not chunk:
-                ended = True
-                self.process.wait()
-                break
-            chunks.append(chunk)
-        *lines, self._partial_line = b"".join(chunks).split(b"\n")
-        return [json.loads(line) for line in lines], ended
+        lines = self._reader.last_lines(_LAST_WORDS) if ended else self._reader.lines(timeout)
+        if self._reader.ended:
+            self.process.wait()
+        return [json.loads(line) for line in lines], self._reader.ended
 
     def sample_memory(self) -> None:
         """Update the peak memory of the worker and its child processes."""
@@ -128,35 +111,30 @@ class Worker:
         if now - self._sampled < _MEMORY_SAMPLE_INTERVAL:
             return
         self._sampled = now
-        with suppress(psutil.Error):
-            root = psutil.Process(self.process.pid)
-            total = 0
-            for process in (root, *root.children(recursive=True)):
-                with suppress(psutil.Error):
-                    total += process.memory_info().rss
-            self.peak = max(self.peak, total)
+        self.peak = max(self.peak, processes.resident_memory(self.process.pid))
 
-    def terminate(self) -> None:
+    def request_stop(self) -> None:
         """Request the stage to stop."""
-        with suppress(ProcessLookupError):
-            self.process.send_signal(signal.SIGTERM)
+        self._send(STOP_REQUEST)
 
     def kill(self) -> None:
         """Kill the worker and its child processes."""
-        with suppress(psutil.Error):
-            for child in psutil.Process(self.process.pid).children(recursive=True):
-                with suppress(psutil.Error):
-                    child.kill()
-        with suppress(ProcessLookupError, PermissionError):
-            os.killpg(self.process.pid, signal.SIGKILL)
-        self.process.wait()
+        processes.kill(self.process)
 
     def close(self) -> None:
-        """Kill the worker if it still runs, and close the pipe."""
+        """Kill the worker if it still runs, and close the pipes."""
         if self.process.poll() is None:
             self.kill()
-        self._selector.close()
-        os.close(self._read)
+        self._reader.close()
+        assert self.process.stdin is not None
+        with suppress(OSError):  # what it has not read
+            self.process.stdin.close()
+
+    def _send(self, line: bytes) -> None:
+        assert self.process.stdin is not None
+        with suppress(OSError):  # it has ended
+            self.process.stdin.write(line)
+            self.process.stdin.flush()
 
 
 def supervise(
@@ -190,7 +168,7 @@ def supervise(
             worker.sample_memory()
             if stop.count and deadline is None:
                 deadline = time.monotonic() + stop_timeout
-                worker.terminate()
+                worker.request_stop()
                 on_message({"kind": "stop sent"})
             if not last and (stop.count > 1 or (deadline is not None and time.monotonic() > deadline)):
                 worker.kill()
@@ -230,17 +208,15 @@ def _out_of_memory(evidence: str) -> InterruptedRun:
 
 def _unexpected_exit(worker: Worker, log: Path, stop: StopSignals) -> GsbakeError:
     """The error of a worker that ended without reporting a result."""
-    code = worker.process.returncode
+    code = ExitCode.of(worker.process.returncode)
     if stop.count:
         return InterruptedRun(_STOPPED)
-    if -code in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):  # before the worker handled them: it was just starting
-        name = signal.Signals(-code).name
-        return InterruptedRun(f"The stage's process was ended from outside by {name}; the same command resumes the run.")
+    if code.requested:  # before the worker handled it: it was just starting
+        return InterruptedRun(f"The stage's process was ended from outside by {code}; the same command resumes the run.")
     with suppress(OSError):
-        tail = log.read_text(errors="replace")[-4000:]
-        if code == -signal.SIGKILL:
+        tail = log.read_text(encoding="utf-8", errors="replace")[-4000:]
+        if code.killed:
             total = psutil.virtual_memory().total
             return _out_of_memory(f"killed by the system at {worker.peak / 1e9:.1f} GB of {total / 1e9:.1f} GB")
-        name = signal.Signals(-code).name if code < 0 else f"exit code {code}"
-        return StageFailed(f"the stage's process ended with {name}", tail)
-    return StageFailed(f"the stage's process ended with code {code}")
+        return StageFailed(f"the stage's process ended with {code}", tail)
+    return StageFailed(f"the stage's process ended with {code}")

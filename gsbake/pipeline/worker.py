@@ -1,4 +1,4 @@
-"""Worker process: reads a job from stdin, runs its stage and reports in JSON Lines on a pipe.
+"""Worker process: reads a job and stop requests from its parent, runs the job's stage and reports in JSON Lines.
 
 Each stage runs in its own process. So thread pools are sized before libraries load, libraries of different stages do not interfere, peak
 memory is measured per stage and returned to the system, and a crash or kill inside a native library becomes an error message. The process
@@ -8,7 +8,6 @@ ends with its parent, so no orphan keeps writing.
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import faulthandler
 import json
 import math
@@ -23,17 +22,21 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 from gsbake.errors import GsbakeError, InterruptedRun
 from gsbake.pipeline.files import disk_error
-from gsbake.pipeline.machine import peak_memory
 from gsbake.pipeline.registry import load_stage
 from gsbake.pipeline.settings import SettingsView
+from gsbake.system.limits import peak_memory
+from gsbake.system.pipes import take_standard_streams
+from gsbake.system.processes import exit_with_parent, kill_with_parent
 from gsbake.text import printable
 
 #: Minimum time between progress messages in seconds.
 PROGRESS_INTERVAL = 0.1
+#: The line after the job by which the supervisor asks the stage to stop. Signals would not do: on Windows they only kill.
+STOP_REQUEST = b"stop\n"
 
 #: Messages of libraries that report a failed allocation in their own exception types.
 _OUT_OF_MEMORY = re.compile(r"can't allocate memory|out of memory|insufficient memory|bad_alloc|unable to allocate", re.IGNORECASE)
@@ -69,8 +72,8 @@ class Job:
 class MessagePipe:
     """Write end of the pipe to the supervisor; the process exits when the read end is closed."""
 
-    def __init__(self, handle: int) -> None:
-        self._handle = handle
+    def __init__(self, stream: BinaryIO) -> None:
+        self._stream = stream
         self._lock = threading.Lock()
 
     def send(self, kind: str, **fields: Any) -> None:
@@ -78,9 +81,9 @@ class MessagePipe:
         data = (json.dumps(to_json({"kind": kind, **fields})) + "\n").encode()
         with self._lock:
             try:
-                while data:
-                    data = data[os.write(self._handle, data) :]
-            except BrokenPipeError:
+                self._stream.write(data)
+                self._stream.flush()
+            except OSError:  # Windows has other words for it than BrokenPipeError
                 os._exit(InterruptedRun.exit_code)
 
 
@@ -104,7 +107,7 @@ class WorkerContext:
         self._last = -math.inf
 
     def request_stop(self, *_: object) -> None:
-        """Handler of SIGTERM."""
+        """Ask the stage to stop, for the supervisor or, as the handler of SIGTERM, for a scheduler that signals all processes of a job."""
         self._stop.set()
 
     @contextmanager
@@ -168,23 +171,23 @@ def to_json(value: Any) -> Any:
     raise TypeError(f"a stage reported a {type(value).__name__}, which is not JSON-serialisable")
 
 
-def die_with_parent(parent: int) -> None:
-    """Have the kernel kill this process when its parent ends; on systems without this feature, poll the parent."""
-    if sys.platform == "linux":
-        ctypes.CDLL(None).prctl(1, signal.SIGKILL, 0, 0, 0)  # PR_SET_PDEATHSIG
-    if os.getppid() != parent:
-        os._exit(InterruptedRun.exit_code)
+class StopRequests:
+    """Reads the supervisor's requests to stop. Before the stage runs there is nothing to save: the process exits."""
 
-    def poll_parent() -> None:
-        while os.getppid() == parent:
-            time.sleep(0.5)
-        os._exit(InterruptedRun.exit_code)
+    def __init__(self, requests: BinaryIO) -> None:
+        self._requests = requests
+        self.context: WorkerContext | None = None
+        threading.Thread(target=self._read, name="stop requests", daemon=True).start()
 
-    if sys.platform != "linux":
-        threading.Thread(target=poll_parent, name="parent poll", daemon=True).start()
+    def _read(self) -> None:
+        for line in self._requests:
+            if line == STOP_REQUEST and self.context is None:
+                os._exit(InterruptedRun.exit_code)
+            elif line == STOP_REQUEST and self.context is not None:
+                self.context.request_stop()
 
 
-def run_job(job: Job, pipe: MessagePipe) -> None:
+def run_job(job: Job, pipe: MessagePipe, stop: StopRequests) -> None:
     """Run the stage of a job and report its results or its error."""
     import importlib
 
@@ -193,6 +196,7 @@ def run_job(job: Job, pipe: MessagePipe) -> None:
         module, _, name = job.schema.partition(":")
         profile = getattr(importlib.import_module(module), name).model_validate(job.profile)
         context = WorkerContext(job, SettingsView(profile, stage.settings, stage.name), pipe)
+        stop.context = context
         signal.signal(signal.SIGTERM, context.request_stop)
         pipe.send("ready")
         results = to_json(stage.run(context) or {})
@@ -219,14 +223,14 @@ def _public_name(error: GsbakeError) -> str:
 
 
 def main() -> None:
-    """Entry point of the worker process: `python -c … HANDLE`, with the job on stdin."""
+    """Entry point of the worker process: `python -c …`, with the job as the first line on stdin."""
     faulthandler.enable()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    handle = int(sys.argv[1])
-    os.set_inheritable(handle, False)
-    job = Job.loads(sys.stdin.read())
-    die_with_parent(job.parent)
-    run_job(job, MessagePipe(handle))
+    requests, answers = take_standard_streams()
+    job = Job.loads(requests.readline().decode())
+    kill_with_parent()
+    exit_with_parent(job.parent, InterruptedRun.exit_code)
+    run_job(job, MessagePipe(answers), StopRequests(requests))
     with contextlib.suppress(OSError):
         sys.stdout.flush()
         sys.stderr.flush()

@@ -96,8 +96,8 @@ class _ReportWriter:
                 {"name": s.name, "psnr": s.metrics.psnr, "exposed_psnr": s.metrics.exposed_psnr, "ssim": s.metrics.ssim}
                 for s in renders.scored
             ]
-            (self.out / "report.html").write_text(text, encoding="utf-8")
-            (self.out / "report.json").write_text(json.dumps(figures | {"views": views}, indent=1))
+            (self.out / "report.html").write_bytes(text.encode())
+            (self.out / "report.json").write_bytes(json.dumps(figures | {"views": views}, indent=1).encode())
         return figures | {"page_bytes": len(text)}
 
     def _render(self) -> _Renders:

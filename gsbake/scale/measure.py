@@ -57,7 +57,7 @@ def measure_scale(
     if options.marker_size:
         found += _measure_markers(cameras, ingest, options, monitor)
     if options.known_distances:
-        entries = json.loads((ingest / "photos.json").read_text())["photos"]
+        entries = json.loads((ingest / "photos.json").read_text(encoding="utf-8"))["photos"]
         picked = PickedPhotos({camera.name: camera for camera in cameras}, entries)
         for text in options.known_distances:
             found.append(_measure_distance(parse_known_distance(text), picked, surface, to_world or Similarity()))
@@ -73,7 +73,7 @@ def measure_scale(
 
 def _measure_gps(ingest: Path, poses: Path, monitor: Monitor) -> MetricScale | None:
     """The scale of solved poses by the positions in EXIF, where it is known well enough; reports why not."""
-    entries = json.loads((ingest / "photos.json").read_text())["photos"]
+    entries = json.loads((ingest / "photos.json").read_text(encoding="utf-8"))["photos"]
     positions = {entry["name"]: entry["gps"] for entry in entries if entry.get("gps")}
     if not positions or not (poses / "photo_cameras.json").exists():  # cameras that the user put in their place have none
         return None

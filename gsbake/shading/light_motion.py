@@ -48,7 +48,8 @@ class LightMotion:
 
     def save(self, path: Path) -> None:
         """Write it as JSON."""
-        path.write_text(json.dumps({"motion": self.motion, "rotations": None if self.rotations is None else self.rotations.tolist()}))
+        body = {"motion": self.motion, "rotations": None if self.rotations is None else self.rotations.tolist()}
+        path.write_bytes(json.dumps(body).encode())
 
     @classmethod
     def load(cls, path: Path) -> LightMotion:
@@ -56,7 +57,7 @@ class LightMotion:
         if not path.exists():
             return cls()
         try:
-            found = json.loads(path.read_text())
+            found = json.loads(path.read_text(encoding="utf-8"))
             rotations = None if found["rotations"] is None else np.array(found["rotations"], np.float64).reshape(-1, 3, 3)
             motion: Motion = found["motion"]
         except (OSError, ValueError, KeyError, TypeError) as error:

@@ -138,7 +138,7 @@ def _mirror_weight(angle: float, cosine: float) -> float:
 
 def lobe_table(roughness: NDArray[Any], root_cosine: NDArray[Any]) -> Floats:
     """Share, roughness and mirror weight (n, 3) of the lobe at `roughness` (n,) and √(n·v) (n,); linear between the fitted nodes."""
-    with FILE.open(newline="") as file:
+    with FILE.open(encoding="utf-8", newline="") as file:
         rows = [[float(x) for x in row] for row in list(csv.reader(file))[1:]]
     nodes = np.array(rows)[:, 2:].reshape(len(ROUGHNESS), len(ROOT_COSINE), 3)
     nodes = np.concatenate([np.broadcast_to([0.0, 0.0, 1.0], (1, *nodes.shape[1:])), nodes])
@@ -155,7 +155,7 @@ def main() -> None:
         for roughness in ROUGHNESS:
             lobe, start = fit_lobe(roughness, root**2, start)
             rows.append((roughness, root, *(round(value, 4) for value in astuple(lobe))))
-    with FILE.open("w", newline="") as file:
+    with FILE.open("w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(["roughness", "root_cosine", "share", "lobe_roughness", "mirror"])
         writer.writerows(sorted(rows))

@@ -156,7 +156,7 @@ def write_capture(
     with ThreadPoolExecutor(2) as pool:  # the renderer releases the GIL
         list(pool.map(lambda camera: _write_view(folder, camera, rig, background, cells), cams))
     if poses:
-        (folder / "transforms.json").write_text(json.dumps(_transforms(cams), indent=1))
+        (folder / "transforms.json").write_bytes(json.dumps(_transforms(cams), indent=1).encode())
     truth = folder / "truth"
     CameraSet(cams, poses="given").save(truth / "cameras.json")
     vertices, faces = true_mesh()

@@ -90,7 +90,7 @@ def build_targets(folders: Mapping[str, Path], out: Path, options: TargetOptions
         monitor.check_stop()
         with monitor.part(target.text):
             files |= builder.surfels() if target.name == SURFELS else builder.write(target)
-    (out / "targets.json").write_text(json.dumps(files, indent=1))
+    (out / "targets.json").write_bytes(json.dumps(files, indent=1).encode())
     return {"files": len(files), "targets": files}
 
 
@@ -270,7 +270,7 @@ class _Builder:
             if not finding.passed and finding.severity == "warning":
                 self.monitor.warn(f"targets: {name}: {finding.rule}: {finding.detail}.")
         (self.out / name).write_bytes(data)
-        (self.out / f"{name.removesuffix('.glb')}.audit.json").write_text(json.dumps(as_json(findings), indent=1))
+        (self.out / f"{name.removesuffix('.glb')}.audit.json").write_bytes(json.dumps(as_json(findings), indent=1).encode())
         return {"audit_passed": sum(f.passed for f in findings), "audit_rules": len(findings)}
 
     def figures(self, target: Target, k: int, level: LevelFile, size: int) -> dict[str, Any]:

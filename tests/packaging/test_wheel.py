@@ -1,7 +1,9 @@
-"""The wheel: one top-level package with stages and profiles inside, and a bake from an empty folder with nothing but the wheel."""
+"""The wheel: one top-level package with stages and profiles inside, and a bake from an empty folder with nothing but the wheel. The same
+package from the source archive, from an editable install, and from a checkout that is only on the path."""
 
 from __future__ import annotations
 
+import json
 import os
 import site
 import subprocess
@@ -14,6 +16,15 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
+#: Prints where the package, its stages and its profiles are found, here and in a child.
+FIND = """
+import json, subprocess, gsbake, gsbake.stages.ingest
+from importlib.resources import files
+from gsbake.python_process import python_command, python_environment
+where = [gsbake.__file__, gsbake.stages.ingest.__file__, str(files("gsbake.profiles") / "smoke.toml")]
+child = python_command("-c", "import gsbake.stages.ingest as stage, gsbake.profiles; print(stage.STAGE.name)")
+print(json.dumps([where, subprocess.check_output(child, env=python_environment(), text=True).strip()]))
+"""
 #: The smallest bake there is: no stereo, a handful of steps.
 TINY = (
     "ingest.max_size=64", "train.iterations=20", "train.max_size=64", "train.init_surfels=500", "refine.iterations=0",
@@ -42,23 +53,63 @@ def test_one_top_level_package(wheel: Path) -> None:
     assert not [name for name in names if "test" in name or name.endswith((".nbi", ".nbc", ".pyc"))]
 
 
+def test_the_source_archive_gives_the_same_wheel(wheel: Path, tmp_path: Path) -> None:
+    run(sys.executable, "-m", "hatchling", "build", "-t", "sdist", "-d", tmp_path, cwd=ROOT)
+    options = ("--no-deps", "--no-build-isolation", "--quiet", "--wheel-dir", tmp_path)
+    run(sys.executable, "-m", "pip", "wheel", *options, next(tmp_path.glob("*.tar.gz")), cwd=tmp_path)
+    with zipfile.ZipFile(wheel) as one, zipfile.ZipFile(next(tmp_path.glob("*.whl"))) as other:
+        assert {name: one.read(name) for name in one.namelist()} == {name: other.read(name) for name in other.namelist()}
+
+
 Run = Callable[..., str]
+Environment = tuple[Path, Path, Run]
 
 
 @pytest.fixture
-def installed(wheel: Path, tmp_path: Path) -> Run:
-    """Runs a command in an empty folder, in an environment of its own that has the dependencies, from this one, but no checkout."""
+def environment(tmp_path: Path) -> Environment:
+    """An environment of its own that has the dependencies, from this one, but no gsbake: its Python, the folder of its packages, and a
+    function that runs a command in an empty folder."""
     home, work = tmp_path / "environment", tmp_path / "work"
     venv.create(home, with_pip=False)
     work.mkdir()
-    packages = Path(run(home / "bin" / "python", "-c", "import site; print(site.getsitepackages()[0])", cwd=work).strip())
+    python = home / ("Scripts/python.exe" if os.name == "nt" else "bin/python")
+    clean = {key: value for key, value in os.environ.items() if not key.startswith(("PYTHON", "COV_", "COVERAGE"))}
+    packages = Path(run(python, "-c", "import site; print(site.getsitepackages()[-1])", cwd=work, environment=clean).strip())
     # Entries of a .pth file are not searched for further .pth files: the editable install of the checkout stays out.
     (packages / "dependencies.pth").write_text("\n".join(site.getsitepackages()))
-    run(sys.executable, "-m", "pip", "install", "--no-deps", "--quiet", "--target", packages, wheel, cwd=work)
-    clean = {key: value for key, value in os.environ.items() if not key.startswith(("PYTHON", "COV_", "COVERAGE"))}
-    where = run(home / "bin" / "python", "-c", "import gsbake; print(gsbake.__file__)", cwd=work, environment=clean).strip()
-    assert Path(where).is_relative_to(packages)
-    return lambda *command: run(home / "bin" / "python", "-m", "gsbake", *command, cwd=work, environment=clean)
+
+    def call(*command: object, **variables: str) -> str:
+        return run(*command, cwd=work, environment=clean | variables)
+
+    return python, packages, call
+
+
+@pytest.fixture
+def installed(wheel: Path, environment: Environment) -> Run:
+    """Runs a command of the installed wheel in an empty folder."""
+    python, packages, call = environment
+    run(sys.executable, "-m", "pip", "install", "--no-deps", "--quiet", "--target", packages, wheel, cwd=packages)
+    where, stage = json.loads(call(python, "-c", FIND))
+    assert stage == "ingest" and all(Path(path).is_relative_to(packages) for path in where)
+    return lambda *command: call(python, "-m", "gsbake", *command)
+
+
+def test_an_editable_install_is_the_checkout(environment: Environment) -> None:
+    python, _, call = environment
+    call(python, "-m", "pip", "install", "--no-deps", "--no-build-isolation", "--quiet", "--editable", ROOT)
+    check_checkout(call(python, "-c", FIND))
+
+
+def test_a_checkout_on_the_path(environment: Environment) -> None:
+    python, _, call = environment
+    check_checkout(call(python, "-c", FIND, PYTHONPATH=str(ROOT)))
+
+
+def check_checkout(found: str) -> None:
+    """Python found the folders of this repository."""
+    where, stage = json.loads(found)
+    assert stage == "ingest"
+    assert list(map(Path, where)) == [ROOT / "gsbake/__init__.py", ROOT / "stages/ingest.py", ROOT / "profiles/smoke.toml"]
 
 
 def test_first_stages_from_an_empty_folder(installed: Run, tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -14,7 +15,8 @@ from pathlib import Path
 import psutil
 import pytest
 
-from gsbake.pipeline.lease import Lease, LeaseHolder, boot_id
+from gsbake.pipeline.lease import Lease, LeaseHolder
+from gsbake.system.limits import boot_id
 from tests.pipeline.test_engine import total
 from tests.pipeline.toy import Sum, Toy, engine
 
@@ -152,8 +154,8 @@ def dead_pid() -> int:
 @pytest.mark.parametrize(
     "holder",
     [
-        LeaseHolder(os.uname().nodename, boot_id(), dead_pid(), time.time() - 100),
-        LeaseHolder(os.uname().nodename, boot_id(), os.getpid(), 12345.0),  # same pid, another process
+        LeaseHolder(socket.gethostname(), boot_id(), dead_pid(), time.time() - 100),
+        LeaseHolder(socket.gethostname(), boot_id(), os.getpid(), 12345.0),  # same pid, another process
     ],
     ids=["dead process", "recycled pid"],
 )
@@ -168,7 +170,7 @@ def test_stale_lease_is_taken_over(tmp_path: Path, holder: LeaseHolder) -> None:
     assert not lease.path.exists()
 
 
-@pytest.mark.parametrize("host", ["another-host", os.uname().nodename], ids=["another host", "cloned machine"])
+@pytest.mark.parametrize("host", ["another-host", socket.gethostname()], ids=["another host", "cloned machine"])
 def test_lease_of_another_host_or_boot_is_stale_without_heartbeats(tmp_path: Path, host: str) -> None:
     lease = Lease(tmp_path / "x.lease", heartbeat_timeout=0.6)
     holder = LeaseHolder(host, "another boot", 1, 0.0, beat=3)

@@ -1,4 +1,4 @@
-"""The child process that decodes untrusted photos and masks: `python -m … PARENT`, with requests on stdin.
+"""The child process that decodes untrusted photos and masks: see `limited_process`.
 
 Decoders are native code: a file may make one loop, take all memory or crash. Here it does so alone, and under a limit on memory that
 follows from the size that the file's header states. The parent's side is `reader_pool.py`.
@@ -45,11 +45,7 @@ def answer(request: dict[str, Any]) -> dict[str, Any]:
 
 
 def main() -> None:
-    """Answer requests until stdin closes; one thread, because the parent runs several of these."""
+    """Answer requests until the parent closes the pipe; one thread, because the parent runs several of these."""
     cv2.setNumThreads(1)
     oiio.attribute("threads", 1)
     serve(answer)
-
-
-if __name__ == "__main__":
-    main()

@@ -55,9 +55,5 @@ def answer(request: dict[str, Any]) -> dict[str, Any]:
 
 
 def main() -> None:
-    """Answer requests until stdin closes."""
+    """Answer requests until the parent closes the pipe."""
     serve(answer)
-
-
-if __name__ == "__main__":
-    main()

@@ -1,4 +1,4 @@
-"""The child process that reads an untrusted COLMAP model: `python -m … PARENT`, with requests on stdin.
+"""The child process that reads an untrusted COLMAP model: see `limited_process`.
 
 pycolmap trusts the counts in binary models: a file of 8 bytes can ask for 2⁶³ points. Here it may, under a limit on memory and time.
 """
@@ -54,5 +54,6 @@ def _read(folder: Path, target: Path) -> dict[str, Any]:
     return {"names": names, "models": [lens.model_name for lens in lenses]}
 
 
-if __name__ == "__main__":
+def main() -> None:
+    """Answer requests until the parent closes the pipe."""
     serve(answer)

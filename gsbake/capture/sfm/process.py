@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import selectors
-import signal
 import subprocess
 import time
 from collections.abc import Callable, Mapping
@@ -16,6 +14,9 @@ from typing import Any
 
 from gsbake.errors import GsbakeError, InterruptedRun
 from gsbake.python_process import python_command, python_environment
+from gsbake.system import processes
+from gsbake.system.exit_codes import ExitCode
+from gsbake.system.pipes import LineReader
 
 #: Work is split between pairs and photos, so the matrix library's own threads would only get in the way.
 _ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
@@ -33,12 +34,6 @@ class JobCallbacks:
 
     progress: Callable[[str, int, int], None]
     stop: Callable[[], bool]
-
-
-def _kill(child: subprocess.Popen[bytes]) -> None:
-    with suppress(ProcessLookupError, PermissionError):
-        os.killpg(child.pid, signal.SIGKILL)
-    child.wait()
 
 
 class _LogProgress:
@@ -69,7 +64,8 @@ class _LogProgress:
 
 
 def _last_line(log: Path) -> str:
-    lines = [line.strip() for line in log.read_text(errors="replace").splitlines() if line.strip()] if log.exists() else []
+    text = log.read_text(encoding="utf-8", errors="replace") if log.exists() else ""
+    lines = [line.strip() for line in text.splitlines() if line.strip()]
     return lines[-1] if lines else "no message"
 
 
@@ -81,49 +77,38 @@ def run_job(job: Mapping[str, Any], out: Path, callbacks: JobCallbacks, limit: f
     """
     out.mkdir(parents=True, exist_ok=True)
     job_file = out / "job.json"
-    job_file.write_text(json.dumps({**job, "out": str(out)}))
+    job_file.write_bytes(json.dumps({**job, "out": str(out)}).encode())
     log = out / "colmap.log"
     log_progress = _LogProgress(log)
     deadline = None if limit is None else time.monotonic() + limit
     command = python_command("-m", "gsbake.capture.sfm.worker", str(job_file), str(os.getpid()))
     environment = python_environment(_ONE_THREAD)
     with log.open("wb") as sink:
-        child = subprocess.Popen(
-            command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=sink, env=environment, start_new_session=True
-        )
+        child = processes.start_apart(command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=sink, env=environment)
+    assert child.stdout is not None
+    reader = LineReader(child.stdout)
     try:
-        assert child.stdout is not None
-        os.set_blocking(child.stdout.fileno(), False)
-        with selectors.DefaultSelector() as selector:
-            selector.register(child.stdout, selectors.EVENT_READ)
-            rest = b""
-            while True:
-                if callbacks.stop():
-                    return None
-                if deadline is not None and time.monotonic() > deadline:
-                    raise InterruptedRun(f"Structure from motion took longer than {limit:.0f} s; run the same command on an idle machine.")
-                if not selector.select(_POLL_SECONDS):
-                    if (progress := log_progress.poll()) is not None:
-                        callbacks.progress(*progress)
-                    continue
-                data = child.stdout.read()
-                if data == b"":
-                    break
-                *lines, rest = (rest + (data or b"")).split(b"\n")
-                for line in lines:
-                    with suppress(ValueError, KeyError, TypeError):  # output of libraries
-                        report = json.loads(line)
-                        log_progress.begin(report["part"], report["total"])
-                        callbacks.progress(report["part"], report["done"], report["total"])
-        code = child.wait()
+        while not reader.ended:
+            if callbacks.stop():
+                return None
+            if deadline is not None and time.monotonic() > deadline:
+                raise InterruptedRun(f"Structure from motion took longer than {limit:.0f} s; run the same command on an idle machine.")
+            lines = reader.lines(_POLL_SECONDS)
+            if not lines and (progress := log_progress.poll()) is not None:
+                callbacks.progress(*progress)
+            for line in lines:
+                with suppress(ValueError, KeyError, TypeError):  # output of libraries
+                    report = json.loads(line)
+                    log_progress.begin(report["part"], report["total"])
+                    callbacks.progress(report["part"], report["done"], report["total"])
+        code = ExitCode.of(child.wait())
     finally:
-        _kill(child)
-        if child.stdout is not None:
-            child.stdout.close()
+        processes.kill(child)
+        reader.close()
     result = out / "result.json"
-    if code < 0 or code == InterruptedRun.exit_code:
-        reason = f"was ended by {signal.Signals(-code).name}" if code < 0 else f"failed ({_last_line(log)})"
+    if code.signal or code.code == InterruptedRun.exit_code:
+        reason = f"was ended by {code}" if code.signal else f"failed ({_last_line(log)})"
         raise InterruptedRun(f"Structure from motion {reason}; the same command resumes it; free memory and disk if it fails again.")
-    if code != 0 or not result.exists():
+    if code.code != 0 or not result.exists():
         raise SolveFailedError(f"Structure from motion failed ({_last_line(log)}); its log is '{log}'.")
-    return dict(json.loads(result.read_text()))
+    return dict(json.loads(result.read_text(encoding="utf-8")))

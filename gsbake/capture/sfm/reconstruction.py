@@ -190,7 +190,7 @@ class SfmPipeline:
         """
         marker = self.work / "features.done"
         if marker.exists():
-            self.upsampled = marker.read_text() == "fine"
+            self.upsampled = marker.read_text(encoding="utf-8") == "fine"
             return
         self._clear()
         with self._timed("features", len(self.names)):
@@ -205,7 +205,7 @@ class SfmPipeline:
                     camera.params = [lens.focal, *list(camera.params)[1:]]
                     camera.has_prior_focal_length = True
                     base.update_camera(camera)
-        marker.write_text("fine" if self.upsampled else "coarse")
+        marker.write_bytes(b"fine" if self.upsampled else b"coarse")
 
     def _clear(self) -> None:
         for path in self.work.glob("*"):

@@ -49,7 +49,7 @@ def verify(
     if not pending:
         return 0
     listing = database.with_name("pairs.txt")
-    listing.write_text("".join(f"{images[i].name} {images[j].name}\n" for i, j in pending))
+    listing.write_bytes("".join(f"{images[i].name} {images[j].name}\n" for i, j in pending).encode())
     options = pycolmap.TwoViewGeometryOptions()
     options.ransac.random_seed = seed
     pycolmap.verify_matches(str(database), str(listing), options)

@@ -29,7 +29,7 @@ from gsbake.capture.sfm.reconstruction import FeatureOptions, Lens, SfmPipeline,
 from gsbake.errors import InterruptedRun
 from gsbake.geometry.cameras import Camera, CameraSet
 from gsbake.geometry.ply import write_cloud
-from gsbake.limited_process import exit_with_parent
+from gsbake.system.processes import exit_with_parent
 
 #: Errors of COLMAP and SQLite that come from the machine, not from the photos.
 _PASSING_FAULT = re.compile(r"disk|I/O|no space|sqlite|database|bad_alloc|memory|failed to (open|write)|cannot (open|write)", re.IGNORECASE)
@@ -151,12 +151,12 @@ def triangulate(job: Mapping[str, Any]) -> dict[str, Any]:
 
 def main() -> None:
     """Entry point: `python -m gsbake.capture.sfm.worker JOB.json PARENT_PID`."""
-    job = json.loads(Path(sys.argv[1]).read_text())
-    exit_with_parent(int(sys.argv[2]))
+    job = json.loads(Path(sys.argv[1]).read_text(encoding="utf-8"))
+    exit_with_parent(int(sys.argv[2]), InterruptedRun.exit_code)
     pycolmap.set_random_seed(job["seed"])
     try:
         result = solve(job) if job["task"] == "solve" else triangulate(job)
-        (Path(job["out"]) / "result.json").write_text(json.dumps(result))
+        (Path(job["out"]) / "result.json").write_bytes(json.dumps(result).encode())
     except Exception as error:
         passing = isinstance(error, OSError | MemoryError) or bool(_PASSING_FAULT.search(str(error)))
         try:

@@ -102,7 +102,7 @@ class Session:
             loaded = (add_priors(views, posed.cameras, posed.folder, *priors) for views in load_views(posed, options.train.max_size))
             full, half = ([view.to(run.device) for view in views] for views in loaded)
         if trained is not None and (trained / EXPOSURE).exists():
-            gains = json.loads((trained / EXPOSURE).read_text())["log_gains"]
+            gains = json.loads((trained / EXPOSURE).read_text(encoding="utf-8"))["log_gains"]
             exposure = [Correction(torch.zeros(6).double(), torch.tensor(gains[view.name]).double()) for view in full]
             full, half = ([c.apply(view) for view, c in zip(views, exposure, strict=True)] for views in (full, half))
         validation, test = (roles(len(full), options.train.holdout) for roles in (validation_photos, test_photos))
@@ -210,7 +210,7 @@ class Session:
                 replace(given, cameras=cameras).save(out / "cameras.json")
             if kinds.gains:
                 gains = {camera.name: c.gain.tolist() for c, camera in zip(corrections, given.cameras, strict=True)}
-                (out / EXPOSURE).write_text(json.dumps({"log_gains": gains}, indent=1))
+                (out / EXPOSURE).write_bytes(json.dumps({"log_gains": gains}, indent=1).encode())
 
     def _write(self) -> dict[str, Any]:
         trainer, out = self.trainer, self.execution.out
@@ -222,7 +222,7 @@ class Session:
         if trainer.light is not None:
             trainer.light.save(out / "light.safetensors")
         self._write_corrections()
-        with (out / "log.csv").open("w", newline="") as file:
+        with (out / "log.csv").open("w", encoding="utf-8", newline="") as file:
             writer = csv.DictWriter(file, ["step", "psnr", "surfels", "sdf_median", "gamma"])
             writer.writeheader()
             writer.writerows(trainer.log)

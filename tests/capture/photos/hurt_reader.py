@@ -43,7 +43,7 @@ def _read_mask(path: Path, *rest: Any) -> Any:
     return _READ_MASK(path, *rest)
 
 
-if __name__ == "__main__":
+def main() -> None:
     conversion.read_photo, matching.read_mask = _read_photo, _read_mask
     os.write(1, b"a library that prints\n")
     reader_process.main()

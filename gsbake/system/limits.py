@@ -1,0 +1,84 @@
+"""Processors, memory and identity of this machine and process, and limits on this process."""
+
+from __future__ import annotations
+
+import importlib
+import platform
+import re
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import psutil
+
+
+def usable_processors() -> int:
+    """Number of logical processors that this process may use: all, or those of its CPU affinity where the system has one."""
+    with suppress(AttributeError, psutil.Error):
+        return max(1, len(psutil.Process().cpu_affinity()))
+    return psutil.cpu_count() or 1
+
+
+def peak_memory() -> int:
+    """Peak resident memory of this process in bytes, without that of the process it was forked from (getrusage includes it)."""
+    with suppress(OSError):
+        found = re.search(r"^VmHWM:\s*(\d+) kB", Path("/proc/self/status").read_text(encoding="ascii", errors="replace"), re.MULTILINE)
+        if found:
+            return int(found.group(1)) * 1024
+    memory = psutil.Process().memory_info()
+    with suppress(AttributeError):
+        return int(memory.peak_wset)  # Windows
+    resource = _resource()
+    if resource is None:
+        return int(memory.rss)
+    peak = int(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
+    return peak if platform.system() == "Darwin" else peak * 1024
+
+
+def limit_address_space(memory: int) -> bool:
+    """Limit this process's address space to `memory` bytes beyond what it has mapped; a later call replaces the limit.
+
+    False where the system does not do that: macOS ignores the limit, Windows has none.
+    """
+    resource = _resource()
+    if resource is None:
+        return False
+    try:
+        mapped = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0]) * resource.getpagesize()
+    except OSError:
+        return False
+    highest = resource.getrlimit(resource.RLIMIT_AS)[1]
+    limit = mapped + memory if highest == resource.RLIM_INFINITY else min(mapped + memory, highest)
+    resource.setrlimit(resource.RLIMIT_AS, (limit, highest))
+    return True
+
+
+def write_no_core() -> None:
+    """A crash of this process leaves no file with its memory."""
+    resource = _resource()
+    if resource is not None:
+        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+
+
+def boot_id() -> str:
+    """Identifier of the machine's current boot."""
+    with suppress(OSError):
+        return Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip()
+    return f"boot-{psutil.boot_time():.0f}"
+
+
+def cpu_name() -> str:
+    """Model name of the processor."""
+    with suppress(OSError):
+        for line in Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines():
+            if line.startswith("model name"):
+                return line.split(":", 1)[1].strip()
+    return platform.processor() or platform.machine()
+
+
+def _resource() -> Any:
+    """The module `resource`; None on Windows."""
+    try:
+        return importlib.import_module("resource")
+    except ImportError:
+        return None
