@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -12,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from gsbake.errors import BadInputError
+from gsbake.stages import ORDER
 from tests.cli.conftest import Run
 
 
@@ -251,6 +253,22 @@ def test_help_imports_no_large_library() -> None:
     assert "report" in done.stdout
     loaded = set(done.stdout.split("LOADED")[1].split())
     assert loaded.isdisjoint({"torch", "numba", "cv2", "numpy", "scipy", "trimesh", "pydantic", "rich.progress", "gsbake.stages.train"})
+
+
+def test_help_groups_commands_and_options_in_panels(run: Run) -> None:
+    text = run("--help").out
+    titles = re.findall(r"(?m)^(\S.*):$", text)
+    assert titles == ["Make", "Inspect", "Edit", "Many captures", "Files", "Single stages", "Options"]
+    panels = dict(zip(titles, re.split(r"(?m)^\S.*:$", text)[1:], strict=True))
+    listed = {title: re.findall(r"(?m)^  ([a-z]+) ", panels[title]) for title in titles[:-1]}
+    assert listed["Make"] == ["run", "check", "synth"] and listed["Many captures"] == ["plan", "batch", "cache"]
+    assert listed["Single stages"] == list(ORDER) and sum(map(len, listed.values())) == 25
+    assert "..." not in re.sub(r"\[ARGS\]\.\.\.", "", text)  # no sentence is cut
+    for command in ("run", "mesh"):
+        options = run(command, "--help").out
+        main, photos, common = (options.index(f"\n{title}:\n") for title in ("Options", "Options of the photos", "Common options"))
+        assert main < options.index("--out") < options.index("--profile") < photos < options.index("--masks auto") < common
+        assert all(options.index(f" {name} ") > common for name in ("--device", "--threads", "--seed", "--json", "--help"))
 
 
 def test_completion_of_stages_profiles_and_settings(monkeypatch: pytest.MonkeyPatch) -> None:
