@@ -10,8 +10,8 @@ from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
 from typing import Literal, Protocol
 
-#: Whether work is skipped: where measurements allow it, always, or never.
-Rule = Literal["auto", "always", "never"]
+#: Rule of [skip]: the work is left out where measurements allow it (auto), in any case (skip), or in none (keep).
+Rule = Literal["auto", "skip", "keep"]
 #: Prefix of decisions about skipped work; the rest is the rule, as in the setting's name.
 SKIP_PREFIX = "skip."
 
@@ -67,8 +67,8 @@ SILENT = SilentMonitor()
 
 
 def skips(rule: Rule, holds: bool) -> bool:
-    """Whether work is skipped: where measurements allow it (`holds`), unless the setting is always or never."""
-    return holds if rule == "auto" else rule == "always"
+    """Whether work is left out: where measurements allow it (`holds`), unless the rule is skip or keep."""
+    return holds if rule == "auto" else rule == "skip"
 
 
 def decide_skip(

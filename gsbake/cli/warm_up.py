@@ -69,13 +69,13 @@ class _Progress(Observer):
         self.done += 1
 
 
-def compile_kernels(session: Session, target: str | None, display: Line) -> bool:
+def compile_kernels(session: Session, until: str | None, display: Line) -> bool:
     """Compile the kernels that the session's profile needs, unless that was done; whether it was done now.
 
     Raises InterruptedRun on a stop request. Any other failure is left to the run itself to report.
     """
     registry = session.engine.registry
-    names = registry.names if target is None else tuple(stage.name for stage in registry.up_to(target))
+    names = registry.names if until is None else tuple(stage.name for stage in registry.up_to(until))
     own = registry.references.get(FIRST) == REGISTRY.references[FIRST]
     if os.environ.get("GSBAKE_WARM_UP") == "never" or not own or FIRST not in names:
         return False
@@ -89,7 +89,7 @@ def compile_kernels(session: Session, target: str | None, display: Line) -> bool
         write_capture(capture, views=VIEWS, size=SIZE)
         try:
             settings = _settings(session.profile.profile)
-            api.run(capture, out=out, profile="smoke", settings=settings, observer=_Progress(display), target="bake")
+            api.run(capture, out=out, profile="smoke", settings=settings, observer=_Progress(display), until="bake")
         except InterruptedRun:
             raise
         except GsbakeError:

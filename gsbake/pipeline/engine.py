@@ -74,19 +74,19 @@ class Engine:
         #: Stages that the present or last run has finished, whether or not it went on to the end.
         self.finished: list[StageState] = []
 
-    def plan(self, target: str | None = None) -> list[StageState]:
+    def plan(self, until: str | None = None) -> list[StageState]:
         """The states of the stages that `run` would take; nothing is run."""
-        states = self.planner.plan(self.registry.up_to(target))
+        states = self.planner.plan(self.registry.up_to(until))
         self.store.digests.save()
         return states
 
-    def run(self, target: str | None = None, on_accepted: Callable[[], None] | None = None) -> list[StageState]:
-        """Bring all stages up to `target` (all without one) up to date; returns their states with artifacts.
+    def run(self, until: str | None = None, on_accepted: Callable[[], None] | None = None) -> list[StageState]:
+        """Bring all stages up to `until` (all without one) up to date; returns their states with artifacts.
 
         `on_accepted` is called once the inputs were read and the first stage's state is known, before anything is computed.
         Raises BadInputError, UsageError, InterruptedRun, or StageFailed, which names the file with the traceback.
         """
-        stages = self.registry.up_to(target)
+        stages = self.registry.up_to(until)
         try:
             ensure_output_folder(self.request.out)
             with StopSignals() as stop:

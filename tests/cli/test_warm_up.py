@@ -51,7 +51,7 @@ def test_once_per_choice_of_methods(runs: list[dict[str, Any]]) -> None:
     lines = Lines()
     assert warm_up.compile_kernels(session(), None, lines)
     assert lines.found == [(0, 3, "train"), (1, 1, "")]
-    assert runs[0]["settings"]["bake.materials"] == "fit" and runs[0]["target"] == "bake"
+    assert runs[0]["settings"]["bake.materials"] == "fit" and runs[0]["until"] == "bake"
     assert not warm_up.compile_kernels(session(), None, lines) and len(runs) == 1
     assert warm_up.compile_kernels(session(overrides=("bake.materials=delight",)), None, lines) and len(runs) == 2
 

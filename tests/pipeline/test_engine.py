@@ -130,7 +130,7 @@ def test_damaged_artifacts_are_invalid(tmp_path: Path, photos: Path) -> None:
     assert "is missing" in engine(tmp_path / "out", photos)[0].plan()[1].reasons[0]
 
 
-def test_seed_and_target(tmp_path: Path, photos: Path) -> None:
+def test_seed_and_last_stage(tmp_path: Path, photos: Path) -> None:
     engine(tmp_path / "out", photos)[0].run()
     seeded, seen = engine(tmp_path / "out", photos, seed=4)
     assert seeded.plan()[1].reasons == ("seed: 0 → 4",)

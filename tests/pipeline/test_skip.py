@@ -14,7 +14,7 @@ from tests.support.recorder import Recorder
 
 @pytest.mark.parametrize(
     ("rule", "holds", "skip"),
-    [("auto", True, True), ("auto", False, False), ("always", False, True), ("never", True, False)],
+    [("auto", True, True), ("auto", False, False), ("skip", False, True), ("keep", True, False)],
 )
 def test_setting_overrides_evidence(rule: Rule, holds: bool, skip: bool) -> None:
     monitor = Recorder()
