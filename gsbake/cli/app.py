@@ -222,14 +222,15 @@ def profiles_command(
     name: Annotated[
         str | None, typer.Argument(metavar="NAME|FILE", help="Profile.", autocompletion=complete_profile, show_default=False)
     ] = None,
+    everything: Annotated[bool, typer.Option("--all", help="List the published systems too, which are for comparison.")] = False,
     overrides: SetOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """List the profiles, or show one: every setting, its value, the source of the value, and its help."""
+    """List the profiles for assets, or show one: every setting, its value, the source of the value, and its help."""
     from gsbake.cli.inspect import list_profiles, show_profile
 
     if name is None:
-        list_profiles(as_json)
+        list_profiles(everything, as_json)
     else:
         show_profile(name, overrides or [], as_json)
 

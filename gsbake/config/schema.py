@@ -310,6 +310,7 @@ class Profile(Section):
     """All settings of a run."""
 
     description: str = Field("", description="What the profile is for.")
+    group: Literal["assets", "published"] = Field("assets", description="assets: for baking; published: a published system, for comparison. Neither is a setting of any stage.")
     ingest: Ingest = Ingest()
     poses: Poses = Poses()
     stereo: Stereo = Stereo()

@@ -239,7 +239,12 @@ def test_profiles_are_listed_and_shown(run: Run) -> None:
         "dsdf", "gs-ror2", "3dgsr", "gsdf", "gs-octree", "gs-pull", "surfacesplat", "splatsdf", "gaussianroom", "ugsdf", "sdf-3dgan",
         "neus", "volsdf",
     }  # fmt: skip
-    assert set(run("profiles", "--json").json) == {"smoke", "preview", "relight", "quality", "scan"} | family
+    for_assets = {"smoke", "preview", "relight", "quality", "scan"}
+    assert set(run("profiles", "--json").json) == for_assets
+    assert set(run("profiles", "--all", "--json").json) == for_assets | family
+    listed = run("profiles").out
+    assert listed.count("\n") == 10 and "relight (default)" in listed and "--all lists 13 published systems" in listed
+    assert "--all" not in run("profiles", "--all").out
     shown = run("profiles", "smoke", "--set", "mesh.faces=123", "--json").json
     assert shown["mesh.faces"]["value"] == 123 and shown["mesh.faces"]["origin"] == "--set"
     assert shown["train.iterations"]["origin"] == "smoke" and shown["ingest.min_photos"]["origin"] == "default"
