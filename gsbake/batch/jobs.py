@@ -12,7 +12,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from gsbake.batch.captures import BatchOptions, CapturePlan, identifier
-from gsbake.batch.estimate import History
+from gsbake.timing.estimate import History
 
 #: Expected seconds below which a job takes the next stage too: starting a job costs some seconds.
 PACK_SECONDS = 120.0

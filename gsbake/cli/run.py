@@ -17,6 +17,7 @@ from gsbake.live.server import LiveView
 from gsbake.live.state import LiveState
 from gsbake.pipeline.plan import StageState
 from gsbake.text import duration, number, size
+from gsbake.timing.expectations import Expectations
 
 
 def run_pipeline(options: Options, until: str | None) -> None:
@@ -25,6 +26,10 @@ def run_pipeline(options: Options, until: str | None) -> None:
     display = choose_display(quiet=options.quiet, verbose=options.verbose, as_json=options.as_json)
     state = LiveState(display) if options.view else None
     session = options.session(state or display)
+    expectations = Expectations(session.engine.request, session.engine.registry.names)
+    display.expected = expectations.of
+    if state is not None:
+        state.expected = expectations.of
     if options.dry_run:
         states = session.engine.plan(until)
         if options.as_json:

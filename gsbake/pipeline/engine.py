@@ -42,6 +42,9 @@ class Observer:
     def stage_waiting(self, name: str, holder: LeaseHolder | None) -> None:
         """Another process computes the artifact; called at every poll while waiting."""
 
+    def part_started(self, name: str, part: str) -> None:
+        """A stage starts a part whose time is measured; see `parts` of the manifest."""
+
     def progress(self, name: str, done: int, total: int, text: str, live: Mapping[str, float]) -> None:
         """A stage reports progress."""
 
@@ -302,6 +305,8 @@ class Engine:
     def _relay(self, name: str, message: Mapping[str, Any]) -> None:
         """Pass a worker's message to the observer and the event log."""
         match message["kind"]:
+            case "part":
+                self.observer.part_started(name, message["name"])
             case "progress":
                 live = {k: v for k, v in message["live"].items() if v is not None}
                 self.observer.progress(name, message["done"], message["total"], message["text"], live)

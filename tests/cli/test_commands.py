@@ -281,3 +281,11 @@ def test_completion_of_stages_profiles_and_settings(monkeypatch: pytest.MonkeyPa
 
     assert complete_profile("pr") == ["preview"] and complete_stage("re") == ["refine", "report"]
     assert complete_setting("mesh.fa") == ["mesh.faces="]
+
+
+def test_a_run_says_the_time_left_or_that_it_is_unknown(run: Run, capture: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import gsbake.cli.display
+
+    monkeypatch.setattr(gsbake.cli.display, "PROGRESS_INTERVAL", 0.0)
+    lines = [line for line in run("run", capture).out.splitlines() if " of 3" in line]
+    assert lines and all(re.search(r", (time left unknown|about [\d.]+ s left)$", line) for line in lines)
