@@ -100,7 +100,7 @@ class StopAt(SilentMonitor):
 
 def training_options(p: Profile) -> TrainOptions:
     """What the stage train takes of a profile, with all iterations: steps are not skipped, so that shares compare."""
-    return TrainOptions(p.train, p.surfels, p.loss, p.light.size, "never", "never", "never", "never", field=p.field, coupling=p.coupling)
+    return TrainOptions(p.train, p.surfels, p.loss, p.light.size, "keep", "keep", "keep", "keep", field=p.field, coupling=p.coupling)
 
 
 def depth_shift(surfels: Surfels, posed: PosedPhotos, photos: Sequence[int], size: int, projected: bool, cell: float) -> float:

@@ -69,8 +69,8 @@ def with_doublings(cells: Sequence[Cell]) -> list[Cell]:
     return out
 
 
-def bake(photos: int, edge: int, target: str, out: Path, threads: int, rounds: int) -> dict[str, tuple[float, float]]:
-    """Seconds and peak megabytes of every stage up to `target`: the fastest of `rounds` bakes of the built-in capture."""
+def bake(photos: int, edge: int, until: str, out: Path, threads: int, rounds: int) -> dict[str, tuple[float, float]]:
+    """Seconds and peak megabytes of every stage up to `until`: the fastest of `rounds` bakes of the built-in capture."""
     capture = out / f"capture-{photos}-{edge}"
     if not (capture / "transforms.json").is_file():
         write_capture(capture, photos, edge)
@@ -80,16 +80,16 @@ def bake(photos: int, edge: int, target: str, out: Path, threads: int, rounds: i
         "stereo.enabled=always",
         f"train.iterations={BAKE_ITERATIONS}",
         f"refine.iterations={BAKE_ITERATIONS // 5}",
-        "skip.confirmed_steps=never",
-        "skip.redundant_photos=never",
-        "skip.resolution=never",
-        "skip.converged_steps=never",
+        "skip.confirmed_steps=keep",
+        "skip.redundant_photos=keep",
+        "skip.resolution=keep",
+        "skip.converged_steps=keep",
     ]
     best: dict[str, tuple[float, float]] = {}
     for number in range(rounds):
         folder = out / f"round-{number}" / f"{photos}-{edge}"
         options = RunOptions(photos=capture, out=folder, profile="preview", overrides=overrides, device="cpu", threads=threads)
-        for state in open_session(options).engine.run(target):
+        for state in open_session(options).engine.run(until):
             assert state.artifact is not None  # the engine returned, so every stage is finished
             found = float(state.artifact.manifest["seconds"]), state.artifact.manifest["peak_bytes"] / 1e6
             best[state.name] = min(found, best.get(state.name, found))

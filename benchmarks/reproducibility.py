@@ -1,6 +1,6 @@
 """Whether runs of one capture with one seed write the same bytes: digests of every stage's files, and its seconds.
 
-python -m benchmarks.reproducibility CAPTURE [--runs 3] [--threads 2 --threads 1] [--target poses] [--profile preview] [--set KEY=VALUE …]
+python -m benchmarks.reproducibility CAPTURE [--runs 3] [--threads 2 --threads 1] [--until poses] [--profile preview] [--set KEY=VALUE …]
 
 The report is left out: it shows run times.
 """
@@ -28,9 +28,9 @@ class StageFiles:
 Run = Mapping[str, StageFiles]
 
 
-def measure(capture: Path, out: Path, threads: int, target: str, profile: str, settings: Mapping[str, str]) -> Run:
-    """Run the stages up to `target` in the empty folder `out`."""
-    result = gsbake.run(capture, out=out, profile=profile, settings=settings, target=target, threads=threads)
+def measure(capture: Path, out: Path, threads: int, until: str, profile: str, settings: Mapping[str, str]) -> Run:
+    """Run the stages up to `until` in the empty folder `out`."""
+    result = gsbake.run(capture, out=out, profile=profile, settings=settings, until=until, threads=threads)
     found = {}
     for state in result.stages:
         assert state.artifact is not None
@@ -65,7 +65,7 @@ def main() -> None:
     parser.add_argument("capture", type=Path)
     parser.add_argument("--runs", type=int, default=3)
     parser.add_argument("--threads", type=int, action="append", help="numbers of threads, taken in turn; default 2")
-    parser.add_argument("--target", default="poses")
+    parser.add_argument("--until", default="poses")
     parser.add_argument("--profile", default="preview")
     parser.add_argument("--set", action="append", default=[], dest="settings", metavar="KEY=VALUE")
     args = parser.parse_args()
@@ -73,7 +73,7 @@ def main() -> None:
     settings = dict(text.split("=", 1) for text in args.settings)
     with tempfile.TemporaryDirectory(prefix="gsbake-runs-") as folder:
         runs = [
-            measure(args.capture, Path(folder) / str(k), count, args.target, args.profile, settings) for k, count in enumerate(counts)
+            measure(args.capture, Path(folder) / str(k), count, args.until, args.profile, settings) for k, count in enumerate(counts)
         ]  # fmt: skip
     sys.stdout.write(table(runs, counts) + "\n")
     sys.exit(1 if any(differing(runs).values()) else 0)

@@ -1,6 +1,6 @@
 """Ablation of the rules of `[skip]`: time and error with each rule on and off.
 
-python -m benchmarks.skip CAPTURE [--profile preview] [--rules resolution,specular] [--modes never] [--reuse RUN] [--out DIR] [--csv FILE]
+python -m benchmarks.skip CAPTURE [--profile preview] [--rules resolution,specular] [--modes keep] [--reuse RUN] [--out DIR] [--csv FILE]
 
 CAPTURE is a folder of photos, or `built-in` for the capture of `gsbake synth`. The first run has every rule at auto; then each rule is set
 to each of the other modes, in the same output folder, so that unaffected stages are cached. `--reuse` copies the stages up to stereo of a
@@ -176,7 +176,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("capture")
     parser.add_argument("--profile", default="preview")
     parser.add_argument("--rules", type=names, default=list(Skip.model_fields))
-    parser.add_argument("--modes", type=names, default=["never"], help="besides auto: never, always")
+    parser.add_argument("--modes", type=names, default=["keep"], help="besides auto: keep, skip")
     parser.add_argument("--threads", type=int, default=0, help="0: the physical cores")
     parser.add_argument("--reuse", type=Path, help="finished run of the same photos and profile, whose early stages are copied")
     parser.add_argument("--out", type=Path, default=ROOT / "out" / "bench" / "skip", help="folder of the runs")

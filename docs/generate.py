@@ -6,7 +6,7 @@ mkdocs calls `on_files` (see `hooks` in mkdocs.yml); the texts come from the set
 from __future__ import annotations
 
 import enum
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import Any, get_args
 
 import typer
@@ -15,6 +15,7 @@ from mkdocs.structure.files import File, Files
 from pydantic.fields import FieldInfo
 
 from gsbake.cli.app import app
+from gsbake.cli.panels import COMMAND_PANELS, OPTION_PANELS, by_panel
 from gsbake.config.load import bounds, load_profile, shipped
 from gsbake.config.schema import Profile
 
@@ -87,8 +88,8 @@ def _default(parameter: Any) -> str:
     return f" Default: {_code(value)}."
 
 
-def _parameters(command: Any) -> Iterator[str]:
-    for parameter in command.params:
+def _parameters(parameters: Iterable[Any]) -> Iterator[str]:
+    for parameter in parameters:
         options = [*parameter.opts, *parameter.secondary_opts]
         text = _cell(getattr(parameter, "help", None) or "")
         if any(option.startswith("-") for option in options):
@@ -100,21 +101,32 @@ def _parameters(command: Any) -> Iterator[str]:
             yield f"| `{_cell(parameter.metavar or parameter.name.upper())}` | {text} |"
 
 
+def _with_subcommands(command: Any) -> Iterator[tuple[str, Any]]:
+    """(name, command) of a command and of those below it, such as `cache gc`."""
+    yield command.name, command
+    for name, below in getattr(command, "commands", {}).items():
+        yield f"{command.name} {name}", below
+
+
 def commands_page() -> str:
-    """One section a command, with its arguments and options."""
+    """One section a panel of `gsbake --help`, and in it one a command, with its arguments and options."""
     group: Any = typer.main.get_command(app)
     out = [
         "# Commands",
         "",
         "This page is made from the command line itself whenever the site is built. `gsbake COMMAND --help` prints the same.",
-        "",
-        "| command | does |",
-        "|---|---|",
     ]
-    out += [f"| [`gsbake {name}`](#gsbake-{name}) | {_cell(command.help or '')} |" for name, command in group.commands.items()]
-    for name, command in group.commands.items():
-        out += ["", f"## gsbake {name} {{ #gsbake-{name} }}", "", " ".join((command.help or "").split()), ""]
-        rows = list(_parameters(command))
-        if rows:
-            out += ["| argument or option | meaning |", "|---|---|", *rows]
+    panels = by_panel(group.commands.values(), COMMAND_PANELS)
+    for title, commands in panels.items():
+        out += ["", f"**{title}**", "", "| command | does |", "|---|---|"]
+        out += [f"| [`gsbake {command.name}`](#gsbake-{command.name}) | {_cell(command.help or '')} |" for command in commands]
+    for title, commands in panels.items():
+        out += ["", f"## {title}"]
+        for name, command in (pair for listed in commands for pair in _with_subcommands(listed)):
+            out += ["", f"### gsbake {name} {{ #gsbake-{name.replace(' ', '-')} }}", "", " ".join((command.help or "").split())]
+            arguments = [p for p in command.params if p.param_type_name == "argument"]
+            options = by_panel((p for p in command.params if p.param_type_name == "option"), OPTION_PANELS)
+            for kind, parameters in ({"Arguments": arguments} | options).items():
+                if parameters:
+                    out += ["", f"| {kind.lower()} | meaning |", "|---|---|", *_parameters(parameters)]
     return "\n".join(out) + "\n"

@@ -17,6 +17,7 @@ from typing import Any
 from gsbake.capture.masks.weights import resolve_network
 from gsbake.capture.sources import PHOTO_FOLDERS, discover, list_masks, source_files
 from gsbake.config.load import DEFAULT, LoadedProfile, load_profile
+from gsbake.config.renamed import present_override
 from gsbake.config.schema import Profile
 from gsbake.config.targets import parse_target, require_packages
 from gsbake.errors import BadInputError, GsbakeError, UsageError
@@ -72,17 +73,17 @@ class Session:
     out: Path
     store: str | None = None  # shared store, a folder or URL
 
-    def run(self, target: str | None = None) -> Result:
-        """Bring the stages up to `target` (None: all) up to date and publish the results in the output folder, those of finished stages
+    def run(self, until: str | None = None) -> Result:
+        """Bring the stages up to `until` (None: all) up to date and publish the results in the output folder, those of finished stages
         also where a later one fails.
 
         Raises what `Engine.run` raises.
         """
-        if target == TARGETS and TARGETS not in self.engine.registry.names:
+        if until == TARGETS and TARGETS not in self.engine.registry.names:
             raise UsageError("No target is set: name them, as in --target web,ar:usdz (settings: targets.files).")
         self.engine.shared = open_shared_store(self.store)
         try:
-            states = self.engine.run(target, on_accepted=lambda: self.project.save(self.out))
+            states = self.engine.run(until, on_accepted=lambda: self.project.save(self.out))
             files = self._publish(states)
         except GsbakeError:
             with suppress(OSError):  # the first error is the one to report
@@ -137,7 +138,7 @@ def run(
     settings: Mapping[str, Any] | None = None,
     masks: str | Path | None = None,
     poses: str | Path | None = None,
-    target: str | None = None,
+    until: str | None = None,
     device: str = "auto",
     threads: int = 0,
     seed: int | None = None,
@@ -153,7 +154,7 @@ def run(
     profile: name of a profile, or path of a TOML file; default "relight".
     settings: {"section.key": value} that override the profile, for example {"mesh.faces": 10000}.
     masks, poses: paths of masks and known poses outside the capture folder.
-    target: last stage to run, for example "mesh"; None runs all.
+    until: last stage to run, for example "mesh"; None runs all.
     device: "auto", "cpu" or "cuda".
     threads: number of threads, at most 512; 0 uses the physical cores.
     seed: seed of all random numbers, 0 to 2**31 − 1; default 0.
@@ -166,7 +167,7 @@ def run(
     """
     overrides = [f"{key}={value if isinstance(value, str) else json.dumps(value)}" for key, value in (settings or {}).items()]
     options = RunOptions(_path(photos), _path(out), profile, overrides, _path(masks), _path(poses), device, threads, seed, _store(store))
-    return open_session(options, observer).run(target)
+    return open_session(options, observer).run(until)
 
 
 def open_session(options: RunOptions, observer: Observer | None = None, registry: Registry | None = None) -> Session:
@@ -202,7 +203,7 @@ def open_session(options: RunOptions, observer: Observer | None = None, registry
         raise UsageError(f"The seed must be a whole number from 0 to {number(MAX_SEED)}, not {seed}.")
     if not 0 <= options.threads <= MAX_THREADS:
         raise UsageError(f"The number of threads must be from 0 (the physical cores) to {MAX_THREADS}, not {options.threads}.")
-    project = replace(project, profile=name, overrides=tuple(last.values()), seed=seed)
+    project = replace(project, profile=name, overrides=tuple(map(present_override, last.values())), seed=seed)
     sources = project.sources() | _priors(project, profile.profile)
     request = Request(
         out=out,

@@ -14,6 +14,10 @@ class GsbakeError(Exception):
         super().__init__(printable(message))
 
 
+class RenamedValueWarning(FutureWarning):
+    """A setting has a value by its old name, which the next version refuses."""
+
+
 class UsageError(GsbakeError):
     """The command or profile was used wrongly (exit code 2)."""
 

@@ -7,11 +7,11 @@ terminal and the manifest; the default, `SILENT`, ignores all reports.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from typing import Literal, Protocol
 
-#: Whether work is skipped: where measurements allow it, always, or never.
-Rule = Literal["auto", "always", "never"]
+#: Rule of [skip]: the work is left out where measurements allow it (auto), in any case (skip), or in none (keep).
+Rule = Literal["auto", "skip", "keep"]
 #: Prefix of decisions about skipped work; the rest is the rule, as in the setting's name.
 SKIP_PREFIX = "skip."
 
@@ -20,7 +20,7 @@ class Monitor(Protocol):
     """Receives the reports of a running step."""
 
     def part(self, name: str) -> AbstractContextManager[None]:
-        """Time a part of the step; times of parts with the same name are added."""
+        """Time a part of the step; times of parts with the same name are added. Parts do not overlap."""
 
     def progress(self, done: int, total: int, text: str = "", **live: float) -> None:
         """Report progress and live figures (psnr=…); fast enough for every iteration."""
@@ -66,9 +66,30 @@ class SilentMonitor:
 SILENT = SilentMonitor()
 
 
+class PartSequence:
+    """Parts that follow each other, for progress that is named only when it is reported: a part ends when the next one starts."""
+
+    def __init__(self, monitor: Monitor) -> None:
+        self.monitor, self.name = monitor, ""
+        self._open = ExitStack()
+
+    def __enter__(self) -> PartSequence:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._open.close()
+
+    def start(self, name: str) -> None:
+        """Start the part `name`, unless it is the present one."""
+        if name != self.name:
+            self._open.close()
+            self._open.enter_context(self.monitor.part(name))
+            self.name = name
+
+
 def skips(rule: Rule, holds: bool) -> bool:
-    """Whether work is skipped: where measurements allow it (`holds`), unless the setting is always or never."""
-    return holds if rule == "auto" else rule == "always"
+    """Whether work is left out: where measurements allow it (`holds`), unless the rule is skip or keep."""
+    return holds if rule == "auto" else rule == "skip"
 
 
 def decide_skip(

@@ -32,16 +32,16 @@ def publish_results(
         if artifact is None:
             continue
         for name in names:
-            target = out / name
-            there = digests.file(target) if target.is_file() else None
+            path = out / name
+            there = digests.file(path) if path.is_file() else None
             if name in artifact.files:
                 if there != artifact.files[name]:
-                    target.parent.mkdir(exist_ok=True)
-                    copy_atomic(artifact.folder / name, target)
+                    path.parent.mkdir(exist_ok=True)
+                    copy_atomic(artifact.folder / name, path)
                 published[name] = artifact.files[name]
-                placed[name] = target
+                placed[name] = path
             elif there is not None and there == published.pop(name, None):
-                target.unlink()
+                path.unlink()
     return placed, replace(project, published=published)
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any
 
 from gsbake.pipeline.stage import Context, Stage
-from gsbake.stages.train import KERNELS
 
 
 def run(ctx: Context) -> dict[str, Any]:
@@ -21,6 +20,13 @@ def run(ctx: Context) -> dict[str, Any]:
     )  # fmt: skip
 
 
+def kernels(settings: Any) -> tuple[str, ...]:
+    """See `gsbake.surfels.KERNELS`."""
+    from gsbake.surfels import KERNELS
+
+    return KERNELS
+
+
 STAGE = Stage(
     name="refine",
     version=4,
@@ -34,5 +40,5 @@ STAGE = Stage(
     ),
     uses_device=True,
     seeded=True,
-    kernels=lambda settings: KERNELS,
+    kernels=kernels,
 )  # fmt: skip

@@ -21,12 +21,11 @@ def run(ctx: Context) -> dict[str, Any]:
     )  # fmt: skip
 
 
-#: Modules with the kernels of this stage.
-KERNELS = (
-    "gsbake.surfels.raster.kernel", "gsbake.surfels.raster.projection", "gsbake.surfels.losses.photometric",
-    "gsbake.surfels.losses.geometry", "gsbake.surfels.raster.binning", "gsbake.surfels.spherical_harmonics",
-    "gsbake.surfels.losses.projection", "gsbake.surfels.adam",
-)  # fmt: skip
+def kernels(settings: Any) -> tuple[str, ...]:
+    """See `gsbake.surfels.KERNELS`."""
+    from gsbake.surfels import KERNELS
+
+    return KERNELS
 
 
 STAGE = Stage(
@@ -43,5 +42,5 @@ STAGE = Stage(
     ),
     uses_device=True,
     seeded=True,
-    kernels=lambda settings: KERNELS,
+    kernels=kernels,
 )  # fmt: skip

@@ -36,8 +36,8 @@ def test_run_bakes_and_caches(photos: Path) -> None:
         first.results("train")
 
 
-def test_run_stops_after_the_target(photos: Path) -> None:
-    assert [state.name for state in gsbake.run(photos, out="o", target="mesh").stages] == ["ingest", "mesh"]
+def test_run_stops_after_the_stage_that_is_named(photos: Path) -> None:
+    assert [state.name for state in gsbake.run(photos, out="o", until="mesh").stages] == ["ingest", "mesh"]
 
 
 def test_errors_are_single_sentences(photos: Path) -> None:

@@ -5,25 +5,19 @@ A capture that cannot be planned (no photos, an unreadable file) becomes a failu
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from PIL import Image
-
 from gsbake.api import RunOptions, Session, open_session
 from gsbake.capture.sources import PHOTO_FOLDERS
 from gsbake.errors import BadInputError, GsbakeError, UsageError
 from gsbake.pipeline.plan import StageState
-from gsbake.pipeline.store import Store
 from gsbake.publish import RESULTS
 from gsbake.system.names import portable_name, same_file_key
-
-#: Megapixels assumed where no header can be read.
-_USUAL_MEGAPIXELS = 12.0
+from gsbake.timing.photos import USUAL_MEGAPIXELS, PhotoSet, photos_of_request
 
 
 @dataclass(frozen=True)
@@ -45,14 +39,6 @@ class BatchOptions:
 
 
 @dataclass(frozen=True)
-class PhotoSet:
-    """Number of photos, and megapixels of one."""
-
-    count: int
-    megapixels: float
-
-
-@dataclass(frozen=True)
 class CapturePlan:
     """A capture, its output folder, and the states of its stages; or the failure that keeps it from being planned."""
 
@@ -60,7 +46,7 @@ class CapturePlan:
     photos: Path
     out: Path
     states: tuple[StageState, ...] = ()
-    photo_set: PhotoSet = PhotoSet(0, _USUAL_MEGAPIXELS)
+    photo_set: PhotoSet = PhotoSet(0, USUAL_MEGAPIXELS)
     published: bool = False  # the results lie in the output folder
     error: str = ""
     exit_code: int = 0
@@ -102,17 +88,8 @@ def plan_capture(photos: Path, options: BatchOptions) -> CapturePlan:
         raise
     except GsbakeError as error:
         return CapturePlan(plan.name, plan.photos, out, error=str(error), exit_code=error.exit_code)
-    return CapturePlan(plan.name, plan.photos, out, tuple(states), _photo_set(session), published=_results_are_published(session, states))
-
-
-def photos_of_run(out: Path) -> PhotoSet | None:
-    """Number and size of the photos that the newest ingest in an output folder read; None when there is none."""
-    for folder, _ in Store(out).manifests("ingest"):
-        with suppress(OSError, ValueError, KeyError, TypeError, IndexError):
-            photos = json.loads((folder / "photos.json").read_text(encoding="utf-8"))["photos"]
-            pixels = sorted(int(p["source_width"]) * int(p["source_height"]) for p in photos)
-            return PhotoSet(len(pixels), pixels[len(pixels) // 2] / 1e6)
-    return None
+    photo_set, published = photos_of_request(session.engine.request), _results_are_published(session, states)
+    return CapturePlan(plan.name, plan.photos, out, tuple(states), photo_set, published)
 
 
 def _states(session: Session) -> list[StageState]:
@@ -121,16 +98,6 @@ def _states(session: Session) -> list[StageState]:
     if engine.store.stage_folder("").exists():
         return engine.plan()
     return engine.planner.plan_empty(engine.registry.up_to(None))
-
-
-def _photo_set(session: Session) -> PhotoSet:
-    """Number of a capture's photos, and megapixels of the first one whose header can be read."""
-    request = session.engine.request
-    names = request.source_names.get("photos", ())
-    for name in names[:3]:
-        with suppress(Exception), Image.open(request.sources["photos"] / name) as image:  # only the header is read; a guess does too
-            return PhotoSet(len(names), image.width * image.height / 1e6)
-    return PhotoSet(len(names), _USUAL_MEGAPIXELS)
 
 
 def _results_are_published(session: Session, states: Sequence[StageState]) -> bool:

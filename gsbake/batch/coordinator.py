@@ -17,7 +17,6 @@ from filelock import FileLock, Timeout
 
 from gsbake import api
 from gsbake.batch.captures import BatchOptions, CapturePlan, plan_captures
-from gsbake.batch.estimate import History
 from gsbake.batch.jobs import make_jobs
 from gsbake.batch.records import FOLDER, Record, RecordReader, all_records, earlier_failures, forget_records, save_batch
 from gsbake.batch.slurm import SlurmOptions, ask_cluster
@@ -27,6 +26,7 @@ from gsbake.pipeline.files import ensure_output_folder
 from gsbake.pipeline.lease import HEARTBEAT_TIMEOUT, LeaseHolder
 from gsbake.pipeline.machine import default_threads
 from gsbake.pipeline.supervise import StopSignals
+from gsbake.timing.estimate import History
 
 #: Most threads of a job with Slurm where the user names none: more are used ever less.
 _SLURM_THREADS = 4

@@ -43,8 +43,8 @@ def as_sh(jobs: Sequence[Job]) -> str:
 
 def as_snakemake(jobs: Sequence[Job]) -> str:
     """A Snakefile with one rule per job; `snakemake --snakefile FILE --cores N --keep-going`. Markers of finished jobs are in .gsbake/."""
-    targets = [f".gsbake/{job.id}.done" for job in jobs]
-    rules = [f"rule all:\n    input: {targets!r}\n"]
+    done = [f".gsbake/{job.id}.done" for job in jobs]
+    rules = [f"rule all:\n    input: {done!r}\n"]
     for job in jobs:
         command = shlex.join(job.command).replace("{", "{{").replace("}", "}}")
         needs = [f".gsbake/{name}.done" for name in job.needs]

@@ -12,7 +12,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from gsbake.batch.captures import BatchOptions, CapturePlan, identifier
-from gsbake.batch.estimate import History
+from gsbake.timing.estimate import History
 
 #: Expected seconds below which a job takes the next stage too: starting a job costs some seconds.
 PACK_SECONDS = 120.0
@@ -56,15 +56,15 @@ def make_jobs(
         earlier: tuple[str, ...] = ()
         for members in group_stages([estimates[state.name].seconds for state in states], pack_seconds):
             group = [states[k] for k in members]
-            target = group[-1].name
+            last = group[-1].name
             seconds = sum(estimates[state.name].seconds for state in group)
             job = Job(
-                id=f"{identifier(index, plan.name)}_{target}",
+                id=f"{identifier(index, plan.name)}_{last}",
                 capture=plan.name,
                 photos=str(plan.photos),
                 out=str(plan.out),
                 stages=tuple(state.name for state in group),
-                command=stage_command(target, plan, options, threads),
+                command=stage_command(last, plan, options, threads),
                 needs=earlier,
                 threads=threads,
                 memory_mb=max(estimates[state.name].memory_mb for state in group),
@@ -93,9 +93,9 @@ def start_levels(jobs: Sequence[Job]) -> dict[str, int]:
     return {name: first[left[name]] * LEVELS // len(ranked) for name in ranked}  # what is equal is in one class
 
 
-def stage_command(target: str, plan: CapturePlan, options: BatchOptions, threads: int) -> tuple[str, ...]:
-    """The command that brings a capture's stages up to `target` up to date; every job names all options, so none depends on another."""
-    words = ["gsbake", target, str(plan.photos), "--out", str(plan.out), "--profile", options.profile, "--seed", str(options.seed)]
+def stage_command(until: str, plan: CapturePlan, options: BatchOptions, threads: int) -> tuple[str, ...]:
+    """The command that brings a capture's stages up to `until` up to date; every job names all options, so none depends on another."""
+    words = ["gsbake", until, str(plan.photos), "--out", str(plan.out), "--profile", options.profile, "--seed", str(options.seed)]
     for override in options.overrides:
         words += ["--set", override]
     words += ["--threads", str(threads), "--quiet"]

@@ -299,8 +299,8 @@ class _Estimation:
         duplicates = {e["name"]: e["duplicate_of"] for e in entries if e["duplicate_of"]}
         indices: list[int] = []
         evidence = "not searched"
-        if rule != "never":
-            indices, evidence = find_redundant_photos(cameras, duplicates, surface, rule == "always")
+        if rule != "keep":
+            indices, evidence = find_redundant_photos(cameras, duplicates, surface, rule == "skip")
         names = [cameras[i].name for i in indices]
         skipped = f"{len(names)} of {len(cameras)} photos skipped ({shortlist(names)})" if names else "no photo is redundant"
         if not decide_skip(self.monitor, "redundant_photos", rule, bool(names), evidence, skipped, f"all {len(cameras)} photos used"):

@@ -5,11 +5,15 @@ from __future__ import annotations
 import io
 import signal
 import sys
+import warnings
 from types import FrameType
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from gsbake.errors import GsbakeError
+
+#: How Python writes a warning.
+_standard_format = warnings.formatwarning
 
 
 def main() -> None:
@@ -22,6 +26,7 @@ def main() -> None:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")  # a Windows console may not have every character
+    warnings.formatwarning = _format_warning
     signal.signal(signal.SIGINT, interrupted)
     signal.signal(signal.SIGTERM, interrupted)
     try:
@@ -41,6 +46,15 @@ def main() -> None:
         _exit_with_error(_save_traceback(error), 1)
     else:
         raise SystemExit(code if isinstance(code, int) else 0)
+
+
+def _format_warning(message: Warning | str, category: type[Warning], filename: str, lineno: int, line: str | None = None) -> str:
+    """One line for a warning to the user; others as Python has them, with the place in the code."""
+    from gsbake.errors import RenamedValueWarning
+
+    if issubclass(category, RenamedValueWarning):
+        return f"gsbake: warning: {message}\n"
+    return _standard_format(message, category, filename, lineno, line)
 
 
 def _exit_with_error(message: str, code: int) -> None:

@@ -11,6 +11,7 @@ import typer
 
 from gsbake import __version__
 from gsbake.cli.file_commands import file_app
+from gsbake.cli.many_commands import many_app
 from gsbake.cli.options import (
     Device,
     DeviceOption,
@@ -40,9 +41,11 @@ from gsbake.cli.options import (
     scale_settings,
     target_settings,
 )
+from gsbake.cli.panels import Panel, PanelGroup, command
 
 app = typer.Typer(
     name="gsbake",
+    cls=PanelGroup,
     help="Photos in, relightable game-ready asset out.",
     epilog=(
         "Exit codes: 0 done, 2 wrong usage, 42 bad input (do not retry), 75 interrupted, out of memory or disk full (the same command "
@@ -84,27 +87,27 @@ def top(
     """Photos in, relightable game-ready asset out."""
 
 
-def _pipeline_command(target: str | None) -> Callable[..., None]:
-    """The command that brings the stages up to `target` up to date; all have the same options."""
+def _pipeline_command(until: str | None) -> Callable[..., None]:
+    """The command that brings the stages up to `until` (None: all) up to date; all have the same options."""
 
-    def command(
+    def pipeline_command(
         photos: PhotosArgument = None,
         out: OutOption = None,
         profile: ProfileOption = None,
-        overrides: SetOption = None,
-        masks: MasksOption = None,
-        poses: PosesOption = None,
-        invert_masks: InvertOption = False,
-        known_distances: KnownDistanceOption = None,
-        marker_size: MarkerSizeOption = None,
         targets: TargetOption = None,
         levels: LevelsOption = None,
+        overrides: SetOption = None,
+        dry_run: DryRunOption = False,
+        view: ViewOption = False,
+        masks: MasksOption = None,
+        invert_masks: InvertOption = False,
+        poses: PosesOption = None,
+        known_distances: KnownDistanceOption = None,
+        marker_size: MarkerSizeOption = None,
         device: DeviceOption = Device.auto,
         threads: ThreadsOption = 0,
         seed: SeedOption = None,
         store: StoreOption = None,
-        dry_run: DryRunOption = False,
-        view: ViewOption = False,
         quiet: QuietOption = False,
         verbose: VerboseOption = False,
         as_json: JsonOption = False,
@@ -118,17 +121,17 @@ def _pipeline_command(target: str | None) -> Callable[..., None]:
             masks=masks.folder if masks else None, poses=poses, device=device.value, threads=threads, seed=seed,
             dry_run=dry_run, quiet=quiet, verbose=verbose, as_json=as_json, store=store, view=view,
         )  # fmt: skip
-        run_pipeline(options, target)
+        run_pipeline(options, until)
 
-    return command
+    return pipeline_command
 
 
-app.command("run", help="Run all stages: PHOTOS to asset.glb and report.html.")(_pipeline_command(None))
+command(app, "run", Panel.MAKE, help="Run all stages: PHOTOS to asset.glb and report.html.")(_pipeline_command(None))
 for _name, _help in STAGE_HELP.items():
-    app.command(_name, help=f"{_help} Runs the stages before it first.")(_pipeline_command(_name))
+    command(app, _name, Panel.STAGES, help=f"{_help} Runs the stages before it first.")(_pipeline_command(_name))
 
 
-@app.command("status")
+@command(app, "status", Panel.INSPECT)
 def status_command(
     photos: PhotosArgument = None,
     out: OutOption = None,
@@ -149,7 +152,7 @@ def status_command(
     )
 
 
-@app.command("explain")
+@command(app, "explain", Panel.INSPECT)
 def explain_command(
     stage: Annotated[str | None, typer.Argument(help="Stage; default: all.", autocompletion=complete_stage, show_default=False)] = None,
     out: OutOption = None,
@@ -165,7 +168,7 @@ def explain_command(
     explain(Options(out=out, profile=profile, overrides=overrides or [], device=device.value, seed=seed, as_json=as_json), stage)
 
 
-@app.command("replace")
+@command(app, "replace", Panel.EDIT)
 def replace_command(
     stage: Annotated[str, typer.Argument(help="Stage whose output is replaced.", autocompletion=complete_stage)],
     files: Annotated[
@@ -183,7 +186,7 @@ def replace_command(
     replace(Options(out=out, dry_run=dry_run, quiet=quiet, as_json=as_json), stage, files or [], undo)
 
 
-@app.command("check")
+@command(app, "check", Panel.MAKE)
 def check_command(
     photos: Annotated[
         Path,
@@ -200,7 +203,7 @@ def check_command(
     check(photos, masks.folder if masks else None, poses, threads, as_json)
 
 
-@app.command("masks")
+@command(app, "masks", Panel.EDIT)
 def masks_command(
     folder: Annotated[Path, typer.Argument(parser=given_path, metavar="DIR", help="New folder for the masks.", show_default=False)],
     doubtful: Annotated[bool, typer.Option("--doubtful", help="Only those that the other photos contradict.")] = False,
@@ -214,163 +217,25 @@ def masks_command(
     masks(Options(out=out, quiet=quiet, as_json=as_json), folder, doubtful)
 
 
-CapturesArgument = Annotated[
-    list[Path], typer.Argument(parser=given_path, metavar="CAPTURES...", help="Folders of photos, or capture folders.", show_default=False)
-]
-RootOption = Annotated[
-    Path, typer.Option("--out", "-o", parser=given_path, metavar="DIR", help="Folder with one output folder per capture.")
-]
-BatchProfileOption = Annotated[
-    str, typer.Option("--profile", "-p", metavar="NAME|FILE", help="Profile of all captures.", autocompletion=complete_profile)
-]
-BatchSeedOption = Annotated[int, typer.Option("--seed", help="Seed of all random numbers, 0 to 2147483647.")]
-
-
-@app.command("plan")
-def plan_command(
-    captures: CapturesArgument,
-    out: RootOption = Path("out"),
-    profile: BatchProfileOption = "relight",
-    overrides: SetOption = None,
-    threads: ThreadsOption = 0,
-    seed: BatchSeedOption = 0,
-    store: StoreOption = None,
-    form: Annotated[
-        str | None,
-        typer.Option(
-            "--emit", metavar="FORMAT", help="Print the jobs for a scheduler: json, sh, snakemake, slurm, opencue or openjd.",
-            show_default=False,
-        ),
-    ] = None,
-) -> None:  # fmt: skip
-    """Show the jobs that bring captures up to date, with dependencies, time and memory; nothing is run."""
-    from gsbake.batch.captures import BatchOptions
-    from gsbake.cli.batch import plan
-
-    plan(captures, BatchOptions(out, profile, tuple(overrides or ()), threads, seed, store), form)
-
-
-@app.command("batch")
-def batch_command(
-    captures: Annotated[
-        list[Path],
-        typer.Argument(
-            parser=given_path, metavar="CAPTURES...|status", show_default=False,
-            help="Folders of photos, or capture folders; or the word status, which shows how far the batch in DIR is.",
-        ),
-    ],
-    out: RootOption = Path("out"),
-    profile: BatchProfileOption = "relight",
-    executor: Annotated[str, typer.Option("--executor", metavar="local|slurm", help="Where the jobs run.")] = "local",
-    overrides: SetOption = None,
-    threads: ThreadsOption = 0,
-    seed: BatchSeedOption = 0,
-    store: StoreOption = None,
-    jobs: Annotated[
-        int,
-        typer.Option(
-            "--jobs", min=0, max=100_000, help="Most jobs in Slurm's queue at a time; 0: two for each core, at least 100.",
-            show_default=False,
-        ),
-    ] = 0,
-    partition: Annotated[str | None, typer.Option("--partition", help="Slurm's partition.  [default: Slurm's]", show_default=False)] = None,
-    account: Annotated[str | None, typer.Option("--account", help="Slurm's account.  [default: the user's]", show_default=False)] = None,
-    retry_failed: Annotated[bool, typer.Option("--retry-failed", help="Run captures again that failed with the same input.")] = False,
-    quiet: QuietOption = False,
-    as_json: JsonOption = False,
-) -> None:  # fmt: skip
-    """Bake many captures on this machine or with Slurm, through Snakemake; the same command goes on where it stopped."""
-    from gsbake.batch.captures import BatchOptions
-    from gsbake.batch.slurm import SlurmOptions
-    from gsbake.cli import batch
-
-    options = BatchOptions(out, profile, tuple(overrides or ()), threads, seed, store)
-    if captures == [Path("status")]:
-        batch.status(out, as_json)
-    else:
-        slurm = SlurmOptions(partition, account)
-        batch.batch(captures, options, executor, retry_failed=retry_failed, workers=jobs, slurm=slurm, quiet=quiet, as_json=as_json)
-
-
-cache_app = typer.Typer(
-    help="List, check or clean the stored outputs of an output folder or of a shared store.", no_args_is_help=True, rich_markup_mode=None,
-    context_settings={"help_option_names": ["-h", "--help"]},
-)  # fmt: skip
-app.add_typer(cache_app, name="cache")
-
-
-@cache_app.command("ls")
-def cache_ls_command(out: OutOption = None, store: StoreOption = None, as_json: JsonOption = False) -> None:
-    """List the stored outputs, least recently used first."""
-    from gsbake.cli import cache, shared_cache
-
-    options = Options(out=out, store=store, as_json=as_json)
-    (cache if store is None else shared_cache).list_outputs(options)
-
-
-@cache_app.command("verify")
-def cache_verify_command(
-    out: OutOption = None, store: StoreOption = None, quiet: QuietOption = False, as_json: JsonOption = False
-) -> None:  # fmt: skip
-    """Read every stored file again and compare it with its digest."""
-    from gsbake.cli import cache, shared_cache
-
-    options = Options(out=out, store=store, quiet=quiet, as_json=as_json)
-    (cache if store is None else shared_cache).verify(options)
-
-
-@cache_app.command("gc")
-def cache_gc_command(
-    out: OutOption = None,
-    store: StoreOption = None,
-    keep: Annotated[
-        str | None, typer.Option("--keep", metavar="SIZE", help="Keep at most this much, such as 20GB.", show_default=False)
-    ] = None,
-    older: Annotated[
-        str | None, typer.Option("--older", metavar="AGE", help="Delete what is unused for longer, such as 30d.", show_default=False)
-    ] = None,
-    dry_run: DryRunOption = False,
-    quiet: QuietOption = False,
-    as_json: JsonOption = False,
-) -> None:
-    """Delete outputs of old settings, checkpoints and files of killed runs; your replacements are kept."""
-    from gsbake.cli import cache, shared_cache
-
-    options = Options(out=out, store=store, dry_run=dry_run, quiet=quiet, as_json=as_json)
-    (cache if store is None else shared_cache).collect_garbage(options, keep, older)
-
-
-@cache_app.command("quota")
-def cache_quota_command(
-    size: Annotated[str, typer.Argument(metavar="SIZE|none", help="Most bytes that machines may put into the store, such as 500GB.")],
-    store: StoreOption = None,
-    quiet: QuietOption = False,
-    as_json: JsonOption = False,
-) -> None:
-    """Limit the size of a shared store; a machine that finds it full keeps its outputs to itself."""
-    from gsbake.cli.shared_cache import set_quota
-
-    set_quota(Options(store=store, quiet=quiet, as_json=as_json), size)
-
-
-@app.command("profiles")
+@command(app, "profiles", Panel.INSPECT)
 def profiles_command(
     name: Annotated[
         str | None, typer.Argument(metavar="NAME|FILE", help="Profile.", autocompletion=complete_profile, show_default=False)
     ] = None,
+    everything: Annotated[bool, typer.Option("--all", help="List the published systems too, which are for comparison.")] = False,
     overrides: SetOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """List the profiles, or show one: every setting, its value, the source of the value, and its help."""
+    """List the profiles for assets, or show one: every setting, its value, the source of the value, and its help."""
     from gsbake.cli.inspect import list_profiles, show_profile
 
     if name is None:
-        list_profiles(as_json)
+        list_profiles(everything, as_json)
     else:
         show_profile(name, overrides or [], as_json)
 
 
-@app.command("doctor")
+@command(app, "doctor", Panel.INSPECT)
 def doctor_command(
     out: Annotated[
         Path, typer.Option("--out", "-o", parser=given_path, metavar="DIR", help="Folder whose free disk space is checked.")
@@ -383,7 +248,7 @@ def doctor_command(
     doctor(as_json, out)
 
 
-@app.command("synth")
+@command(app, "synth", Panel.MAKE)
 def synth_command(
     folder: Annotated[Path, typer.Argument(parser=given_path, help="Output folder of the capture.")],
     views: Annotated[int, typer.Option(min=1, max=10_000, help="Number of photos.")] = 24,
@@ -405,6 +270,7 @@ def synth_command(
     )  # fmt: skip
 
 
+app.add_typer(many_app)
 app.add_typer(file_app)
 
 

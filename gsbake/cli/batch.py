@@ -13,7 +13,6 @@ from gsbake import api
 from gsbake.batch.captures import BatchOptions, plan_captures
 from gsbake.batch.coordinator import Outcome, outcomes_now, run_batch
 from gsbake.batch.emit import FORMATS, emit
-from gsbake.batch.estimate import History
 from gsbake.batch.jobs import Job, make_jobs
 from gsbake.batch.page import write_index
 from gsbake.batch.records import Record, load_batch
@@ -22,6 +21,7 @@ from gsbake.cli.output import cell, print_json, print_table, print_text
 from gsbake.errors import BadInputError, InterruptedRun, UsageError
 from gsbake.pipeline.machine import default_threads
 from gsbake.text import duration, size
+from gsbake.timing.estimate import History
 
 _STYLES = {"done": "green", "cached": "green", "failed": "red", "unfinished": "yellow", "running": "cyan"}
 

@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TaskID, TaskProgressColumn, TextColumn
+from rich.progress import BarColumn, Progress, ProgressColumn, Task, TaskID, TaskProgressColumn, TextColumn
 from rich.text import Text
 
 from gsbake.cli.output import cell
-from gsbake.live.time_left import TimeLeft
 from gsbake.pipeline.engine import Observer
 from gsbake.pipeline.lease import LeaseHolder
 from gsbake.pipeline.plan import StageState
 from gsbake.pipeline.stage import Stage
 from gsbake.text import duration, figures, number, printable
+from gsbake.timing.estimate import Estimate
+from gsbake.timing.time_left import TimeLeft
 
 #: Seconds between progress lines without a terminal.
 PROGRESS_INTERVAL = 30.0
@@ -25,7 +26,9 @@ _REUSED = {"cached": "cached", "replaced": "replaced by the user"}
 
 
 class QuietDisplay(Observer):
-    """Warnings on stderr, nothing else."""
+    """Warnings on stderr, nothing else. `expected` estimates a stage that starts, for the displays that show the time left."""
+
+    expected: Callable[[StageState], Estimate | None] = staticmethod(lambda state: None)
 
     def __init__(self) -> None:
         self.errors = Console(stderr=True, highlight=False, soft_wrap=True)
@@ -49,7 +52,7 @@ class PlainDisplay(QuietDisplay):
         self._begin = time.monotonic()
         self._last = self._begin
         self._waiting = ""
-        self._left = TimeLeft()
+        self.left = TimeLeft(self._begin)
 
     def line(self, text: str) -> None:
         """Print a line with the time since the start of the run."""
@@ -73,7 +76,7 @@ class PlainDisplay(QuietDisplay):
     def stage_started(self, state: StageState) -> None:
         """Print when verbose why a stage runs."""
         self._last = time.monotonic()
-        self._left = TimeLeft()
+        self.left = TimeLeft(self._last, self.expected(state))
         if self.verbose:
             self.line(f"{state.name}: {state.title} ({'; '.join(state.reasons)})")
 
@@ -84,14 +87,18 @@ class PlainDisplay(QuietDisplay):
             self._waiting = text
             self.line(text)
 
+    def part_started(self, name: str, part: str) -> None:
+        """Update the time left."""
+        self.left.start_part(time.monotonic(), part)
+
     def progress(self, name: str, done: int, total: int, text: str, live: Mapping[str, float]) -> None:
         """Print a line every PROGRESS_INTERVAL seconds."""
         now = time.monotonic()
-        left = self._left.update(now, done, total, text)
+        self.left.update(now, done, total)
         if now - self._last < PROGRESS_INTERVAL:
             return
         self._last = now
-        parts = [f"{name}: {number(done)} of {number(total)}", text, _live(live), f"about {duration(left)} left" if left else ""]
+        parts = [f"{name}: {number(done)} of {number(total)}", text, _live(live), self.left.text(now)]
         self.line(", ".join(part for part in parts if part))
 
     def decision(self, name: str, what: str, choice: str, evidence: str) -> None:
@@ -108,12 +115,24 @@ class PlainDisplay(QuietDisplay):
         self.line(f"{state.name}: {_summary(state)}")
 
 
+class TimeLeftColumn(ProgressColumn):
+    """The time left of the running stage, also between its reports."""
+
+    def __init__(self, display: PlainDisplay) -> None:
+        super().__init__()
+        self.display = display
+
+    def render(self, task: Task) -> Text:
+        """The time left in words; nothing beside the compilation of kernels."""
+        return Text(f"{self.display.left.text(time.monotonic()) if task.fields.get('stage') else '':>20}")
+
+
 class TerminalDisplay(PlainDisplay):
     """Progress bar with remaining time and live figures; one line per stage."""
 
     def __init__(self, verbose: bool = False) -> None:
         super().__init__(verbose=verbose)
-        columns = (TextColumn("{task.description:>8}"), BarColumn(32), TaskProgressColumn(), TextColumn("{task.fields[left]:>14}"))
+        columns = (TextColumn("{task.description:>8}"), BarColumn(32), TaskProgressColumn(), TimeLeftColumn(self))
         note = TextColumn("{task.fields[note]}", markup=False)  # the name of a photo, for example
         self._bar = Progress(*columns, note, console=self.console, transient=True, refresh_per_second=5)
         self._task: TaskID | None = None
@@ -125,7 +144,7 @@ class TerminalDisplay(PlainDisplay):
     def preparing(self, done: int, total: int, text: str) -> None:
         """A bar of its own while kernels are compiled."""
         if self._task is None:
-            self._task = self._bar.add_task("kernels", total=total, note="", left="")
+            self._task = self._bar.add_task("kernels", total=total, note="")
             self._bar.start()
         self._bar.update(self._task, completed=done, total=total, note=f"compiling those of {text}, once per installation")
         if not text:
@@ -139,16 +158,15 @@ class TerminalDisplay(PlainDisplay):
     def stage_started(self, state: StageState) -> None:
         """Open the stage's bar."""
         super().stage_started(state)
-        self._task = self._bar.add_task(state.name, total=None, note=state.title, left="")
+        self._task = self._bar.add_task(state.name, total=None, note=state.title, stage=True)
         self._bar.start()
 
     def progress(self, name: str, done: int, total: int, text: str, live: Mapping[str, float]) -> None:
         """Update the bar."""
         if self._task is not None:
             note = " ".join(part for part in (text, _live(live)) if part)
-            left = self._left.update(time.monotonic(), done, total, text)
-            shown = f"{duration(left)} left" if left else ""
-            self._bar.update(self._task, completed=done, total=total or None, note=printable(note), left=shown)
+            self.left.update(time.monotonic(), done, total)
+            self._bar.update(self._task, completed=done, total=total or None, note=printable(note))
 
     def stage_finished(self, state: StageState) -> None:
         """Replace the bar by the stage's time and results."""

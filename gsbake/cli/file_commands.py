@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from gsbake.cli.options import JsonOption, QuietOption, given_path
+from gsbake.cli.panels import Panel, command
 
 file_app = typer.Typer()
 
@@ -17,7 +18,7 @@ LightOption = Annotated[
 ]
 
 
-@file_app.command("inspect")
+@command(file_app, "inspect", Panel.FILES)
 def inspect_command(
     file: FileArgument,
     as_json: JsonOption = False,
@@ -28,7 +29,7 @@ def inspect_command(
     inspect(file, as_json)
 
 
-@file_app.command("compare")
+@command(file_app, "compare", Panel.FILES)
 def compare_command(
     first: Annotated[Path, typer.Argument(parser=given_path, metavar="A", help="A .glb or .gltf file.")],
     second: Annotated[Path, typer.Argument(parser=given_path, metavar="B", help="Another, in the same frame.")],
@@ -51,7 +52,7 @@ def compare_command(
     compare(first, second, truth, sheet, light, views, size, as_json)
 
 
-@file_app.command("render")
+@command(file_app, "render", Panel.FILES)
 def render_command(
     file: FileArgument,
     turntable: Annotated[

@@ -10,7 +10,7 @@ from rich.console import Console
 from gsbake.api import Session
 from gsbake.cli.options import Options
 from gsbake.cli.output import cell, print_json, print_table, print_text
-from gsbake.config.load import LoadedProfile, bounds, fields, load_profile, shipped
+from gsbake.config.load import DEFAULT, LoadedProfile, bounds, fields, load_profile, shipped
 from gsbake.pipeline.plan import StageState
 from gsbake.pipeline.settings import flatten
 from gsbake.text import duration, figures, size
@@ -102,13 +102,16 @@ def explain(options: Options, stage: str | None) -> None:
             console.print(cell(f"    {name} = {value}  ({resolved}{origins[name]})"))
 
 
-def list_profiles(as_json: bool) -> None:
-    """Print the shipped profiles."""
-    found = {name: load_profile(name).profile.description for name in shipped()}
+def list_profiles(everything: bool, as_json: bool) -> None:
+    """Print the shipped profiles for assets, or `everything`."""
+    loaded = {name: load_profile(name).profile for name in shipped()}
+    found = {name: profile.description for name, profile in loaded.items() if everything or profile.group == "assets"}
     if as_json:
         print_json(found)
         return
-    print_table(("profile", "description"), list(found.items()))
+    print_table(("profile", "for"), [(f"{name} (default)" if name == DEFAULT else name, text) for name, text in found.items()])
+    if others := len(loaded) - len(found):
+        print_text(f"`gsbake profiles NAME` shows one; --all lists {others} published systems too.")
 
 
 def show_profile(name: str, overrides: list[str], as_json: bool) -> None:

@@ -34,13 +34,13 @@ class Line(Protocol):
 
 
 @contextmanager
-def compiling(session: Session, target: str | None, display: Line) -> Iterator[None]:
-    """Compile the kernels of a session's stages up to `target` (None: all) while the block runs, from the first stage that computes on."""
+def compiling(session: Session, until: str | None, display: Line) -> Iterator[None]:
+    """Compile the kernels of a session's stages up to `until` (None: all) while the block runs, from the first stage that computes on."""
     if os.environ.get("GSBAKE_COMPILE") == "never":
         yield
         return
     settings = session.profile.profile
-    modules = [name for stage in session.engine.registry.up_to(target) for name in stage.kernels(settings)]
+    modules = [name for stage in session.engine.registry.up_to(until) for name in stage.kernels(settings)]
     compilation = Compilation(modules, processes())
 
     def before_stage(stage: Stage, check: Callable[[], None]) -> None:

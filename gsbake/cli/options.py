@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from gsbake.cli.panels import COMMON_OPTIONS, PHOTO_OPTIONS
+
 if TYPE_CHECKING:
     from gsbake.api import Session
     from gsbake.pipeline.engine import Observer
@@ -149,6 +151,7 @@ MasksOption = Annotated[
         metavar="auto|none|DIR",
         help="Masks, one per photo, white on the object. auto: those of the capture, the missing ones are made; none: use none.",
         show_default=False,
+        rich_help_panel=PHOTO_OPTIONS,
     ),
 ]
 KnownDistanceOption = Annotated[
@@ -159,6 +162,7 @@ KnownDistanceOption = Annotated[
         metavar="'PHOTO:X,Y PHOTO:X,Y LENGTH'",
         help="Length between two points of the photos, as in 'A.jpg:120,80 B.jpg:640,410 8cm': the asset is in metres. Repeatable.",
         show_default=False,
+        rich_help_panel=PHOTO_OPTIONS,
     ),
 ]
 MarkerSizeOption = Annotated[
@@ -169,6 +173,7 @@ MarkerSizeOption = Annotated[
         metavar="LENGTH",
         help="Edge of the printed ArUco or AprilTag markers in the photos, as in 5cm: the asset is in metres.",
         show_default=False,
+        rich_help_panel=PHOTO_OPTIONS,
     ),
 ]
 TargetOption = Annotated[
@@ -194,30 +199,39 @@ PosesOption = Annotated[
         help="Known poses: transforms.json, a COLMAP model folder, poses_bounds.npy, or cameras of Metashape (XML), RealityScan (CSV, "
         "XMP), OpenSfM, OpenMVG or Polycam (JSON).",
         show_default=False,
+        rich_help_panel=PHOTO_OPTIONS,
     ),
 ]
-InvertOption = Annotated[bool, typer.Option("--invert-masks", help="Masks are white on the background.")]
+InvertOption = Annotated[bool, typer.Option("--invert-masks", help="Masks are white on the background.", rich_help_panel=PHOTO_OPTIONS)]
 ViewOption = Annotated[
     bool, typer.Option("--view", help="Serve a page on this machine that shows the run: render, curves, decisions, time left.")
 ]
-DeviceOption = Annotated[Device, typer.Option("--device", help="Device of the kernels.")]
+DeviceOption = Annotated[Device, typer.Option("--device", help="Device of the kernels.", rich_help_panel=COMMON_OPTIONS)]
 ThreadsOption = Annotated[
-    int, typer.Option("--threads", help="Number of threads, at most 512; 0 uses the physical cores.", show_default=False)
+    int,
+    typer.Option(
+        "--threads", help="Number of threads, at most 512; 0 uses the physical cores.", show_default=False, rich_help_panel=COMMON_OPTIONS
+    ),
 ]
 SeedOption = Annotated[
-    int | None, typer.Option("--seed", help="Seed of all random numbers, 0 to 2147483647.  [default: 0]", show_default=False)
+    int | None,
+    typer.Option(
+        "--seed", help="Seed of all random numbers, 0 to 2147483647.  [default: 0]", show_default=False, rich_help_panel=COMMON_OPTIONS
+    ),
 ]
 StoreOption = Annotated[
     str | None,
     typer.Option(
         "--store", metavar="DIR|URL", envvar="GSBAKE_STORE", help="Shared store beside the output folder: a folder, s3:// or sftp://.",
-        show_default=False, show_envvar=True,
+        show_default=False, show_envvar=True, rich_help_panel=COMMON_OPTIONS,
     ),
 ]  # fmt: skip
 DryRunOption = Annotated[bool, typer.Option("--dry-run", "-n", help="Print what would run, and why; run nothing.")]
-QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="Print warnings and errors only.")]
-VerboseOption = Annotated[bool, typer.Option("--verbose", "-v", help="Print every decision with its evidence.")]
-JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON document instead of text.")]
+QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="Print warnings and errors only.", rich_help_panel=COMMON_OPTIONS)]
+VerboseOption = Annotated[
+    bool, typer.Option("--verbose", "-v", help="Print every decision with its evidence.", rich_help_panel=COMMON_OPTIONS)
+]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON document instead of text.", rich_help_panel=COMMON_OPTIONS)]
 
 
 @dataclass(frozen=True)

@@ -77,11 +77,11 @@ def _replacement_files(stage: str, paths: list[Path], base: Artifact | None) -> 
     files: dict[str, Path] = {}
     known = set(base.files) if base is not None else set()
     for path in paths:
-        targets = REPLACED_FILES.get((stage, path.suffix.lower()), ())
-        if len(paths) == 1 and targets and path.name not in set(targets[1:]):
+        replaced = REPLACED_FILES.get((stage, path.suffix.lower()), ())
+        if len(paths) == 1 and replaced and path.name not in set(replaced[1:]):
             _check_ply(path)
-            files.update(dict.fromkeys(targets, path))
-        elif path.name in known or path.name in targets:
+            files.update(dict.fromkeys(replaced, path))
+        elif path.name in known or path.name in replaced:
             files[path.name] = path
         elif known:
             raise UsageError(f"Stage '{stage}' has no file '{path.name}' in its output; it has {', '.join(sorted(known)[:8])}.")

@@ -17,24 +17,29 @@ from gsbake.live.server import LiveView
 from gsbake.live.state import LiveState
 from gsbake.pipeline.plan import StageState
 from gsbake.text import duration, number, size
+from gsbake.timing.expectations import Expectations
 
 
-def run_pipeline(options: Options, target: str | None) -> None:
-    """Bring the stages up to `target` (None: all) up to date and print a summary."""
+def run_pipeline(options: Options, until: str | None) -> None:
+    """Bring the stages up to `until` (None: all) up to date and print a summary."""
     start = time.perf_counter()
     display = choose_display(quiet=options.quiet, verbose=options.verbose, as_json=options.as_json)
     state = LiveState(display) if options.view else None
     session = options.session(state or display)
+    expectations = Expectations(session.engine.request, session.engine.registry.names)
+    display.expected = expectations.of
+    if state is not None:
+        state.expected = expectations.of
     if options.dry_run:
-        states = session.engine.plan(target)
+        states = session.engine.plan(until)
         if options.as_json:
             print_json(plan_document(session, states))
         elif not options.quiet:
             print_plan(states)
         return
     try:
-        with compiling(session, target, display), serving(state, session):
-            result = session.run(target)
+        with compiling(session, until, display), serving(state, session):
+            result = session.run(until)
     finally:
         close_display(display)
     seconds = time.perf_counter() - start

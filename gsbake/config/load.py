@@ -22,6 +22,7 @@ from typing import Any, get_args
 from pydantic import BaseModel, ValidationError
 from pydantic.fields import FieldInfo
 
+from gsbake.config.renamed import present_value
 from gsbake.config.schema import Profile
 from gsbake.errors import BadInputError, UsageError
 from gsbake.text import number
@@ -53,18 +54,18 @@ def load_profile(name: str = DEFAULT, overrides: Sequence[str] = ()) -> LoadedPr
     """Load the profile `name` (a shipped one or a TOML file) and apply `overrides` ("section.key=value").
 
     Raises UsageError for a profile that does not exist or an override without '=', BadInputError for an unknown key or an invalid value,
-    with file, key and allowed values.
+    with file, key and allowed values. Warns of a value that has a new name (RenamedValueWarning).
     """
     values: dict[str, Any] = {}
     origins: dict[str, str] = {}
     for path in reversed(_chain(_find(name, None))):
         for key, value in _read(path).items():
-            values[key] = value
             origins[key] = path.stem if path.parent == _shipped_folder() else str(path)
+            values[key] = present_value(key, value, origins[key])
     for text in overrides:
         key, value = _parse_override(text)
         _check_key(key, "--set")
-        values[key] = value
+        values[key] = present_value(key, value, "--set")
         origins[key] = "--set"
     return LoadedProfile(name, _validate(values, origins), {key: origins.get(key, "default") for key in fields()})
 

@@ -88,7 +88,7 @@ class Poses(Section):
 class Stereo(Section):
     """Multi-view stereo: depth maps by patch matching."""
 
-    enabled: Rule = Field("auto", description="Run multi-view stereo before training. auto: unless photos are too few or too small.")
+    enabled: Literal["auto", "always", "never"] = Field("auto", description="Run multi-view stereo before training. auto: unless photos are too few or too small.")
     max_size: int = Field(800, ge=64, le=4000, description="Longer side in pixels of the photos that are matched.")
     neighbours: int = Field(6, ge=1, le=8, description="Source views per reference view.")
     best_views: int = Field(4, ge=1, le=8, description="Source views with the lowest matching cost, over which a pixel's cost is averaged.")
@@ -290,13 +290,13 @@ class Report(Section):
 
 
 class Skip(Section):
-    """Work that a capture may not need. auto: skip it where measurements allow; always: skip it; never: do it."""
+    """Work that a capture may not need. auto: leave it out where measurements allow; skip: leave it out; keep: do it."""
 
     resolution: Rule = Field("auto", description="Full resolution, where photos hold no detail above half of it.")
-    redundant_photos: Rule = Field("auto", description="Duplicate photos, and photos of views that many others cover. always: in small captures too.")
+    redundant_photos: Rule = Field("auto", description="Duplicate photos, and photos of views that many others cover. skip: in small captures too.")
     specular: Rule = Field("auto", description="Fitting specular reflection, where the surface shows no view dependence.")
-    confirmed_steps: Rule = Field("auto", description="Up to half of the training iterations, in proportion to the share of the object that stereo confirmed. always: half of them.")
-    converged_steps: Rule = Field("auto", description="Training iterations after held-out PSNR and median SDF sample reach a plateau (early stopping). always: the last iterations in any case.")
+    confirmed_steps: Rule = Field("auto", description="Up to half of the training iterations, in proportion to the share of the object that stereo confirmed. skip: half of them.")
+    converged_steps: Rule = Field("auto", description="Training iterations after held-out PSNR and median SDF sample reach a plateau (early stopping). skip: the last iterations in any case.")
     pose_refinement: Rule = Field("auto", description="Refining poses during training, where structure from motion solved them, matched features do not contradict them, or held-out PSNR does not improve.")
     exposure_refinement: Rule = Field("auto", description="Learning exposure gains during training, where photos agree at their tie points, these are too few, or held-out PSNR does not improve.")
     empty_cells: Rule = Field("auto", description="Voxels far from the surface.")
@@ -310,6 +310,7 @@ class Profile(Section):
     """All settings of a run."""
 
     description: str = Field("", description="What the profile is for.")
+    group: Literal["assets", "published"] = Field("assets", description="assets: for baking; published: a published system, for comparison. Neither is a setting of any stage.")
     ingest: Ingest = Ingest()
     poses: Poses = Poses()
     stereo: Stereo = Stereo()

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
-from gsbake.live.time_left import TimeLeft
 from gsbake.pipeline.engine import Observer
 from gsbake.pipeline.lease import LeaseHolder
 from gsbake.pipeline.plan import StageState
 from gsbake.pipeline.stage import Stage
 from gsbake.text import duration, printable
+from gsbake.timing.estimate import Estimate
+from gsbake.timing.time_left import TimeLeft
 
 #: Points of a curve: every second is left out when there are more.
 MAX_POINTS = 600
@@ -21,12 +22,14 @@ MAX_LINES = 500
 
 
 class LiveState(Observer):
-    """The run so far as JSON, and the events passed on to another observer."""
+    """The run so far as JSON, and the events passed on to another observer. `expected` estimates a stage that starts."""
+
+    expected: Callable[[StageState], Estimate | None] = staticmethod(lambda state: None)
 
     def __init__(self, display: Observer) -> None:
         self.display = display
         self._lock = threading.Lock()
-        self._left = TimeLeft()
+        self._left: tuple[str, TimeLeft] | None = None  # the running stage
         self._begin = time.monotonic()
         self._stages: list[dict[str, Any]] = []
         self._curves: dict[str, list[tuple[float, float]]] = {}
@@ -36,9 +39,11 @@ class LiveState(Observer):
     def snapshot(self) -> dict[str, Any]:
         """The state as JSON."""
         with self._lock:
+            now = time.monotonic()
+            running, left = ("", "") if self._left is None else (self._left[0], self._left[1].text(now))
             return {
-                "seconds": round(time.monotonic() - self._begin, 1),
-                "stages": [dict(stage) for stage in self._stages],
+                "seconds": round(now - self._begin, 1),
+                "stages": [stage | ({"left": left} if stage["name"] == running else {}) for stage in self._stages],
                 "curves": {name: list(points) for name, points in self._curves.items()},
                 "lines": list(self._lines),
                 "ended": self._ended,
@@ -66,9 +71,9 @@ class LiveState(Observer):
     def stage_started(self, state: StageState) -> None:
         """Mark a stage as running."""
         with self._lock:
-            self._left = TimeLeft()
+            self._left = state.name, TimeLeft(time.monotonic(), self.expected(state))
             self._curves = {}
-        self._set(state.name, status="running", done=0, total=0, text="", left="")
+        self._set(state.name, status="running", done=0, total=0, text="")
         self.display.stage_started(state)
 
     def stage_waiting(self, name: str, holder: LeaseHolder | None) -> None:
@@ -76,16 +81,24 @@ class LiveState(Observer):
         self._set(name, status="waiting", text="another process computes it")
         self.display.stage_waiting(name, holder)
 
+    def part_started(self, name: str, part: str) -> None:
+        """Update the time left."""
+        with self._lock:
+            if self._left is not None:
+                self._left[1].start_part(time.monotonic(), part)
+        self.display.part_started(name, part)
+
     def progress(self, name: str, done: int, total: int, text: str, live: Mapping[str, float]) -> None:
         """Update progress, time left and curves."""
         with self._lock:
-            left = self._left.update(time.monotonic(), done, total, text)
+            if self._left is not None:
+                self._left[1].update(time.monotonic(), done, total)
             for key, value in live.items():
                 points = self._curves.setdefault(printable(key), [])
                 points.append((float(done), float(value)))
                 if len(points) > MAX_POINTS:
                     del points[1::2]
-        self._set(name, done=done, total=total, text=printable(text), left=f"about {duration(left)}" if left else "")
+        self._set(name, done=done, total=total, text=printable(text))
         self.display.progress(name, done, total, text, live)
 
     def decision(self, name: str, what: str, choice: str, evidence: str) -> None:
@@ -107,7 +120,9 @@ class LiveState(Observer):
         """Mark a stage as done, with its summary and time."""
         manifest: Mapping[str, Any] = state.artifact.manifest if state.artifact is not None else {}
         text = printable(str(manifest.get("summary") or ""))
-        self._set(state.name, status="done", text=text, left="", took=duration(float(manifest.get("seconds") or 0.0)))
+        with self._lock:
+            self._left = None
+        self._set(state.name, status="done", text=text, took=duration(float(manifest.get("seconds") or 0.0)))
         self.display.stage_finished(state)
 
     def _set(self, name: str, **fields: Any) -> None:

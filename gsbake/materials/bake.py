@@ -148,7 +148,6 @@ class _Baking:
                 raise BadInputError(f"bake: {error}.") from error
         with self.monitor.part("texels"):
             surface = UnwrappedMesh.of(vertices, faces, atlas, size, self.threads)
-        self.monitor.progress(1, 4, "atlas", charts=atlas.charts, fill=atlas.fill)
         return surface
 
     def _dense(self, surface: UnwrappedMesh) -> tuple[tuple[RayCaster, NDArray[np.float64]], DenseSamples]:
@@ -186,8 +185,7 @@ class _Baking:
         if options.bake.materials == "fit":
             rules = options.specular, options.metallic_map, options.roughness_map
             fit = FitSettings(options.bake, options.light_size, options.holdout, *rules)
-            with monitor.part("fit"):
-                fitted = fit_materials(surface, self.posed, projected, detail, occlusion, fit, self.seed, monitor)
+            fitted = fit_materials(surface, self.posed, projected, detail, occlusion, fit, self.seed, monitor)
             fitted.light.save(light)
             if fitted.light_motion.rotations is not None:
                 fitted.light_motion.save(self.out / "light_motion.json")

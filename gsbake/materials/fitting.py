@@ -31,7 +31,7 @@ from gsbake.materials.two_level_fit import FitPlan, compare_light_motions, fit_t
 from gsbake.materials.view_dependence import SURFACE_POINTS, MeshBrightness
 from gsbake.materials.visibility import Visibility
 from gsbake.meshing.resolution import pixel_footprint
-from gsbake.monitor import Monitor, Rule, decide_skip, skips
+from gsbake.monitor import Monitor, PartSequence, Rule, decide_skip, skips
 from gsbake.shading.environment import EnvironmentLight
 from gsbake.shading.light_motion import LightMotion, Motion, light_rotations
 from gsbake.texturing.normal_map import DenseSamples
@@ -136,16 +136,19 @@ class _Fitting:
 
     def run(self) -> FittedTextures:
         """Choose the texture size, read the photos' pixels, trace visibility, fit, and resample to the full texture."""
-        footprint = self._choose_texture()
-        pixels = self._read_pixels()
-        fine, coarse = self._surfaces()
-        diffuse = skips(self.settings.specular, pixels.diffuse)
-        if fine.transport is not None and self.settings.bake.visibility == "reflections" and not diffuse:
-            pixels = self._trace_reflections(pixels, fine)
-        pixels = self._under_moving_light(coarse, pixels, diffuse)
-        choice = self._fit(fine, coarse, pixels, diffuse)
-        values = self._full_texture(choice, pixels)
-        return self._result(choice, values, footprint, pixels)
+        with PartSequence(self.monitor) as self.parts:
+            self.parts.start("light transport")
+            footprint = self._choose_texture()
+            pixels = self._read_pixels()
+            fine, coarse = self._surfaces()
+            diffuse = skips(self.settings.specular, pixels.diffuse)
+            if fine.transport is not None and self.settings.bake.visibility == "reflections" and not diffuse:
+                pixels = self._trace_reflections(pixels, fine)
+            pixels = self._under_moving_light(coarse, pixels, diffuse)
+            choice = self._fit(fine, coarse, pixels, diffuse)
+            self.parts.start("full texture")
+            values = self._full_texture(choice, pixels)
+            return self._result(choice, values, footprint, pixels)
 
     @property
     def _ray_offset(self) -> float:
@@ -219,6 +222,7 @@ class _Fitting:
 
     def _each(self, name: str, done: int, total: int) -> None:
         self.monitor.check_stop()
+        self.parts.start(name)
         self.monitor.progress(done, total, name)
 
     def _coarse_level(self, texels: FitSurface, pixels: _PhotoPixels) -> FitLevel:

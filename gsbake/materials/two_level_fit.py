@@ -110,7 +110,7 @@ def fit_two_levels(coarse: FitLevel, fine: FitLevel, texture: CoarseTexture, pla
         adapt = replace(refine, iterations=steps(SHADING_SHARE), metal_searches_at=(), rate=SHADING_RATE)
         for turn in range(SHADING_ROUNDS + 1):
             if turn:
-                choice.fit.run(coarse.fitted, [], adapt, each("material fit, coarse level"))
+                choice.fit.run(coarse.fitted, [], adapt, each("remaining shading"))
             seed = plan.seed + turn
             choice.fit.move_to_light(choice.fit.find_remaining_shading(seed), seed)
     if not choice.fit.mostly_dielectric:

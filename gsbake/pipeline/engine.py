@@ -42,6 +42,9 @@ class Observer:
     def stage_waiting(self, name: str, holder: LeaseHolder | None) -> None:
         """Another process computes the artifact; called at every poll while waiting."""
 
+    def part_started(self, name: str, part: str) -> None:
+        """A stage starts a part whose time is measured; see `parts` of the manifest."""
+
     def progress(self, name: str, done: int, total: int, text: str, live: Mapping[str, float]) -> None:
         """A stage reports progress."""
 
@@ -76,19 +79,19 @@ class Engine:
         #: Stages that the present or last run has finished, whether or not it went on to the end.
         self.finished: list[StageState] = []
 
-    def plan(self, target: str | None = None) -> list[StageState]:
+    def plan(self, until: str | None = None) -> list[StageState]:
         """The states of the stages that `run` would take; nothing is run."""
-        states = self.planner.plan(self.registry.up_to(target))
+        states = self.planner.plan(self.registry.up_to(until))
         self.store.digests.save()
         return states
 
-    def run(self, target: str | None = None, on_accepted: Callable[[], None] | None = None) -> list[StageState]:
-        """Bring all stages up to `target` (all without one) up to date; returns their states with artifacts.
+    def run(self, until: str | None = None, on_accepted: Callable[[], None] | None = None) -> list[StageState]:
+        """Bring all stages up to `until` (all without one) up to date; returns their states with artifacts.
 
         `on_accepted` is called once the inputs were read and the first stage's state is known, before anything is computed.
         Raises BadInputError, UsageError, InterruptedRun, or StageFailed, which names the file with the traceback.
         """
-        stages = self.registry.up_to(target)
+        stages = self.registry.up_to(until)
         try:
             ensure_output_folder(self.request.out)
             with StopSignals() as stop:
@@ -305,6 +308,8 @@ class Engine:
     def _relay(self, name: str, message: Mapping[str, Any]) -> None:
         """Pass a worker's message to the observer and the event log."""
         match message["kind"]:
+            case "part":
+                self.observer.part_started(name, message["name"])
             case "progress":
                 live = {k: v for k, v in message["live"].items() if v is not None}
                 self.observer.progress(name, message["done"], message["total"], message["text"], live)

@@ -42,11 +42,11 @@ class Registry:
         """The stages but one, which no other needs."""
         return Registry({key: reference for key, reference in self.references.items() if key != name})
 
-    def up_to(self, target: str | None = None) -> list[Stage]:
-        """`target` and its direct and indirect dependencies in running order; all stages without a target."""
-        if target is None:
+    def up_to(self, until: str | None = None) -> list[Stage]:
+        """The stage `until` and its direct and indirect dependencies in running order; all stages without one."""
+        if until is None:
             return [self.load(name) for name in self.names]
-        wanted = {target}
+        wanted = {until}
         stages = []
         for name in reversed(self.names):
             if name in wanted:
@@ -54,5 +54,5 @@ class Registry:
                 wanted.update(stage.needs)
                 stages.append(stage)
         if not stages:
-            self.load(target)
+            self.load(until)
         return stages[::-1]

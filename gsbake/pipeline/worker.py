@@ -112,7 +112,8 @@ class WorkerContext:
 
     @contextmanager
     def part(self, name: str) -> Iterator[None]:
-        """Measure the time of a part of the stage; times of parts with the same name are added."""
+        """Measure the time of a part of the stage, and report its start; times of parts with the same name are added."""
+        self._pipe.send("part", name=name)
         start = time.perf_counter()
         try:
             yield

@@ -31,7 +31,7 @@ def project_photos(surface: UnwrappedMesh, posed: PosedPhotos, holdout: int, equ
     """
     held_out_views = set(held_out(len(posed), holdout))
     blender = ProjectionBlender(surface.texel_position, surface.texel_normal, surface.caster, 3, surface.texel_size)
-    measured = equalisation != "always"
+    measured = equalisation != "skip"
     tie_points = TiePointExposure.from_model(posed.folder / "sparse", posed.cameras.to_world.inverse()) if measured else None
     for index in range(len(posed)):
         monitor.check_stop()

@@ -11,12 +11,13 @@ from pathlib import Path
 
 import pytest
 
-from gsbake.batch.captures import BatchOptions, PhotoSet, plan_captures
+from gsbake.batch.captures import BatchOptions, plan_captures
 from gsbake.batch.emit import FORMATS, as_openjd, emit
-from gsbake.batch.estimate import History, at_threads, formula
 from gsbake.batch.jobs import Job, make_jobs
 from gsbake.errors import UsageError
 from gsbake.stages import ORDER
+from gsbake.timing.estimate import History, at_threads, formula
+from gsbake.timing.photos import PhotoSet
 from tests.cli.conftest import Run
 
 Make = Callable[..., Path]

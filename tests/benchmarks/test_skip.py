@@ -23,8 +23,8 @@ def test_a_failed_run_is_a_row_with_the_reason(tmp_path: Path) -> None:
     for i in range(2):
         picture = np.random.default_rng(i).integers(0, 255, (40, 40, 3), np.uint8)
         Image.fromarray(picture).save(folder / f"p{i}.png")
-    row = measure_run(tmp_path / "capture", "smoke", "resolution", "always", tmp_path / "out", 1)
-    assert (row.capture, row.rule, row.mode, row.choice) == ("capture", "resolution", "always", "failed")
+    row = measure_run(tmp_path / "capture", "smoke", "resolution", "skip", tmp_path / "out", 1)
+    assert (row.capture, row.rule, row.mode, row.choice) == ("capture", "resolution", "skip", "failed")
     assert "has 2 usable photos" in row.evidence and row.seconds is None and row.chamfer_pct is None
 
 
@@ -54,8 +54,8 @@ def test_a_run_without_early_stages_cannot_be_reused(tmp_path: Path) -> None:
 
 def test_rows_of_other_runs_are_kept(tmp_path: Path) -> None:
     file = tmp_path / "skip.csv"
-    write(file, [Row("cup", "preview", "settled", "never", "old", "", seconds=1.0), Row("cup", "preview", "photos", "never", "kept", "")])
-    write(file, [Row("cup", "preview", "settled", "never", "new", "", seconds=2.25), Row("jug", "preview", "settled", "never", "more", "")])
+    write(file, [Row("cup", "preview", "settled", "keep", "old", "", seconds=1.0), Row("cup", "preview", "photos", "keep", "kept", "")])
+    write(file, [Row("cup", "preview", "settled", "keep", "new", "", seconds=2.25), Row("jug", "preview", "settled", "keep", "more", "")])
     with file.open(newline="") as body:
         lines = [(line["capture"], line["choice"], line["seconds"]) for line in csv.DictReader(body)]
     assert lines == [("cup", "kept", ""), ("cup", "new", "2.25"), ("jug", "more", "")]

@@ -190,7 +190,7 @@ def test_ingest_halves_blurred_photos(tmp_path: Path, runner: Runner) -> None:
     assert "3 mask files" in done.line("masks")
 
 
-@pytest.mark.parametrize(("sharp", "mode", "width"), [(1, "auto", 1000), (0, "never", 1000), (3, "always", 500)])
+@pytest.mark.parametrize(("sharp", "mode", "width"), [(1, "auto", 1000), (0, "keep", 1000), (3, "skip", 500)])
 def test_ingest_keeps_the_size_of_sharp_photos(tmp_path: Path, runner: Runner, sharp: int, mode: str, width: int) -> None:
     blurred_photos(tmp_path / "images", sharp)
     _, done = runner.ingest(tmp_path, resolution=mode)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -12,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from gsbake.errors import BadInputError
+from gsbake.stages import ORDER
 from tests.cli.conftest import Run
 
 
@@ -237,7 +239,12 @@ def test_profiles_are_listed_and_shown(run: Run) -> None:
         "dsdf", "gs-ror2", "3dgsr", "gsdf", "gs-octree", "gs-pull", "surfacesplat", "splatsdf", "gaussianroom", "ugsdf", "sdf-3dgan",
         "neus", "volsdf",
     }  # fmt: skip
-    assert set(run("profiles", "--json").json) == {"smoke", "preview", "relight", "quality", "scan"} | family
+    for_assets = {"smoke", "preview", "relight", "quality", "scan"}
+    assert set(run("profiles", "--json").json) == for_assets
+    assert set(run("profiles", "--all", "--json").json) == for_assets | family
+    listed = run("profiles").out
+    assert listed.count("\n") == 10 and "relight (default)" in listed and "--all lists 13 published systems" in listed
+    assert "--all" not in run("profiles", "--all").out
     shown = run("profiles", "smoke", "--set", "mesh.faces=123", "--json").json
     assert shown["mesh.faces"]["value"] == 123 and shown["mesh.faces"]["origin"] == "--set"
     assert shown["train.iterations"]["origin"] == "smoke" and shown["ingest.min_photos"]["origin"] == "default"
@@ -253,8 +260,32 @@ def test_help_imports_no_large_library() -> None:
     assert loaded.isdisjoint({"torch", "numba", "cv2", "numpy", "scipy", "trimesh", "pydantic", "rich.progress", "gsbake.stages.train"})
 
 
+def test_help_groups_commands_and_options_in_panels(run: Run) -> None:
+    text = run("--help").out
+    titles = re.findall(r"(?m)^(\S.*):$", text)
+    assert titles == ["Make", "Inspect", "Edit", "Many captures", "Files", "Single stages", "Options"]
+    panels = dict(zip(titles, re.split(r"(?m)^\S.*:$", text)[1:], strict=True))
+    listed = {title: re.findall(r"(?m)^  ([a-z]+) ", panels[title]) for title in titles[:-1]}
+    assert listed["Make"] == ["run", "check", "synth"] and listed["Many captures"] == ["plan", "batch", "cache"]
+    assert listed["Single stages"] == list(ORDER) and sum(map(len, listed.values())) == 25
+    assert "..." not in re.sub(r"\[ARGS\]\.\.\.", "", text)  # no sentence is cut
+    for command in ("run", "mesh"):
+        options = run(command, "--help").out
+        main, photos, common = (options.index(f"\n{title}:\n") for title in ("Options", "Options of the photos", "Common options"))
+        assert main < options.index("--out") < options.index("--profile") < photos < options.index("--masks auto") < common
+        assert all(options.index(f" {name} ") > common for name in ("--device", "--threads", "--seed", "--json", "--help"))
+
+
 def test_completion_of_stages_profiles_and_settings(monkeypatch: pytest.MonkeyPatch) -> None:
     from gsbake.cli.options import complete_profile, complete_setting, complete_stage
 
     assert complete_profile("pr") == ["preview"] and complete_stage("re") == ["refine", "report"]
     assert complete_setting("mesh.fa") == ["mesh.faces="]
+
+
+def test_a_run_says_the_time_left_or_that_it_is_unknown(run: Run, capture: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import gsbake.cli.display
+
+    monkeypatch.setattr(gsbake.cli.display, "PROGRESS_INTERVAL", 0.0)
+    lines = [line for line in run("run", capture).out.splitlines() if " of 3" in line]
+    assert lines and all(re.search(r", (time left unknown|about [\d.]+ s left)$", line) for line in lines)

@@ -106,10 +106,10 @@ def test_every_number_is_finite_and_bounded() -> None:
 def test_extends_origins_and_overrides(tmp_path: Path) -> None:
     write(tmp_path / "base.toml", 'extends = "preview"\n[mesh]\nfaces = 777\nsmoothing_iterations = 1\n')
     mine = write(tmp_path / "mine.toml", 'extends = "base.toml"\n[mesh]\nfaces = 888\n')
-    loaded = load_profile(mine, ["bake.size=512", "mesh.holes=leave", "export.copyright=2031 me = you", "skip.converged_steps=never"])
+    loaded = load_profile(mine, ["bake.size=512", "mesh.holes=leave", "export.copyright=2031 me = you", "skip.converged_steps=keep"])
     profile, preview = loaded.profile, load_profile("preview").profile
     assert (profile.mesh.faces, profile.mesh.smoothing_iterations, profile.bake.size) == (888, 1, 512)
-    assert profile.mesh.holes == "leave" and profile.export.copyright == "2031 me = you" and profile.skip.converged_steps == "never"
+    assert profile.mesh.holes == "leave" and profile.export.copyright == "2031 me = you" and profile.skip.converged_steps == "keep"
     assert profile.train.iterations == preview.train.iterations
     origins = loaded.origins
     assert origins["mesh.faces"] == mine and origins["mesh.smoothing_iterations"] == str(tmp_path / "base.toml")
@@ -122,7 +122,7 @@ def test_extends_origins_and_overrides(tmp_path: Path) -> None:
     [
         ("[train]\niteration = 5\n", ["there is no setting 'train.iteration'", "the nearest is 'train.iterations'"]),
         ("[trian]\niterations = 5\n", ["'trian.iterations'", "the nearest is 'train.iterations'"]),
-        ('[skip]\nredundant_photos = "sometimes"\n', ["skip.redundant_photos = 'sometimes'", "one of auto, always, never"]),
+        ('[skip]\nredundant_photos = "sometimes"\n', ["skip.redundant_photos = 'sometimes'", "one of auto, skip, keep"]),
         ("[bake]\nfaces = 5\n", ["'bake.faces'", "the nearest is 'mesh.faces'"]),
         ("faces = 5\n", ["'faces'", "the nearest is 'mesh.faces'"]),
         ("[mesh]\nfaces = 5\n", ["mesh.faces = 5 is invalid: it must be a whole number from 100 to 10 000 000."]),

@@ -50,7 +50,7 @@ def test_add_a_stage(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     photos.mkdir()
     for name in "abc":
         (photos / f"{name}.png").write_text(name)
-    result = gsbake.api.run(photos, out=tmp_path / "out", settings={"export.copyright": "CC0"}, target="card")
+    result = gsbake.api.run(photos, out=tmp_path / "out", settings={"export.copyright": "CC0"}, until="card")
     card = next((tmp_path / "out" / "stages" / "card").glob("*/card.json"))
     size = (tmp_path / "out" / "asset.glb").stat().st_size
     assert json.loads(card.read_text()) == {"bytes": size, "copyright": "CC0"} and result.results("card") == {"bytes": size}

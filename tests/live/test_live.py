@@ -28,6 +28,9 @@ class Spy(Observer):
     def __init__(self) -> None:
         self.seen: list[str] = []
 
+    def part_started(self, name: str, part: str) -> None:
+        self.seen.append(f"{name}: {part}")
+
     def progress(self, name: str, done: int, total: int, text: str, live: Any) -> None:
         self.seen.append(f"{name} {done}")
 
@@ -36,6 +39,7 @@ def a_run(state: LiveState) -> None:
     stage: Any = SimpleNamespace(name="train", title="Training <b>", reasons=(), artifact=None)
     state.run_started([stage, SimpleNamespace(name="mesh", title="Mesh")])  # type: ignore[list-item]
     state.stage_started(stage)
+    state.part_started("train", "training")
     for step in range(1, 700):
         state.progress("train", step, 1000, "", {"psnr": 20 + step / 100})
     state.decision("train", "poses", "kept", "no gain \u202e")
@@ -58,7 +62,8 @@ def get(view: LiveView, path: str, **headers: str) -> tuple[int, bytes]:
 
 def test_state_progress_curves_and_decisions(view: LiveView) -> None:
     a_run(view.state)
-    assert view.state.display.seen[-1] == "train 699"  # type: ignore[attr-defined]
+    seen = view.state.display.seen  # type: ignore[attr-defined]
+    assert seen[0] == "train: training" and seen[-1] == "train 699"
     code, body = get(view, f"/{view.token}/state.json")
     found = json.loads(body)
     assert code == 200 and not found["ended"]

@@ -36,7 +36,7 @@ def test_second_run_is_cached(tmp_path: Path, photos: Path) -> None:
     states = first.run()
     assert seen.ran == ["read", "sum", "tell"] and seen.cached == []
     assert (states[2].artifact.folder / "tell.txt").read_text() == f"total {total(10, 3)}"  # type: ignore[union-attr]
-    assert seen.reports[-1] == (10, 10, {"psnr": 10.0})
+    assert seen.reports[-1] == (10, 10, {"psnr": 10.0}) and seen.parts == [("sum", "loop")]
     second, again = engine(tmp_path / "out", photos)
     second.run()
     assert again.ran == [] and again.cached == ["read", "sum", "tell"]
@@ -130,7 +130,7 @@ def test_damaged_artifacts_are_invalid(tmp_path: Path, photos: Path) -> None:
     assert "is missing" in engine(tmp_path / "out", photos)[0].plan()[1].reasons[0]
 
 
-def test_seed_and_target(tmp_path: Path, photos: Path) -> None:
+def test_seed_and_last_stage(tmp_path: Path, photos: Path) -> None:
     engine(tmp_path / "out", photos)[0].run()
     seeded, seen = engine(tmp_path / "out", photos, seed=4)
     assert seeded.plan()[1].reasons == ("seed: 0 → 4",)

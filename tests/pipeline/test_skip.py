@@ -1,4 +1,4 @@
-"""Decisions on skipped work: setting and evidence, report, and saved time in manifest and event log."""
+"""Decisions on skipped work: setting and evidence, report, and saved time in manifest and event log; parts that follow each other."""
 
 from __future__ import annotations
 
@@ -7,14 +7,14 @@ from pathlib import Path
 
 import pytest
 
-from gsbake.monitor import Rule, decide_skip, skips
+from gsbake.monitor import PartSequence, Rule, decide_skip, skips
 from tests.pipeline.toy import engine
 from tests.support.recorder import Recorder
 
 
 @pytest.mark.parametrize(
     ("rule", "holds", "skip"),
-    [("auto", True, True), ("auto", False, False), ("always", False, True), ("never", True, False)],
+    [("auto", True, True), ("auto", False, False), ("skip", False, True), ("keep", True, False)],
 )
 def test_setting_overrides_evidence(rule: Rule, holds: bool, skip: bool) -> None:
     monitor = Recorder()
@@ -36,3 +36,12 @@ def test_saved_time_is_in_manifest_and_event_log(tmp_path: Path) -> None:
     assert states[1].artifact.manifest["decisions"] == [done]
     lines = [json.loads(line) for line in (tmp_path / "out" / "events.jsonl").read_text().splitlines()]
     assert [e.get("saved_s") for e in lines if e["event"] == "decision"] == [None, 12.3]
+
+
+def test_parts_that_follow_each_other() -> None:
+    monitor = Recorder()
+    with PartSequence(monitor) as parts:
+        for name in ("matching", "matching", "mapping"):
+            parts.start(name)
+        assert list(monitor.parts) == ["matching"]  # the present one is not over
+    assert list(monitor.parts) == ["matching", "mapping"]

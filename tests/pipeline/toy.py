@@ -146,6 +146,10 @@ class Recorder(Observer):
         self.cached: list[str] = []
         self.waited: list[str] = []
         self.reports: list[tuple[int, int, dict[str, float]]] = []
+        self.parts: list[tuple[str, str]] = []
+
+    def part_started(self, name: str, part: str) -> None:
+        self.parts.append((name, part))
 
     def stage_reused(self, state: Any) -> None:
         self.cached.append(state.name)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import shutil
 import sqlite3
 from collections.abc import Sequence
-from contextlib import ExitStack, closing
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -21,7 +21,7 @@ from gsbake.capture.sfm.standing_background import StandingBackground, find_stan
 from gsbake.config.schema import Poses
 from gsbake.errors import BadInputError, InterruptedRun
 from gsbake.geometry.cameras import Camera, CameraSet
-from gsbake.monitor import Monitor
+from gsbake.monitor import Monitor, PartSequence
 from gsbake.text import shortlist
 
 #: Time limit of triangulation with given poses in seconds, per photo and at least. Far above any measured time: it ends a process that
@@ -249,15 +249,10 @@ class PoseSolver:
             shutil.rmtree(work)
         work.mkdir(parents=True, exist_ok=True)
         shutil.rmtree(folder, ignore_errors=True)
-        with ExitStack() as part_timer:
-            current = ""
+        with PartSequence(self.monitor) as parts:
 
             def progress(part: str, done: int, total: int) -> None:
-                nonlocal current
-                if part != current:
-                    part_timer.close()
-                    part_timer.enter_context(self.monitor.part(part))
-                    current = part
+                parts.start(part)
                 self.monitor.progress(done, total, part)
 
             result = run_job(job, folder, JobCallbacks(progress, self.monitor.stop_requested), limit)

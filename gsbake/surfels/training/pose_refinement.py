@@ -81,13 +81,13 @@ def pose_rule(rule: Rule, cameras: CameraSet, size: int) -> tuple[Rule, str]:
     if rule != "auto":
         return rule, ""
     if cameras.poses == "solved":
-        return "always", "the poses are those of structure from motion"
+        return "skip", "the poses are those of structure from motion"
     if cameras.epipolar_px is None:
-        return "always", "too few features were matched to tell whether the given poses are wrong"
+        return "skip", "too few features were matched to tell whether the given poses are wrong"
     error = cameras.epipolar_px * size / max(max(camera.width, camera.height) for camera in cameras.cameras)
     limit = EPIPOLAR_SHARE * motion_bound(size)
     if error < limit:
-        return "always", f"matched features are {error:.2f} px from the epipolar lines of the given poses; a trial needs {limit:.2g} px"
+        return "skip", f"matched features are {error:.2f} px from the epipolar lines of the given poses; a trial needs {limit:.2g} px"
     return "auto", ""
 
 
@@ -97,19 +97,19 @@ def exposure_rule(rule: Rule, spread: float | None) -> tuple[Rule, str]:
     if rule != "auto":
         return rule, ""
     if spread is None:
-        return "always", "too few tie points to tell whether photos differ in exposure"
+        return "skip", "too few tie points to tell whether photos differ in exposure"
     if spread < MAX_SPREAD:
-        return "always", f"90 % of the photos agree within {spread:.2f}x at their tie points; a trial needs {MAX_SPREAD:g}x"
+        return "skip", f"90 % of the photos agree within {spread:.2f}x at their tie points; a trial needs {MAX_SPREAD:g}x"
     return "auto", ""
 
 
 class Aligner:
     """Corrects the poses and exposures of a trainer's photos."""
 
-    def __init__(self, trainer: Trainer, poses: str, gains: str) -> None:
-        """`poses` and `gains` are the rules of [skip]: "always" skips these corrections, "never" makes them, "auto" decides by a trial."""
-        self.trainer, self.required = trainer, CorrectionKinds(poses == "never", gains == "never")
-        self.allowed = CorrectionKinds(poses != "always", gains != "always")
+    def __init__(self, trainer: Trainer, poses: Rule, gains: Rule) -> None:
+        """Rules of [skip] for `poses` and `gains`: "skip" leaves these corrections out, "keep" makes them, "auto" decides by a trial."""
+        self.trainer, self.required = trainer, CorrectionKinds(poses == "keep", gains == "keep")
+        self.allowed = CorrectionKinds(poses != "skip", gains != "skip")
         self.original = list(trainer.views), list(trainer.half_views)
         self.corrections = [Correction.identity() for _ in trainer.views]
         self.decided = None if "auto" in (poses, gains) else self.required

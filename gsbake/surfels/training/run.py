@@ -60,7 +60,7 @@ def train_surfels(
     share = 0.0 if stereo is None else confirmed_share(posed, stereo)
     holds, evidence = can_skip_steps(share, kind, light is not None)
     steps = options.train.iterations
-    assumed = 1.0 if options.confirmed_steps == "always" else share
+    assumed = 1.0 if options.confirmed_steps == "skip" else share
     skipped = skipped_steps(steps, assumed) if skips(options.confirmed_steps, holds) else 0
     run = Execution(out, scratch, seed, threads, device, monitor)
     with monitor.part("field"):

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from gsbake.imaging.metrics import decibels
+from gsbake.monitor import Rule
 from gsbake.surfels.adam import Adam
 from gsbake.surfels.densification.clone_split import Statistics, densify, prune, reset_opacity
 from gsbake.surfels.densification.policy import PolicyInputs
@@ -49,7 +50,7 @@ class Plan:
     """Settings of a training run: the profile's sections and the schedule.
 
     `densify`: whether surfels are densified and pruned; `policy`: the densification policy, a name in `registry.DENSIFICATION`.
-    `converged` is the rule skip.converged_steps: "auto" stops at a plateau, "always" as soon as the schedule allows, "never" does not stop
+    `converged` is the rule skip.converged_steps: "auto" stops at a plateau, "skip" as soon as the schedule allows, "keep" does not stop
     early.
     """
 
@@ -60,7 +61,7 @@ class Plan:
     coarse_share: float
     densify: bool
     seed: int
-    converged: str = "never"
+    converged: Rule = "keep"
     policy: str = "gradient"
 
 
@@ -282,9 +283,9 @@ class Trainer:
         }  # fmt: skip
         self.log.append(row)
         densifying = self.plan.densify and self.done < DENSIFY_END * self.plan.iterations
-        if self.plan.converged != "never" and self.cooldown_start is None and self.done < self.end and not self.coarse() and not densifying:
+        if self.plan.converged != "keep" and self.cooldown_start is None and self.done < self.end and not self.coarse() and not densifying:
             plateaued, self.plateau_evidence = has_plateaued(self.log)
-            if plateaued or self.plan.converged == "always":
+            if plateaued or self.plan.converged == "skip":
                 self.cooldown_start = self.done
                 self.end = min(self.end, self.done + int(COOLDOWN_SHARE * self.plan.iterations))
         return row

@@ -64,7 +64,7 @@ def test_a_video_is_ingested_as_photos(tmp_path: Path) -> None:
     assert (sources.photos, sources.masks, sources.poses) == (path, None, None)
     out = tmp_path / "out"
     out.mkdir()
-    options = IngestOptions(Ingest(frames=8, mask_network="none"), "never")
+    options = IngestOptions(Ingest(frames=8, mask_network="none"), "keep")
     figures = ingest(path, out, options)
     assert figures["photos"] == 8
     names = [entry["name"] for entry in json.loads((out / "photos.json").read_text())["photos"]]

@@ -46,7 +46,7 @@ def trainer(mode: str) -> Trainer:
     return Trainer(Plan(p.train, p.surfels, p.loss, STEPS, 0.1, False, 0, mode), surfels, None, [view], [view], [])
 
 
-@pytest.mark.parametrize(("mode", "gain", "stop"), [("auto", 0.0, 80), ("auto", 1.0, None), ("never", 0.0, None), ("always", 1.0, 20)])
+@pytest.mark.parametrize(("mode", "gain", "stop"), [("auto", 0.0, 80), ("auto", 1.0, None), ("keep", 0.0, None), ("skip", 1.0, 20)])
 def test_training_cools_down_at_a_plateau(monkeypatch: pytest.MonkeyPatch, mode: str, gain: float, stop: int | None) -> None:
     t = trainer(mode)
     monkeypatch.setattr(t, "evaluate", lambda: 30.0 + gain * t.done)

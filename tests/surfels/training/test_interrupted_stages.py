@@ -12,7 +12,7 @@ import pytest
 
 SETTINGS = (
     "ingest.max_size=96", "stereo.enabled=never", "train.iterations=260", "train.max_size=96", "train.init_surfels=1500",
-    "surfels.max_count=2500", "surfels.shading=pbr", "light.size=8", "refine.iterations=120", "skip.pose_refinement=never",
+    "surfels.max_count=2500", "surfels.shading=pbr", "light.size=8", "refine.iterations=120", "skip.pose_refinement=keep",
 )  # fmt: skip
 
 #: Runs up to a stage and sends itself a signal after a number of that stage's steps (signal 0: never).

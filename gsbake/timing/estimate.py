@@ -1,7 +1,7 @@
 """Estimates of a stage's time and memory from the photos and the settings, corrected by earlier runs.
 
 The formulas give the order of magnitude: seconds on two cores and resident megabytes, fitted to `gsbake run` with the profiles preview and
-relight on two captures of 40 and 48 small photos. What earlier runs in the same batch folder took corrects them: the median ratio of
+relight on two captures of 40 and 48 small photos. What earlier runs in the same folder took corrects them: the median ratio of
 measured and estimated seconds, and the largest ratio of memory, per stage; runs with the same settings count alone where there are any.
 """
 
@@ -9,13 +9,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from statistics import median
 from typing import Any
 
-from gsbake.batch.captures import PhotoSet, photos_of_run
 from gsbake.pipeline.store import Store
+from gsbake.timing.photos import PhotoSet, photos_of_run
+from gsbake.timing.usual_parts import usual_parts
 
 #: Exponent of the speed-up by threads: 2 threads are 1.74 times as fast as 1.
 _THREAD_EXPONENT = 0.8
@@ -24,14 +26,19 @@ _FITTED_THREADS = 2
 #: Room above the largest memory that was measured, and above that of a formula.
 _MEMORY_MARGIN, _MEMORY_MARGIN_OF_FORMULA = 1.2, 1.5
 
-
 @dataclass(frozen=True)
 class Estimate:
-    """Expected seconds, and megabytes of memory to reserve; `measured` is the number of earlier runs behind the correction."""
+    """Expected seconds, and megabytes of memory to reserve.
+
+    `measured` is the number of earlier runs behind the correction, `same` whether they had the same settings; `parts` are the shares of the
+    stage's parts in its seconds, in running order.
+    """
 
     seconds: float
     memory_mb: int
     measured: int = 0
+    parts: Mapping[str, float] = field(default_factory=dict)
+    same: bool = False
 
 
 def formula(stage: str, photos: PhotoSet, settings: Mapping[str, Any]) -> tuple[float, float]:
@@ -71,43 +78,60 @@ def formula(stage: str, photos: PhotoSet, settings: Mapping[str, Any]) -> tuple[
     return 10.0, 500.0
 
 
+@dataclass(frozen=True)
+class Measured:
+    """An earlier run of a stage: its settings, the ratios of measured and estimated seconds and memory, and the share of each part."""
+
+    settings: Mapping[str, Any]
+    seconds: float
+    memory: float
+    parts: Mapping[str, float]
+
+
 @dataclass
 class History:
-    """Ratios of measured and estimated seconds and memory of earlier runs: {stage: [(settings, seconds ratio, memory ratio)]}."""
+    """Earlier runs by stage, newest first where they were read so."""
 
-    ratios: dict[str, list[tuple[Mapping[str, Any], float, float]]] = field(default_factory=dict)
+    runs: dict[str, list[Measured]] = field(default_factory=dict)
 
     @staticmethod
     def of_runs(outs: Iterable[Path], stages: Iterable[str]) -> History:
-        """The history of the output folders `outs`; folders without a finished ingest are left out."""
+        """The history of the output folders `outs`; folders without a finished ingest, or that cannot be read, are left out."""
         history, names = History(), list(stages)
         for out in outs:
-            photos = photos_of_run(out)
-            if photos is not None:
-                for stage in names:
-                    for _, manifest in Store(out).manifests(stage):
-                        history.add(stage, photos, manifest)
+            with suppress(OSError):
+                photos = photos_of_run(out)
+                if photos is not None:
+                    for stage in names:
+                        for _, manifest in Store(out).manifests(stage):
+                            history.add(stage, photos, manifest)
         return history
 
     def add(self, stage: str, photos: PhotoSet, manifest: Mapping[str, Any]) -> None:
         """Add one manifest. A resumed stage is left out: its time is that of the rest only."""
         settings, seconds, peak = manifest.get("settings", {}), manifest.get("seconds"), manifest.get("peak_bytes")
-        threads = manifest.get("threads")
+        threads, parts = manifest.get("threads"), manifest.get("parts") or {}
         if manifest.get("resumed") or not isinstance(seconds, int | float) or not isinstance(peak, int) or not isinstance(threads, int):
             return
         expected, memory = formula(stage, photos, settings)
         alone = seconds / at_threads(1.0, max(threads, 1))
-        self.ratios.setdefault(stage, []).append((settings, alone / expected, peak / 1e6 / memory))
+        shares = {name: part / seconds for name, part in parts.items()} if seconds > 0 else {}
+        self.runs.setdefault(stage, []).append(Measured(settings, alone / expected, peak / 1e6 / memory, shares))
 
     def estimate(self, stage: str, photos: PhotoSet, settings: Mapping[str, Any], threads: int) -> Estimate:
-        """The estimate of a stage with the values of its `settings` (those it declares), on `threads` threads."""
+        """The estimate of a stage with the values of its `settings` (those it declares), on `threads` threads.
+
+        Shares of parts are those of a run with the same settings, else those of `usual_parts`: other settings have other parts.
+        """
         seconds, memory = formula(stage, photos, settings)
-        known = self.ratios.get(stage, [])
-        known = [entry for entry in known if entry[0] == settings] or known
+        known = self.runs.get(stage, [])
+        same = [run for run in known if run.settings == settings]
+        parts = same[0].parts if same else usual_parts(stage, settings)
+        known = same or known
         if not known:
-            return Estimate(at_threads(seconds, threads), math.ceil(memory * _MEMORY_MARGIN_OF_FORMULA))
-        speed, room = median(entry[1] for entry in known), max(entry[2] for entry in known)
-        return Estimate(at_threads(seconds * speed, threads), math.ceil(memory * room * _MEMORY_MARGIN), len(known))
+            return Estimate(at_threads(seconds, threads), math.ceil(memory * _MEMORY_MARGIN_OF_FORMULA), parts=parts)
+        speed, room = median(run.seconds for run in known), max(run.memory for run in known)
+        return Estimate(at_threads(seconds * speed, threads), math.ceil(memory * room * _MEMORY_MARGIN), len(known), parts, bool(same))
 
 
 def at_threads(seconds: float, threads: int) -> float:
