@@ -5,14 +5,20 @@
 SHELL := /bin/sh
 VENV := .venv
 BIN := $(VENV)/bin
-STAMP := $(VENV)/.stamp
+RUNTIME := $(VENV)/.runtime
+DEV := $(VENV)/.dev
 IN_RANGE := import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))
 PYTHON ?= $(shell for p in python3.11 python3.12 python3.13 python3 python; do \
 	command -v $$p >/dev/null 2>&1 && $$p -c '$(IN_RANGE)' 2>/dev/null && echo $$p && break; done)
 TORCH := $(shell grep '^torch==' constraints.txt)
-# Byte code is compiled afterwards, on all cores and without the packages' own tests: pip compiles on one core.
-PIP_OPTIONS := install --quiet --disable-pip-version-check --no-compile --constraint constraints.txt
+# PyTorch's builds for the CPU. The plain wheel of the package index brings gigabytes of CUDA on Linux; for a GPU: TORCH_INDEX=https://download.pytorch.org/whl/cu130
+TORCH_INDEX ?= https://download.pytorch.org/whl/cpu
+# Byte code is compiled when a module is first imported: most of what is installed never is.
+PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile --no-deps
 DEMO_OUT ?= out/demo
+
+LOCK := --config-file packaging/uv.toml --universal --python-version 3.11.5 --generate-hashes --constraint constraints.txt \
+	--no-emit-package torch --no-header --no-annotate
 
 # The scorer is a program of its own with an environment of its own (Blender as a module needs Python 3.11).
 SCORE_DIR ?= ../shared/score
@@ -32,31 +38,36 @@ FUZZ_INPUTS ?= 10000
 WORKERS ?= 2
 QUICK := -m "not slow and not stress" --numprocesses $(WORKERS) --dist loadfile --no-loadscope-reorder
 
-.PHONY: help setup node demo docs test coverage check bench stress score lock audit sbom clean
+.PHONY: help setup kernels node demo docs test coverage check bench stress score lock audit sbom clean
 
 help: ## Show this
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 10
 
-setup: $(STAMP) ## Make .venv with exactly the versions in constraints.txt
+setup: $(DEV) ## Make .venv with everything for developers, exactly the versions in constraints.txt
 
-$(STAMP): pyproject.toml constraints.txt
+$(RUNTIME): pyproject.toml constraints.txt packaging/runtime.lock
 	@test -n "$(PYTHON)" || { echo "gsbake needs Python 3.11, 3.12 or 3.13, and none is on the PATH; name one: make PYTHON=/path/to/python3.12" >&2; exit 1; }
 	@"$(PYTHON)" -c '$(IN_RANGE)' || { echo "gsbake needs Python 3.11, 3.12 or 3.13 (xatlas has no wheel for newer ones); $(PYTHON) is `"$(PYTHON)" --version 2>&1`" >&2; exit 1; }
 	@test -x $(BIN)/python || "$(PYTHON)" -m venv $(VENV) || { rm -rf $(VENV); echo "$(PYTHON) cannot make a virtual environment; on Debian: sudo apt-get install python3-venv" >&2; exit 1; }
-	$(BIN)/python -m pip $(PIP_OPTIONS) $(TORCH)
-	$(BIN)/python -m pip $(PIP_OPTIONS) --editable '.[dev]'
-	@$(BIN)/python -W ignore -m compileall -qq -j 0 -x 'site-packages/.*/tests?/' "`$(BIN)/python -c 'import sysconfig; print(sysconfig.get_path("purelib"))'`" || true
+	@echo "Installing PyTorch from $(TORCH_INDEX)"
+	@$(PIP) --index-url $(TORCH_INDEX) --retries 1 $(TORCH) || { echo "Name another index of PyTorch's builds: make TORCH_INDEX=https://…" >&2; exit 1; }
+	$(PIP) --require-hashes --requirement packaging/runtime.lock
+	$(PIP) --no-build-isolation --editable .
 	@$(BIN)/python -m gsbake.capture.masks.weights || echo "Without it masks are not made; everything else works." >&2
+	@touch $@
+
+$(DEV): $(RUNTIME) packaging/dev.lock
+	$(PIP) --require-hashes --requirement packaging/dev.lock
 	@touch $@
 
 node: $(VENV)/node/.stamp ## Install the JavaScript reference implementations that tests compare with
 
-$(VENV)/node/.stamp: $(STAMP) tests/node/package-lock.json
+$(VENV)/node/.stamp: $(DEV) tests/node/package-lock.json
 	@mkdir -p $(VENV)/node && cp tests/node/package.json tests/node/package-lock.json $(VENV)/node
 	PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/npm ci --prefix $(VENV)/node --silent --no-audit --no-fund
 	@touch $@
 
-demo: setup ## Bake the built-in capture with the smallest profile
+demo: $(RUNTIME) ## Bake the built-in capture with the smallest profile
 	$(BIN)/gsbake synth $(DEMO_OUT)/capture
 	$(BIN)/gsbake run $(DEMO_OUT)/capture --profile smoke --out $(DEMO_OUT)
 	@echo "The asset is $(DEMO_OUT)/asset.glb; open $(DEMO_OUT)/report.html in a browser."
@@ -74,10 +85,14 @@ check: setup ## Lint, types on three systems, order of the layers, dead code
 	$(BIN)/lint-imports --no-logo --no-cache
 	$(BIN)/vulture
 
-test: check node ## The checks and the quick tests, in two processes: WORKERS=2
+test: kernels check node ## The checks and the quick tests, in two processes: WORKERS=2
 	$(BIN)/pytest $(QUICK)
 
-coverage: setup node ## The quick tests with the share of lines they run, which takes about half as long again
+# Compiled here by all cores, or every process of the tests would compile what it needs.
+kernels: $(RUNTIME)
+	@$(BIN)/python -m gsbake.cli.kernels
+
+coverage: kernels setup node ## The quick tests with the share of lines they run, which takes about half as long again
 	$(BIN)/pytest $(QUICK) --cov --cov-report=term:skip-covered
 
 stress: setup node ## The slow tests: hostile input at length, kills at random moments, faults on a Slurm cluster and on servers where installed, poses of a development capture where present
@@ -98,12 +113,14 @@ score: .score/.stamp ## Score an asset against its truth: SCORE_GT=capture/gt SC
 $(SCORE_DIR)/requirements.txt:
 	@echo "there is no scorer in $(SCORE_DIR); say where it is: make score SCORE_DIR=…" >&2; exit 1
 
-lock: ## Write requirements.lock, the digests of every pinned package: WHEELS=DIR with PyTorch's CPU builds
-	python3 packaging/lock.py $(if $(WHEELS),--wheels $(WHEELS))
+# Locked for all three systems and all Pythons; PyTorch is left to its version in constraints.txt (see packaging/uv.toml).
+lock: .audit/.stamp ## Write packaging/*.lock, the digests of every file of the pinned packages
+	.audit/bin/uv pip compile --quiet $(LOCK) --output-file packaging/runtime.lock pyproject.toml packaging/build.in
+	.audit/bin/uv pip compile --quiet $(LOCK) --output-file packaging/dev.lock --extra dev pyproject.toml packaging/build.in
 
 audit: .audit/.stamp ## Look for risky code (bandit) and for known vulnerabilities of the pinned packages (pip-audit, needs the internet)
 	.audit/bin/bandit -q -c pyproject.toml -r gsbake stages
-	.audit/bin/pip-audit --disable-pip --require-hashes -r requirements.lock
+	.audit/bin/pip-audit --disable-pip --require-hashes -r packaging/dev.lock
 
 sbom: setup .audit/.stamp ## Write out/sbom.json, the list of all installed packages and their licences (CycloneDX)
 	@mkdir -p out
