@@ -53,7 +53,7 @@ $(RUNTIME): pyproject.toml constraints.txt packaging/runtime.lock
 	@$(PIP) --index-url $(TORCH_INDEX) --retries 1 $(TORCH) || { echo "Name another index of PyTorch's builds: make TORCH_INDEX=https://…" >&2; exit 1; }
 	$(PIP) --require-hashes --requirement packaging/runtime.lock
 	$(PIP) --no-build-isolation --editable .
-	@$(BIN)/python -m gsbake.capture.masks.weights || echo "Without it masks are not made; everything else works." >&2
+	@$(BIN)/gsbake doctor --fetch-weights || echo "Without it masks are not made; everything else works." >&2
 	@touch $@
 
 $(DEV): $(RUNTIME) packaging/dev.lock

@@ -21,12 +21,12 @@ def run(ctx: Context) -> dict[str, Any]:
     )  # fmt: skip
 
 
-#: Modules with the kernels of this stage.
+#: Modules with the kernels of this stage, and with one that only depths of stereo are refined with.
 KERNELS = (
     "gsbake.meshing.fusion_kernel", "gsbake.meshing.depth_views", "gsbake.meshing.hole_filling", "gsbake.geometry.sparse_lattice",
     "gsbake.meshing.marching_cubes", "gsbake.meshing.refinement.normals", "gsbake.geometry.surface_distance",
-    "gsbake.meshing.refinement.photometric_kernel",
 )  # fmt: skip
+STEREO_KERNELS = ("gsbake.meshing.refinement.photometric_kernel",)
 
 
 STAGE = Stage(
@@ -40,5 +40,5 @@ STAGE = Stage(
         "mesh.*", "surfels.projected_depth", "train.max_size", "stereo.max_size", "skip.empty_cells", "export.max_triangles",
     ),
     uses_device=True,
-    kernels=lambda settings: KERNELS,
+    kernels=lambda settings: KERNELS if settings.stereo.enabled == "never" else KERNELS + STEREO_KERNELS,
 )  # fmt: skip

@@ -32,5 +32,5 @@ STAGE = Stage(
     needs=("poses",),
     settings=("stereo.*",),
     seeded=True,
-    kernels=lambda settings: KERNELS,
+    kernels=lambda settings: () if settings.stereo.enabled == "never" else KERNELS,
 )

@@ -230,8 +230,11 @@ class _Ingestion:
         if not without or self.options.ingest.masks != "auto":
             return 0
         if not self._makes_masks:
-            reason = "set by the profile" if WEIGHTS.is_file() else f"its weights are not installed: run `{INSTALL}`"
+            missing = not WEIGHTS.is_file()
+            reason = "its weights are not installed" if missing else "set by the profile"
             self.monitor.decide("automatic masks", "none", f"no mask network is used; {reason}")
+            if missing:
+                self.monitor.warn(f"Masks are not made, because the network's weights are not installed; run `{INSTALL}`, then this again.")
             return 0
         (self.out / "guesses").mkdir()
         with self.monitor.part("mask guesses"):

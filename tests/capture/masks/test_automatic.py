@@ -138,7 +138,8 @@ def test_without_weights_the_run_says_how_to_get_them(
         monkeypatch.setattr(module, "WEIGHTS", tmp_path / "absent.onnx")
     figures, done = runner.ingest(capture, mask_network="auto")
     assert figures["guessed_masks"] == 0 and not (runner.root / "ingest" / "guesses").exists()
-    assert "run `python -m gsbake.capture.masks.weights`" in done.line("automatic masks")
+    assert "weights are not installed" in done.line("automatic masks")
+    assert any("run `gsbake doctor --fetch-weights`" in text for text in done.warnings)
     with pytest.raises(BadInputError, match="has no masks"):
         export_masks(runner.root / "ingest", None, tmp_path / "edit")
 

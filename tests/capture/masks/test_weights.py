@@ -39,10 +39,24 @@ def test_the_expected_file_is_unpacked(tmp_path: Path) -> None:
 def test_auto_takes_what_is_installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(weights, "WEIGHTS", tmp_path / "u2netp.onnx")
     assert [weights.resolve_network(name) for name in ("auto", "none")] == ["none", "none"]
-    with pytest.raises(UsageError, match="python -m gsbake.capture.masks.weights"):
+    with pytest.raises(UsageError, match="gsbake doctor --fetch-weights"):
         weights.resolve_network("u2netp")
     (tmp_path / "u2netp.onnx").write_bytes(b"weights")
     assert [weights.resolve_network(name) for name in ("auto", "none", "u2netp")] == ["u2netp", "none", "u2netp"]
+
+
+def test_without_pip_one_is_made_for_the_moment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    made: list[bool] = []
+
+    def create(folder: Path, with_pip: bool) -> None:
+        made.append(with_pip)
+        (folder / "bin").mkdir(parents=True)
+        (folder / "bin" / "python").write_text("")
+
+    monkeypatch.setattr("venv.create", create)
+    command = weights._pip(tmp_path, "download")
+    assert made == [True] and command == [str(tmp_path / "environment" / "bin" / "python"), "-I", "-m", "pip", "download"]
 
 
 def test_an_index_out_of_reach_is_one_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
