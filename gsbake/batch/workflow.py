@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import importlib.util
 import json
-import shlex
 import shutil
 import subprocess
 import time
@@ -30,7 +29,7 @@ from gsbake.batch.records import FOLDER, Record, RecordReader
 from gsbake.errors import UsageError
 from gsbake.pipeline.supervise import StopSignals
 from gsbake.python_process import python_command, python_environment
-from gsbake.system.processes import leads_group, start_apart, stop_group
+from gsbake.system.processes import leads_group, shell_line, start_apart, stop_group
 
 EXECUTORS = ("local", "slurm")
 #: Times that a job is started again which was interrupted or killed.
@@ -199,7 +198,7 @@ def _prepare(jobs: Sequence[Job], options: BatchOptions, execution: Execution, w
             "id": job.id, "photos": job.photos, "out": job.out, "capture": job.capture, "stages": job.stages, "needs": job.needs,
             "threads": job.threads, "memory_mb": min(job.memory_mb, memory), "minutes": job.minutes,
             "level": levels[job.id],
-            "shell": shlex.join(python_command("-m", "gsbake.batch.job", str(path), job.id)),
+            "shell": shell_line(python_command("-m", "gsbake.batch.job", str(path), job.id)),
         }
         for job in jobs
     ]  # fmt: skip

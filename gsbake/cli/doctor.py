@@ -134,8 +134,8 @@ def _try_import(module: str) -> tuple[float | None, str]:
     """Seconds the import takes, or None and the last line of its error."""
     try:
         done = subprocess.run(
-            python_command("-c", _TIMED_IMPORT, module), env=python_environment(), stdin=subprocess.DEVNULL, capture_output=True, text=True,
-            timeout=120, check=False,
+            python_command("-c", _TIMED_IMPORT, module), env=python_environment(), stdin=subprocess.DEVNULL, capture_output=True,
+            encoding="utf-8", errors="replace", timeout=120, check=False,
         )  # fmt: skip
     except subprocess.TimeoutExpired:
         return None, "import takes more than two minutes"

