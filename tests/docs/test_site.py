@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 import typer
 
+import gsbake
 from gsbake.cli.app import app
 from gsbake.config.load import fields
 
@@ -83,7 +84,10 @@ def test_the_script_that_makes_the_pictures_fits_the_code() -> None:
 
 def test_the_changelog_keeps_its_form() -> None:
     text = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
-    assert re.findall(r"(?m)^## (.*)", text)[0] == "[Unreleased]"
+    first, *releases = re.findall(r"(?m)^## (.*)", text)
+    assert first == "[Unreleased]"
+    assert all(re.fullmatch(r"\[\d+\.\d+\.\d+\] - \d{4}-\d{2}-\d{2}", release) for release in releases)
+    assert releases[0].startswith(f"[{gsbake.__version__}]")
     assert set(re.findall(r"(?m)^### (.*)", text)) <= {"Added", "Changed", "Deprecated", "Removed", "Fixed", "Security"}
 
 

@@ -13,7 +13,6 @@ from __future__ import annotations
 import hashlib
 import importlib.util
 import subprocess
-import sys
 import tempfile
 import venv
 import zipfile
