@@ -26,6 +26,7 @@ _FITTED_THREADS = 2
 #: Room above the largest memory that was measured, and above that of a formula.
 _MEMORY_MARGIN, _MEMORY_MARGIN_OF_FORMULA = 1.2, 1.5
 
+
 @dataclass(frozen=True)
 class Estimate:
     """Expected seconds, and megabytes of memory to reserve.

@@ -30,7 +30,7 @@ class Trust:
 
 
 #: After runs with the same settings, after runs with others, and after none.
-SAME, OTHER, FORMULA = Trust(0.5, 1.0), Trust(0.2, 0.5), Trust(0.05, 0.0)
+SAME, OTHER, FORMULA = Trust(0.15, 0.5), Trust(0.1, 0.25), Trust(0.05, 0.0)
 
 
 class TimeLeft:
