@@ -18,13 +18,13 @@ import shlex
 import subprocess
 import tempfile
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass, fields, replace
-from datetime import UTC, datetime
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from benchmarks.csv_rows import today
 from gsbake.capture.posed_photos import PosedPhotos
 from gsbake.geometry.ply import read_mesh
 from gsbake.gltf.document import decode_image
@@ -55,7 +55,7 @@ class Row:
     commit: str = ""
     host: str = ""
     seed: int = 0
-    date: str = ""
+    date: str = field(default_factory=today)
 
 
 def rows_of(out: Path, commit: str) -> list[Row]:
@@ -68,7 +68,7 @@ def rows_of(out: Path, commit: str) -> list[Row]:
     manifest = json.loads((stages["targets"] / "manifest.json").read_text())
     capture = Path(json.loads((out / "project.json").read_text())["photos"])
     name = capture.parent.name if capture.name in ("images", "photos") else capture.name
-    common = {"commit": commit, "host": f"{platform.node()}: {manifest['host'].get('cpu', '')}", "seed": _seed(out), "date": _today()}
+    common = {"commit": commit, "host": f"{platform.node()}: {manifest['host'].get('cpu', '')}", "seed": _seed(out)}
     listed: dict[str, dict[str, Any]] = {"asset.glb": {"target": "default", "level": 0}} | json.loads(
         (stages["targets"] / "targets.json").read_text()
     )
@@ -169,10 +169,6 @@ def _newest(out: Path, stage: str) -> Path:
 
 def _seed(out: Path) -> int:
     return int(json.loads((out / "project.json").read_text()).get("seed") or 0)
-
-
-def _today() -> str:
-    return datetime.now(UTC).date().isoformat()
 
 
 def main() -> None:
