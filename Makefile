@@ -32,7 +32,7 @@ FUZZ_INPUTS ?= 10000
 WORKERS ?= 2
 QUICK := -m "not slow and not stress" --numprocesses $(WORKERS) --dist loadfile --no-loadscope-reorder
 
-.PHONY: help setup node demo docs test coverage check bench stress score lock audit sbom clean
+.PHONY: help setup node demo docs lab test coverage check bench stress score lock audit sbom clean
 
 help: ## Show this
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 10
@@ -63,6 +63,9 @@ demo: setup ## Bake the built-in capture with the smallest profile
 
 docs: setup ## Build the documentation into site/ (open site/index.html)
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet --strict
+
+lab: setup ## Write the tables of docs/lab from benchmarks/results
+	$(BIN)/python -m benchmarks.lab
 
 check: setup ## Lint and types
 	$(BIN)/ruff check .

@@ -140,20 +140,6 @@ def read_csv(path: Path) -> list[Row]:
         return [_row(line) for line in csv.DictReader(file)]
 
 
-def markdown(rows: Iterable[Row]) -> str:
-    """The rows as a Markdown table."""
-    lines = ["| capture | target | level | bytes | triangles | texels | chamfer to the dense mesh | relit PSNR | with a gain per channel |"]
-    lines.append("|---|---|---|---|---|---|---|---|---|")
-    for row in rows:
-        psnr = ["–" if value is None else f"{value:.2f} dB" for value in (row.relight_psnr, row.relight_psnr_scaled)]
-        lines.append(
-            f"| {row.capture} | `{row.target}` | {row.level} | {row.bytes} | {row.triangles} | {row.texture}² | {row.chamfer_pct:.3f} % | "
-            + " | ".join(psnr)
-            + " |"
-        )
-    return "\n".join(lines) + "\n"
-
-
 def _row(line: dict[str, str]) -> Row:
     whole = {k: int(line[k]) for k in ("level", "bytes", "triangles", "texture", "seed")}
     real = {k: float(line[k]) if line[k] else None for k in ("chamfer_pct", "relight_psnr", "relight_psnr_scaled")}
@@ -172,7 +158,7 @@ def _seed(out: Path) -> int:
 
 
 def main() -> None:
-    """Measure, write the CSV file and print the table."""
+    """Measure and write the CSV file."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("runs", nargs="+", type=Path)
     parser.add_argument("--score", help="interpreter and script of the independent scorer")
@@ -189,7 +175,7 @@ def main() -> None:
             wanted = row.file in options.render or (not options.render and row.level == 0)
             if options.score and str(out) in truths and wanted:
                 write_csv(options.results, [scored(row, out, Path(truths[str(out)]), shlex.split(options.score))])
-    print(markdown(read_csv(options.results)))
+    print(f"The rows are in {options.results}; `make lab` writes the tables.")
 
 
 if __name__ == "__main__":
