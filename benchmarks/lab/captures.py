@@ -44,7 +44,7 @@ def skip(results: Path) -> Table:
         if rule not in Skip.model_fields:
             continue
         whole = known[capture, profile, "all", "auto"]
-        done, left = (known.get((capture, profile, rule, mode), whole) for mode in ("never", "always"))
+        done, left = (known.get((capture, profile, rule, mode), whole) for mode in ("keep", "skip"))
         lines += [done, left]
         columns = (("cpu_s", 0), ("chamfer_pct", 3), ("psnr", 1), ("megabytes", 2))
         figures = [change(done[name], left[name], digits) for name, digits in columns]

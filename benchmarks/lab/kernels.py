@@ -85,7 +85,7 @@ def bytes_(results: Path) -> Table:
         counts = (str(sum(int(x[column]) for x in found)) for column in ("files", "different"))
         rows.append([capture, profile, f"{found[0]['stage']} to {found[-1]['stage']}", threads.replace(" ", ", "), *counts])
     headings = ("capture", "profile", "stages", "threads", "files", "that differ")
-    command = "python -m benchmarks.reproducibility CAPTURE --runs 2 --threads 2 --threads 1 --target export --profile smoke"
+    command = "python -m benchmarks.reproducibility CAPTURE --runs 2 --threads 2 --threads 1 --until export --profile smoke"
     return Table(command, headings, rows, lines)
 
 
