@@ -38,7 +38,7 @@ FUZZ_INPUTS ?= 10000
 WORKERS ?= 2
 QUICK := -m "not slow and not stress" --numprocesses $(WORKERS) --dist loadfile --no-loadscope-reorder
 
-.PHONY: help setup kernels node demo docs test coverage check bench stress score lock audit sbom clean
+.PHONY: help setup kernels node demo docs lab test coverage check bench stress score lock audit sbom clean
 
 help: ## Show this
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 10
@@ -74,6 +74,9 @@ demo: $(RUNTIME) ## Bake the built-in capture with the smallest profile
 
 docs: setup ## Build the documentation into site/ (open site/index.html)
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet --strict
+
+lab: setup ## Write the tables of docs/lab from benchmarks/results
+	$(BIN)/python -m benchmarks.lab
 
 # The types of everything for this system, and for macOS and Windows of what depends on the system (tests/system/test_one_place.py keeps it
 # there). Caches apart, or each would throw the others' away.

@@ -22,14 +22,14 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
 import numpy as np
 
-from benchmarks.csv_rows import read_rows, write_rows
+from benchmarks.csv_rows import read_rows, today, write_rows
 from benchmarks.materials import truth_subset
 from benchmarks.objects.__main__ import FIGURES, PYTHON, SCORER, current_commit, score
 from benchmarks.timeline import ROOT
@@ -82,6 +82,7 @@ class Row:
     base_scaled: float
     roughness: float
     metallic: float
+    date: str = field(default_factory=today)
 
     @property
     def key(self) -> tuple[str, ...]:

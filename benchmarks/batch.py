@@ -25,10 +25,11 @@ import subprocess
 import sys
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from statistics import median
 
+from benchmarks.csv_rows import today
 from benchmarks.timeline import ROOT
 from gsbake.batch.records import all_records
 from gsbake.python_process import python_command, python_environment
@@ -54,6 +55,7 @@ class Row:
     jobs: float
     busy: float
     load: float
+    date: str = field(default_factory=today)
 
 
 @dataclass(frozen=True)

@@ -1,12 +1,18 @@
-"""CSV files of benchmark rows: dataclasses of texts, whole numbers and floats, of which those with one `key` replace each other."""
+"""CSV files of benchmark rows: dataclasses of texts, whole numbers and floats (or None). Rows of one `key` replace each other."""
 
 from __future__ import annotations
 
 import csv
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, fields
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, ClassVar, Protocol, TypeVar
+
+
+def today() -> str:
+    """Today's date (UTC), year first."""
+    return datetime.now(UTC).date().isoformat()
 
 
 class KeyedRow(Protocol):
@@ -26,9 +32,14 @@ def read_rows(path: Path, kind: type[AnyRow]) -> list[AnyRow]:
     """The rows of a CSV file written by `write_rows`; none when it does not exist."""
     if not path.is_file():
         return []
-    parsers: dict[str, Callable[[str], Any]] = {f.name: {"int": int, "float": float}.get(str(f.type), str) for f in fields(kind)}
+    kinds: dict[str, Callable[[str], Any]] = {"int": int, "float": float, "float | None": _optional}
+    parsers = {f.name: kinds.get(str(f.type), str) for f in fields(kind)}
     with path.open(newline="") as file:
         return [kind(**{name: parsers[name](value) for name, value in line.items()}) for line in csv.DictReader(file)]
+
+
+def _optional(text: str) -> float | None:
+    return float(text) if text else None
 
 
 def write_rows(path: Path, rows: Sequence[KeyedRow]) -> None:

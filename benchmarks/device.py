@@ -17,6 +17,8 @@ from typing import Any
 
 import torch
 
+from benchmarks.csv_rows import today
+from benchmarks.fields import commit
 from benchmarks.raster import sphere
 from gsbake.config.schema import Profile
 from gsbake.pipeline.machine import missing_cuda_requirement
@@ -166,9 +168,10 @@ def main() -> int:
         print("  ".join(f"{v:18.2f}" for v in row.values()))
     if args.csv:
         with open(args.csv, "w", newline="") as file:
-            writer = csv.DictWriter(file, list(rows[0]))
+            origin = {"commit": commit(), "host": f"{torch.cuda.get_device_name()}, torch {torch.__version__}", "date": today()}
+            writer = csv.DictWriter(file, [*rows[0], *origin])
             writer.writeheader()
-            writer.writerows(rows)
+            writer.writerows(row | origin for row in rows)
     return 0
 
 

@@ -21,7 +21,7 @@ import platform
 import shutil
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +29,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from benchmarks.csv_rows import today
 from benchmarks.fields import KEY, commit, parse, run_options, write
 from benchmarks.timeline import ROOT
 from benchmarks.truth import Surface, camera_frame, nearest, nearest_on_faces, read_centres, read_truth
@@ -75,6 +76,7 @@ class Row:
     counts: str
     commit: str = ""
     host: str = ""
+    date: str = field(default_factory=today)
 
 
 class StopAt(SilentMonitor):

@@ -14,10 +14,11 @@ import argparse
 import csv
 import sys
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from statistics import mean
 
+from benchmarks.csv_rows import today
 from benchmarks.farm_costs import RESULTS as COSTS
 from benchmarks.farm_costs import Costs, read_costs
 from benchmarks.farm_model import Farm, Result, simulate
@@ -66,6 +67,7 @@ class Row:
     coordinator_use: float
     jobs: int
     failures: float
+    date: str = field(default_factory=today)
 
 
 def farm(costs: Costs, nodes: int) -> Farm:

@@ -24,12 +24,13 @@ import subprocess
 import sys
 import tomllib
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from benchmarks.csv_rows import today
 from benchmarks.skip import CpuClock
 from benchmarks.timeline import BUILT_IN, CAPTURES, ROOT, manifests, names
 from benchmarks.truth import measure_stage, read_truth
@@ -74,6 +75,7 @@ class Row:
     failed: str = ""
     commit: str = ""
     host: str = ""
+    date: str = field(default_factory=today)
 
 
 def commit() -> str:

@@ -18,10 +18,11 @@ import csv
 import math
 import sys
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 
 from benchmarks.charts import COLOURS, Panel, Series, write
+from benchmarks.csv_rows import today
 from benchmarks.step import profile
 from gsbake.api import RunOptions, open_session
 from gsbake.kernels.threads import configure
@@ -51,6 +52,7 @@ class Cell:
     seconds: float
     peak_mb: float | None = None
     per_doubling: float | None = None
+    date: str = field(default_factory=today)
 
 
 def per_doubling(before: tuple[float, float], after: tuple[float, float]) -> float:
@@ -65,7 +67,7 @@ def with_doublings(cells: Sequence[Cell]) -> list[Cell]:
         last = out[-1] if out and (out[-1].axis, out[-1].what) == (cell.axis, cell.what) else None
         power = 2 if cell.axis == "resolution" else 1
         ratio = None if last is None else per_doubling((last.size**power, last.seconds), (cell.size**power, cell.seconds))
-        out.append(Cell(cell.axis, cell.what, cell.size, cell.seconds, cell.peak_mb, ratio))
+        out.append(replace(cell, per_doubling=ratio))
     return out
 
 
@@ -125,7 +127,10 @@ def read_csv(path: Path) -> list[Cell]:
         return []
     with path.open(newline="") as file:
         return [
-            Cell(line["axis"], line["what"], int(line["size"]), float(line["seconds"]), float(line["peak_mb"]) if line["peak_mb"] else None)
+            Cell(
+                line["axis"], line["what"], int(line["size"]), float(line["seconds"]),
+                float(line["peak_mb"]) if line["peak_mb"] else None, date=line["date"],
+            )  # fmt: skip
             for line in csv.DictReader(file)
         ]
 

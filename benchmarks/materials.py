@@ -24,10 +24,11 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
+from benchmarks.csv_rows import today
 from benchmarks.maps import measure_maps
 from benchmarks.skip import CpuClock, reuse, write
 from benchmarks.timeline import CAPTURES, ROOT, manifests, names
@@ -71,6 +72,7 @@ class Row:
     albedo_psnr_scaled: float | None = None
     roughness_rmse: float | None = None
     metallic_rmse: float | None = None
+    date: str = field(default_factory=today)
 
 
 def truth_subset(truth: Path, views: int, folder: Path) -> Path:
@@ -126,7 +128,7 @@ def measure(folder: Path, profile: str, row: str, overrides: Sequence[str], out:
 
 
 def markdown(rows: Sequence[Row]) -> str:
-    """The rows as the table of docs/lab/materials.md."""
+    """The rows as a table."""
 
     def text(value: float | None, form: str) -> str:
         return "–" if value is None else format(value, form)

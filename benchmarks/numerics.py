@@ -1,18 +1,21 @@
-"""Error of the float32 kernels against the float64 reference over scales and fields of view; writes the table of docs/lab/numerics.md.
+"""Error of the float32 kernels against the float64 reference over scales and fields of view.
 
-python -m benchmarks.numerics [--doc docs/lab/numerics.md]
+python -m benchmarks.numerics [--csv FILE]
 """
 
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import math
 import sys
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
+from benchmarks.csv_rows import today, write_rows
 from gsbake.surfels.raster.projection import Pinhole
 from gsbake.surfels.raster.rasterise import render
 from gsbake.surfels.raster.reference import render_reference
@@ -21,7 +24,25 @@ SCALES = (1e-8, 1e-4, 1e-2, 1e-1, 1.0, 1e4)
 FIELDS = (1.0, 20.0, 50.0, 90.0, 150.0, 170.0)
 SURFELS, WIDTH, HEIGHT, SEEDS = 60, 61, 47, 3
 PLANES = ("features", "depth", "alpha", "distortion")
-BEGIN, END = "<!-- table: begin -->", "<!-- table: end -->"
+RESULTS = Path(__file__).parent / "results" / "numerics.csv"
+
+
+@dataclass(frozen=True)
+class Row:
+    """One scale (against the unit frame at distance 3) and field of view in degrees, the worst of the seeds: relative RMS error of the
+    colours, share of pixels off by more than 1e-4 of the brightest, relative RMS error of the worst other plane."""
+
+    scale: float
+    field: float
+    colour: float
+    off: float
+    other: float
+    date: str = dataclasses.field(default_factory=today)
+
+    @property
+    def key(self) -> tuple[str, ...]:
+        """Rows of one scale and field of view replace each other."""
+        return str(self.scale), str(self.field)
 
 
 def scene(scale: float, field: float, seed: int) -> tuple[list[Tensor], Pinhole]:
@@ -60,29 +81,20 @@ def errors(scale: float, field: float) -> tuple[float, float, float]:
     return max(colour, default=0.0), max(off, default=0.0), max(other, default=0.0)
 
 
-def table() -> str:
-    """The markdown table over the grid."""
-    lines = ["| scale | " + " | ".join(f"{f:g}°" for f in FIELDS) + " |", "|---" * (len(FIELDS) + 1) + "|"]
-    for scale in SCALES:
-        cells = []
-        for field in FIELDS:
-            colour, off, other = errors(scale, field)
-            cells.append(f"{colour:.0e} · {other:.0e} · {100 * off:.2g} %")
-        lines.append(f"| {scale:g} | " + " | ".join(cells) + " |")
-    return "\n".join(lines)
+def rows() -> list[Row]:
+    """The whole grid."""
+    return [Row(scale, angle, *errors(scale, angle)) for scale in SCALES for angle in FIELDS]
 
 
 def main() -> None:
-    """Measure and write the table between its markers."""
+    """Measure, print and write the rows."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--doc", type=Path, default=Path(__file__).parent.parent / "docs" / "lab" / "numerics.md")
-    args = parser.parse_args()
-    made = table()
-    sys.stdout.write(made + "\n")
-    text = args.doc.read_text(encoding="utf-8")
-    head, _, rest = text.partition(BEGIN)
-    tail = rest.partition(END)[2]
-    args.doc.write_text(f"{head}{BEGIN}\n\n{made}\n\n{END}{tail}", encoding="utf-8")
+    parser.add_argument("--csv", type=Path, default=RESULTS)
+    options = parser.parse_args()
+    found = rows()
+    write_rows(options.csv, found)
+    for row in found:
+        sys.stdout.write(f"{row.scale:g}, {row.field:g}°: {row.colour:.0e}, other planes {row.other:.0e}, {100 * row.off:.2g} % off\n")
 
 
 if __name__ == "__main__":

@@ -1,8 +1,9 @@
 """Whether runs of one capture with one seed write the same bytes: digests of every stage's files, and its seconds.
 
 python -m benchmarks.reproducibility CAPTURE [--runs 3] [--threads 2 --threads 1] [--until poses] [--profile preview] [--set KEY=VALUE …]
+    [--csv FILE]
 
-The report is left out: it shows run times.
+Writes a row per stage to the CSV file, where rows of other captures and stages stay. The report is left out: it shows run times.
 """
 
 from __future__ import annotations
@@ -11,10 +12,11 @@ import argparse
 import sys
 import tempfile
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import gsbake
+from benchmarks.csv_rows import read_rows, today, write_rows
 
 
 @dataclass(frozen=True)
@@ -26,6 +28,25 @@ class StageFiles:
 
 
 Run = Mapping[str, StageFiles]
+RESULTS = Path(__file__).parent / "results" / "reproducibility.csv"
+
+
+@dataclass(frozen=True)
+class Row:
+    """One stage of one capture: threads of the runs, number of files, and how many of them are not the same in all runs."""
+
+    capture: str
+    profile: str
+    stage: str
+    threads: str
+    files: int
+    different: int
+    date: str = field(default_factory=today)
+
+    @property
+    def key(self) -> tuple[str, ...]:
+        """Rows of one stage of one capture replace each other."""
+        return self.capture, self.profile, self.stage
 
 
 def measure(capture: Path, out: Path, threads: int, until: str, profile: str, settings: Mapping[str, str]) -> Run:
@@ -59,6 +80,12 @@ def table(runs: Sequence[Run], threads: Sequence[int]) -> str:
     return "\n".join(lines)
 
 
+def rows(capture: str, profile: str, runs: Sequence[Run], threads: Sequence[int]) -> list[Row]:
+    """A row per stage."""
+    counts = " ".join(str(count) for count in threads)
+    return [Row(capture, profile, stage, counts, len(runs[0][stage].files), len(names)) for stage, names in differing(runs).items()]
+
+
 def main() -> None:
     """Run the capture several times and print the table; exit code 1 when anything differs."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
@@ -68,6 +95,7 @@ def main() -> None:
     parser.add_argument("--until", default="poses")
     parser.add_argument("--profile", default="preview")
     parser.add_argument("--set", action="append", default=[], dest="settings", metavar="KEY=VALUE")
+    parser.add_argument("--csv", type=Path, default=RESULTS)
     args = parser.parse_args()
     counts = [(args.threads or [2])[k % len(args.threads or [2])] for k in range(args.runs)]
     settings = dict(text.split("=", 1) for text in args.settings)
@@ -76,6 +104,7 @@ def main() -> None:
             measure(args.capture, Path(folder) / str(k), count, args.until, args.profile, settings) for k, count in enumerate(counts)
         ]  # fmt: skip
     sys.stdout.write(table(runs, counts) + "\n")
+    write_rows(args.csv, [*read_rows(args.csv, Row), *rows(args.capture.name, args.profile, runs, counts)])
     sys.exit(1 if any(differing(runs).values()) else 0)
 
 

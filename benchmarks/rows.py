@@ -7,11 +7,12 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Literal
 
 from benchmarks.charts import Panel, Point, Series, pareto, write
+from benchmarks.csv_rows import today
 from benchmarks.truth import Figures
 
 #: {initialisation: colour index}, and colour indices of other tools.
@@ -40,6 +41,7 @@ class Row:
     psnr: float | None = None
     peak_mb: float | None = None
     source: Literal["measured", "quoted"] = "measured"
+    date: str = field(default_factory=today)
 
     def with_figures(self, figures: Figures) -> Row:
         """The row with a mesh's figures."""

@@ -21,10 +21,11 @@ import resource
 import shutil
 import sys
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+from benchmarks.csv_rows import today
 from benchmarks.timeline import BUILT_IN, ROOT, find_capture, manifests, names
 from benchmarks.truth import measure_stage, read_truth
 from gsbake.api import RunOptions, open_session
@@ -59,6 +60,7 @@ class Row:
     normal_deg: float | None = None
     psnr: float | None = None
     megabytes: float | None = None
+    date: str = field(default_factory=today)
 
 
 class CpuClock(Observer):

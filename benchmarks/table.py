@@ -24,6 +24,7 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.csv_rows import today
 from benchmarks.raster import sphere
 from benchmarks.step import profile
 from gsbake.kernels.threads import configure, thread_count
@@ -31,7 +32,7 @@ from gsbake.surfels.raster.rasterise import render
 from gsbake.surfels.raster.reference import render_reference
 
 RESULTS = Path(__file__).parent / "results" / "raster.csv"
-COLUMNS = ("surfels", "size", "channels", "pass", "ms", "x_copy", "x_twin", "threads")
+COLUMNS = ("surfels", "size", "channels", "pass", "ms", "x_copy", "x_twin", "threads", "date")
 SMALL = (500, 64, 3)
 
 
@@ -95,7 +96,7 @@ def rows(surfels: int, size: int, channels: int, materials: bool, repeats: int) 
     forward, backward = passes(surfels, size, channels, repeats)
     step = profile(surfels, size, materials, repeats)
     read, back = min_bytes(surfels, size, channels)
-    cell = {"surfels": surfels, "size": size, "channels": channels, "x_twin": "", "threads": thread_count()}
+    cell = {"surfels": surfels, "size": size, "channels": channels, "x_twin": "", "threads": thread_count(), "date": today()}
     all_ = read + back + 16 * state_floats(surfels, materials)
     figures = (("forward", forward, read), ("backward", backward, back), ("step", step["step"], all_))
     made = [cell | {"pass": k, "ms": round(ms, 2), "x_copy": round(ms / copy_ms(b, repeats), 1)} for k, ms, b in figures]
@@ -105,7 +106,7 @@ def rows(surfels: int, size: int, channels: int, materials: bool, repeats: int) 
 def small_rows() -> list[dict[str, object]]:
     """Rows of the small scene, with the ratio to the PyTorch reference."""
     ours, reference = passes(*SMALL, repeats=9), passes(*SMALL, repeats=2, reference=True)
-    cell = {"surfels": SMALL[0], "size": SMALL[1], "channels": SMALL[2], "threads": thread_count()}
+    cell = {"surfels": SMALL[0], "size": SMALL[1], "channels": SMALL[2], "threads": thread_count(), "date": today()}
     made = []
     for name, ms, slow, size in zip(("forward", "backward"), ours, reference, min_bytes(*SMALL), strict=True):
         made.append(cell | {"pass": name, "ms": round(ms, 2), "x_copy": round(ms / copy_ms(size, 9), 1), "x_twin": round(slow / ms, 1)})

@@ -18,13 +18,13 @@ import shlex
 import subprocess
 import tempfile
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass, fields, replace
-from datetime import UTC, datetime
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from benchmarks.csv_rows import today
 from gsbake.capture.posed_photos import PosedPhotos
 from gsbake.geometry.ply import read_mesh
 from gsbake.gltf.document import decode_image
@@ -55,7 +55,7 @@ class Row:
     commit: str = ""
     host: str = ""
     seed: int = 0
-    date: str = ""
+    date: str = field(default_factory=today)
 
 
 def rows_of(out: Path, commit: str) -> list[Row]:
@@ -68,7 +68,7 @@ def rows_of(out: Path, commit: str) -> list[Row]:
     manifest = json.loads((stages["targets"] / "manifest.json").read_text())
     capture = Path(json.loads((out / "project.json").read_text())["photos"])
     name = capture.parent.name if capture.name in ("images", "photos") else capture.name
-    common = {"commit": commit, "host": f"{platform.node()}: {manifest['host'].get('cpu', '')}", "seed": _seed(out), "date": _today()}
+    common = {"commit": commit, "host": f"{platform.node()}: {manifest['host'].get('cpu', '')}", "seed": _seed(out)}
     listed: dict[str, dict[str, Any]] = {"asset.glb": {"target": "default", "level": 0}} | json.loads(
         (stages["targets"] / "targets.json").read_text()
     )
@@ -140,20 +140,6 @@ def read_csv(path: Path) -> list[Row]:
         return [_row(line) for line in csv.DictReader(file)]
 
 
-def markdown(rows: Iterable[Row]) -> str:
-    """The rows as a Markdown table."""
-    lines = ["| capture | target | level | bytes | triangles | texels | chamfer to the dense mesh | relit PSNR | with a gain per channel |"]
-    lines.append("|---|---|---|---|---|---|---|---|---|")
-    for row in rows:
-        psnr = ["–" if value is None else f"{value:.2f} dB" for value in (row.relight_psnr, row.relight_psnr_scaled)]
-        lines.append(
-            f"| {row.capture} | `{row.target}` | {row.level} | {row.bytes} | {row.triangles} | {row.texture}² | {row.chamfer_pct:.3f} % | "
-            + " | ".join(psnr)
-            + " |"
-        )
-    return "\n".join(lines) + "\n"
-
-
 def _row(line: dict[str, str]) -> Row:
     whole = {k: int(line[k]) for k in ("level", "bytes", "triangles", "texture", "seed")}
     real = {k: float(line[k]) if line[k] else None for k in ("chamfer_pct", "relight_psnr", "relight_psnr_scaled")}
@@ -171,12 +157,8 @@ def _seed(out: Path) -> int:
     return int(json.loads((out / "project.json").read_text()).get("seed") or 0)
 
 
-def _today() -> str:
-    return datetime.now(UTC).date().isoformat()
-
-
 def main() -> None:
-    """Measure, write the CSV file and print the table."""
+    """Measure and write the CSV file."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("runs", nargs="+", type=Path)
     parser.add_argument("--score", help="interpreter and script of the independent scorer")
@@ -193,7 +175,7 @@ def main() -> None:
             wanted = row.file in options.render or (not options.render and row.level == 0)
             if options.score and str(out) in truths and wanted:
                 write_csv(options.results, [scored(row, out, Path(truths[str(out)]), shlex.split(options.score))])
-    print(markdown(read_csv(options.results)))
+    print(f"The rows are in {options.results}; `make lab` writes the tables.")
 
 
 if __name__ == "__main__":

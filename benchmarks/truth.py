@@ -179,13 +179,17 @@ def camera_frame(centres: Mapping[str, Array], truth: Truth) -> Similarity:
 
 
 def align(surface: Surface, centres: Mapping[str, Array], truth: Truth) -> Similarity:
-    """Similarity from a reconstruction to the ground truth: from camera `centres`, then ICP with a shrinking distance threshold.
+    """`align_points` of points on a reconstructed surface."""
+    return align_points(surface.sample(ALIGNMENT_POINTS[0], 5)[0], centres, truth)
+
+
+def align_points(points: Array, centres: Mapping[str, Array], truth: Truth) -> Similarity:
+    """Similarity from a reconstruction to the ground truth: from camera `centres`, then ICP of `points` (n, 3) with a shrinking threshold.
 
     Raises UsageError when fewer than three cameras match by name.
     """
     frame = camera_frame(centres, truth)
     reach = 0.05 * truth.surface.diagonal
-    points = surface.sample(ALIGNMENT_POINTS[0], 5)[0]
     anchors = truth.surface.sample(ALIGNMENT_POINTS[1], 6)[0]
     tree = cKDTree(anchors)
     for _ in range(30):

@@ -45,7 +45,7 @@ MAX_THREADS = 512
 
 @dataclass(frozen=True)
 class RunOptions:
-    """Options of a run; None stands for the value stored in the output folder, else the default.
+    """Options of a run, those of `run`; None stands for the value stored in the output folder, else the default.
 
     `overrides` are settings as "section.key=value", added to the stored ones; `threads` = 0 uses the physical cores.
     `store` names a shared store, a folder or URL, which is not stored; None takes the variable GSBAKE_STORE.
@@ -65,7 +65,10 @@ class RunOptions:
 
 @dataclass(frozen=True)
 class Session:
-    """A run ready to start: the engine, the stored options (`project`), the profile, the output folder and the shared store."""
+    """A run ready to start: the engine, the stored options (`project`), the profile, the output folder and the shared store.
+
+    `engine.plan()` says what each stage would do; nothing is computed or written before `run`.
+    """
 
     engine: Engine
     project: Project
@@ -77,7 +80,10 @@ class Session:
         """Bring the stages up to `until` (None: all) up to date and publish the results in the output folder, those of finished stages
         also where a later one fails.
 
-        Raises what `Engine.run` raises.
+        Raises:
+            UsageError: There is no such stage, or no target files are set.
+            BadInputError: A stage cannot use the data, or the output folder cannot be written.
+            InterruptedRun: Stopped on request or by a fault that may pass.
         """
         if until == TARGETS and TARGETS not in self.engine.registry.names:
             raise UsageError("No target is set: name them, as in --target web,ar:usdz (settings: targets.files).")
@@ -116,7 +122,11 @@ class Result:
     stages: tuple[StageState, ...]
 
     def results(self, stage: str) -> Mapping[str, Any]:
-        """Results that a stage reported. Raises KeyError for a stage that was not part of the run."""
+        """Figures that a stage reported, for example `results("poses")["registered"]`.
+
+        Raises:
+            KeyError: The stage was not part of the run.
+        """
         for state in self.stages:
             if state.name == stage and state.artifact is not None:
                 found: Mapping[str, Any] = state.artifact.manifest.get("results", {})
@@ -145,25 +155,31 @@ def run(
     store: str | Path | None = None,
     observer: Observer | None = None,
 ) -> Result:
-    """Bake an asset from a folder of photos, or bring an earlier run in `out` up to date; returns the results.
+    """Bake an asset from a folder of photos, or bring an earlier run in `out` up to date.
 
-    Parameters
-    ----------
-    photos: folder of photos, or a capture folder with images/, masks/ and poses; needed in the first call only.
-    out: output folder; default out/<name of photos>.
-    profile: name of a profile, or path of a TOML file; default "relight".
-    settings: {"section.key": value} that override the profile, for example {"mesh.faces": 10000}.
-    masks, poses: paths of masks and known poses outside the capture folder.
-    until: last stage to run, for example "mesh"; None runs all.
-    device: "auto", "cpu" or "cuda".
-    threads: number of threads, at most 512; 0 uses the physical cores.
-    seed: seed of all random numbers, 0 to 2**31 − 1; default 0.
-    store: shared store, a folder or URL (file, s3, sftp); default: the environment variable GSBAKE_STORE, else none.
-    observer: receives progress, decisions and warnings.
+    Stages whose inputs, settings and code did not change are taken from `out`, and finished ones stay there when a later one fails.
 
-    Raises
-    ------
-    UsageError, BadInputError or InterruptedRun (`gsbake.errors`), each with one sentence that says what to do.
+    Args:
+        photos: Folder of photos, a video, or a capture folder with images/, masks/ and poses; needed in the first call only.
+        out: Output folder; default `out/<name of photos>`.
+        profile: Name of a profile, or path of a TOML file; default "relight".
+        settings: {"section.key": value} that override the profile, for example {"mesh.faces": 10000}.
+        masks: Masks outside the capture folder.
+        poses: Known poses outside the capture folder.
+        until: Last stage to run, for example "mesh"; None runs all.
+        device: "auto", "cpu" or "cuda".
+        threads: Number of threads, at most 512; 0 uses the physical cores.
+        seed: Seed of all random numbers, 0 to 2**31 − 1; default 0.
+        store: Shared store, a folder or URL (file, s3, sftp); default: the environment variable GSBAKE_STORE, else none.
+        observer: Receives progress, decisions and warnings.
+
+    Returns:
+        The published files and the state of every stage.
+
+    Raises:
+        UsageError: Arguments, settings or profile are wrong.
+        BadInputError: The photos cannot be used; trying again will not help.
+        InterruptedRun: Stopped on request or by a fault that may pass; the same call resumes.
     """
     overrides = [f"{key}={value if isinstance(value, str) else json.dumps(value)}" for key, value in (settings or {}).items()]
     options = RunOptions(_path(photos), _path(out), profile, overrides, _path(masks), _path(poses), device, threads, seed, _store(store))
@@ -173,10 +189,16 @@ def run(
 def open_session(options: RunOptions, observer: Observer | None = None, registry: Registry | None = None) -> Session:
     """Merge the options with those stored in the output folder; nothing is written.
 
-    `registry` holds other stages than gsbake's own.
+    With `photos` the stored options are discarded; without it they hold and the given ones are added.
 
-    With `photos` the stored options are discarded; without it they hold and the given ones are added. Raises UsageError when photos are
-    neither given nor stored, and for a seed or a number of threads out of range.
+    Args:
+        options: What to run on, where, and how.
+        observer: Receives the events of the run.
+        registry: Other stages than gsbake's own.
+
+    Raises:
+        UsageError: Photos are neither given nor stored, a profile or setting is wrong, a seed or number of threads is out of range.
+        BadInputError: The photos' folder has none.
     """
     out = options.out or _default_out(options.photos)
     stored = Project.load(out)
@@ -224,7 +246,11 @@ def open_session(options: RunOptions, observer: Observer | None = None, registry
 
 
 def open_store(out: Path | None) -> tuple[Store, tuple[str, ...]]:
-    """Artifacts of the run in `out` (None: the only run in ./out), and the names of the stages. Raises UsageError."""
+    """Artifacts of the run in `out` (None: the only run in ./out), and the names of the stages.
+
+    Raises:
+        UsageError: `out` holds no run, or there are several in ./out.
+    """
     out = out or _default_out(None)
     if not (out / "stages").is_dir():
         raise UsageError(f"'{out}' holds no run; name its folder with --out.")

@@ -17,11 +17,11 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from benchmarks.csv_rows import read_rows, write_rows
+from benchmarks.csv_rows import read_rows, today, write_rows
 from benchmarks.objects.entries import Entry, read_entries
 from benchmarks.timeline import ROOT
 from gsbake.errors import GsbakeError
@@ -51,7 +51,7 @@ class Row:
     host: str
     seconds: float
     chamfer_pct: float
-    normal_deg: float
+    normal_deg: float | None
     relit: float
     relit_scaled: float
     base: float
@@ -59,6 +59,7 @@ class Row:
     roughness: float
     metallic: float
     gains: str
+    date: str = field(default_factory=today)
 
     @property
     def key(self) -> tuple[str, ...]:

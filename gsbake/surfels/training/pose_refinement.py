@@ -26,7 +26,8 @@ from gsbake.surfels.training.trainer import Trainer
 
 #: Share of the run before the first correction, and between corrections (at least one step per training photo).
 START_SHARE, INTERVAL_SHARE = 0.3, 0.05
-#: Steps of a trial, as a share of the run; at least one per photo. Better poses need that long to improve surfels (docs/lab/capture.md).
+#: Steps of a trial, as a share of the run; at least one per photo. Better poses need that long to improve surfels
+#: (docs/decisions/0015-poses-kept.md).
 TRIAL_SHARE = 0.3
 #: Minimum pose error for a trial in pixels and as a share of the longer side (median over held-out photos): with exact poses, unfinished
 #: surfels measure .2 to .9 pixels of 400.

@@ -1,7 +1,7 @@
 """Training steps that can be skipped where stereo has confirmed the shape.
 
 Surfels initialised on confirmed depths are already near the surface, so training needs fewer steps. Freezing the confirmed surfels instead
-was measured to be worse (docs/lab/skip.md): training still improves them.
+was measured to be worse (docs/decisions/0028-skip-rules.md): training still improves them.
 """
 
 from __future__ import annotations

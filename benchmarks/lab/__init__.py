@@ -1,0 +1,1 @@
+"""Tables of the pages in docs/lab, written from the rows in benchmarks/results: `python -m benchmarks.lab`."""

@@ -1,0 +1,89 @@
+"""Tables of shape and materials: objects with known materials, parts of the fit, what each rule of the fit brings."""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Mapping
+from pathlib import Path
+
+from benchmarks.lab.tables import Line, Maker, Table, newest, number, pair, read, signed, spaced
+
+#: Names of the rows of `benchmarks.materials` that are shown.
+PARTS = {
+    "projected": "surfels' materials projected",
+    "fit": "texture fit, no priors, no shadows",
+    "reflections": "+ visibility, bounce, reflections",
+    "priors": "+ priors but sparsity",
+    "sparsity": "+ sparsity",
+}
+OBJECT_HEADINGS = ("object", "metal", "Chamfer %", "relit dB", "base colour dB", "roughness", "metallic", "measured")
+
+
+def _object(line: Line) -> list[str]:
+    maps = number(line["roughness"], 3), number(line["metallic"], 3)
+    shape = number(line["chamfer_pct"], 3)
+    return [spaced(line["object"]), line["metal"], shape, pair(line, "relit"), pair(line, "base"), *maps, line["date"]]
+
+
+def _objects(results: Path, photos: bool) -> list[Line]:
+    lines = [line for line in read(results, "objects") if line["profile"] == "relight" and not line["settings"]]
+    return sorted(newest((x for x in lines if x["object"].endswith("_photos") == photos), "object"), key=lambda x: x["object"])
+
+
+def objects(results: Path) -> Table:
+    """The newest row of every object from given poses and masks, and their medians."""
+    lines = _objects(results, photos=False)
+    rows = [_object(line) for line in lines]
+
+    def median(column: str) -> str:
+        return str(statistics.median(float(line[column]) for line in lines))
+
+    columns = ("chamfer_pct", "relit", "relit_scaled", "base", "base_scaled", "roughness", "metallic")
+    rows.append(_object({"object": "**median**", "metal": "", "date": ""} | {column: median(column) for column in columns}))
+    return Table("python -m benchmarks.objects OUT", OBJECT_HEADINGS, rows, lines)
+
+
+def objects_alone(results: Path) -> Table:
+    """The newest row of every object on a table, from photos alone."""
+    lines = _objects(results, photos=True)
+    command = f"python -m benchmarks.objects OUT --only {','.join(line['object'] for line in lines)}"
+    return Table(command, OBJECT_HEADINGS, [_object(line) for line in lines], lines)
+
+
+def parts(results: Path) -> Table:
+    """Rows of `benchmarks.materials`, each with everything of the one above."""
+    lines = newest((x for x in read(results, "materials") if x["row"] in PARTS), "capture", "row")
+    rows = []
+    for line in lines:
+        relit = f"{number(line['relight_psnr'], 1)} ({number(line['relight_psnr_scaled'], 1)})"
+        maps = number(line["roughness_rmse"], 3), number(line["metallic_rmse"], 3)
+        figures = number(line["psnr"], 1), relit, number(line["albedo_psnr_scaled"], 1), *maps, number(line["cpu_s"], 0)
+        rows.append([line["capture"] if line["row"] == "projected" else "", PARTS[line["row"]], *figures])
+    headings = ("capture", "with", "held out dB", "relit dB", "base colour dB, with gains", "roughness", "metallic", "CPU s")
+    return Table("python -m benchmarks.materials --views 3", headings, rows, lines)
+
+
+def rules(results: Path) -> Table:
+    """What leaving out a rule of the fit changes: mean over the objects, and the objects that lose and gain most."""
+    lines = read(results, "ablation")
+    whole = {(line["object"], line["commit"]): line for line in lines if line["rule"] == "none"}
+    chosen = [x for x in newest((x for x in lines if x["rule"] != "none"), "object", "rule") if (x["object"], x["commit"]) in whole]
+    rows = []
+    for rule in sorted({line["rule"] for line in chosen}):
+        pairs = [(line, whole[line["object"], line["commit"]]) for line in chosen if line["rule"] == rule]
+
+        def shift(column: str, pairs: list[tuple[Line, Line]] = pairs) -> list[float]:
+            return [float(without[column]) - float(with_[column]) for without, with_ in pairs]
+
+        def both(column: str) -> str:
+            return f"{signed(statistics.mean(shift(column)), 1)} ({signed(statistics.mean(shift(column + '_scaled')), 1)})"
+
+        by_object = sorted(zip(shift("relit_scaled"), (spaced(line["object"]) for line, _ in pairs), strict=True))
+        (lowest, loser), (highest, winner) = by_object[0], by_object[-1]
+        ends = f"{signed(lowest, 1)} {loser}", f"{signed(highest, 1)} {winner}"
+        rows.append([rule, str(len(pairs)), both("relit"), both("base"), signed(statistics.mean(shift("metallic")), 3), *ends])
+    headings = ("left out", "objects", "relit dB", "base colour dB", "metallic", "most lost", "most gained")
+    return Table("python -m benchmarks.ablation RUNS CAPTURES OUT --views 4", headings, rows, chosen)
+
+
+TABLES: Mapping[str, Maker] = {"objects": objects, "objects alone": objects_alone, "parts": parts, "rules": rules}
