@@ -1,4 +1,4 @@
-"""Write the tables of docs/lab from the rows in benchmarks/results.
+"""Write the tables of docs/lab and of README.md from the rows in benchmarks/results.
 
 python -m benchmarks.lab [--pages DIR] [--results DIR]
 
@@ -13,7 +13,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from benchmarks.lab.pages import PAGES, RESULTS, PageError, filled
+from benchmarks.lab.pages import PAGES, README, RESULTS, PageError, filled
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -23,7 +23,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--results", type=Path, default=RESULTS)
     options = parser.parse_args(arguments)
     try:
-        for page in sorted(options.pages.glob("*.md")):
+        for page in (*sorted(options.pages.glob("*.md")), *([README] if options.pages == PAGES else [])):
             text = page.read_text(encoding="utf-8")
             if (made := filled(text, page.name, options.results)) != text:
                 page.write_text(made, encoding="utf-8")
