@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.support.slow import slow
 from tests.support.ssh_server import ServerUnavailable, SshServer
 
 
@@ -55,7 +56,7 @@ def ssh(tmp_path_factory: pytest.TempPathFactory) -> Iterator[SshServer]:
     server.kill()
 
 
-@pytest.fixture(params=["folder", "object server", pytest.param("SSH server", marks=pytest.mark.slow)])
+@pytest.fixture(params=["folder", slow("object server"), slow("SSH server")])
 def url(request: pytest.FixtureRequest, tmp_path: Path) -> str:
     if request.param == "folder":
         return str(tmp_path / "shared")

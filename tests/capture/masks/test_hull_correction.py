@@ -9,6 +9,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+import pytest
 
 from gsbake.capture.masks.hull_correction import apply_correction, correct_by_hull
 from gsbake.capture.photos.undistortion import undistort_points
@@ -87,6 +88,7 @@ def test_a_piece_with_the_colours_of_the_background_is_a_hole() -> None:
     assert (apply_correction(pierced, photo_of(pierced), certain, possible) == pierced).all()
 
 
+@pytest.mark.slow
 def test_the_correction_is_distorted_as_the_photo(tmp_path: Path) -> None:
     cameras = ring(distortion=(0.15, 0.0, 0.0, 0.0))
     truth = {c.name: torus_mask(c) for c in cameras}
