@@ -15,6 +15,7 @@ import tomllib
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import cache
 from importlib import resources
 from pathlib import Path
 from typing import Any, get_args
@@ -58,9 +59,10 @@ def load_profile(name: str = DEFAULT, overrides: Sequence[str] = ()) -> LoadedPr
     """
     values: dict[str, Any] = {}
     origins: dict[str, str] = {}
+    folder = next(iter(shipped().values())).parent
     for path in reversed(_chain(_find(name, None))):
         for key, value in _read(path).items():
-            origins[key] = path.stem if path.parent == _shipped_folder() else str(path)
+            origins[key] = path.stem if path.parent == folder else str(path)
             values[key] = present_value(key, value, origins[key])
     for text in overrides:
         key, value = _parse_override(text)
@@ -70,7 +72,8 @@ def load_profile(name: str = DEFAULT, overrides: Sequence[str] = ()) -> LoadedPr
     return LoadedProfile(name, _validate(values, origins), {key: origins.get(key, "default") for key in fields()})
 
 
-def fields() -> dict[str, FieldInfo]:
+@cache
+def fields() -> Mapping[str, FieldInfo]:
     """{"section.key": field} of every setting, and "description"."""
     out: dict[str, FieldInfo] = {}
     for name, info in Profile.model_fields.items():
@@ -95,10 +98,6 @@ def bounds(field: FieldInfo) -> str:
         return ""
     lower = f"from {limits['ge']}" if "ge" in limits else f"above {limits['gt']}, up"
     return f"a {'whole ' if kind is int else ''}number {lower} to {limits['le']}"
-
-
-def _shipped_folder() -> Path:
-    return next(iter(shipped().values())).parent
 
 
 def _find(name: str, relative_to: Path | None) -> Path:

@@ -61,6 +61,7 @@ def test_faults_of_photos(tmp_path: Path) -> None:
     assert of(findings, "sides").level == "advice" and figures["registered"] == 8
 
 
+@pytest.mark.slow
 def test_photos_that_do_not_register(tmp_path: Path) -> None:
     images = tmp_path / "images"
     images.mkdir()

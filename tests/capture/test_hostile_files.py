@@ -21,6 +21,7 @@ from gsbake.capture.poses.given import read_poses
 from gsbake.config.schema import Ingest
 from gsbake.errors import BadInputError
 from gsbake.imaging.png import write_png
+from tests.support.slow import slow
 
 SIZES = {"a.jpg": PhotoSize(200, 100)}
 POSE = np.eye(4).tolist()
@@ -217,9 +218,9 @@ def test_colmap_model_by_hand(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "change",
     [
-        {"points": struct.pack("<Q", 2**63)}, {"points": struct.pack("<Q", 2**40)}, {"points": b""}, {"name": b"\xff\xfe\x80.jpg"},
-        {"size": 0},
-        {"focal": 1e300}, {"focal": 0.0}, {"focal": float("nan")}, {"x": 1e308}, {"x": float("inf")}, {"size": 2**60},
+        {"points": struct.pack("<Q", 2**63)}, {"focal": float("nan")},
+        slow({"points": struct.pack("<Q", 2**40)}), slow({"points": b""}), slow({"name": b"\xff\xfe\x80.jpg"}), slow({"size": 0}),
+        slow({"focal": 1e300}), slow({"focal": 0.0}), slow({"x": 1e308}), slow({"x": float("inf")}), slow({"size": 2**60}),
     ],
 )  # fmt: skip
 def test_hostile_colmap_model(tmp_path: Path, change: dict[str, Any]) -> None:
@@ -230,6 +231,7 @@ def test_hostile_colmap_model(tmp_path: Path, change: dict[str, Any]) -> None:
     assert "\n" not in str(caught.value) and time.monotonic() - begin < 60
 
 
+@pytest.mark.slow
 def test_many_frames_are_matched_in_linear_time() -> None:
     photos = [f"{k:06d}.jpg" for k in range(20_000)]
     index = PhotoIndex(photos)

@@ -19,6 +19,7 @@ from gsbake.geometry.cameras import Camera, CameraSet
 from gsbake.geometry.ply import write_cloud
 from tests.capture.conftest import Done, Runner
 from tests.support.cameras import look_at
+from tests.support.slow import slow
 
 
 def textured_board(size: int = 600) -> np.ndarray[Any, np.dtype[np.uint8]]:
@@ -96,19 +97,19 @@ def test_solved_poses_are_the_true_ones(tmp_path: Path, runner: Runner) -> None:
     assert ups[:, 2].mean() > 0.5
 
 
-@pytest.mark.parametrize("given", [False, True], ids=["solved", "given"])
+@pytest.mark.parametrize("given", [slow(False, id="solved"), pytest.param(True, id="given")])
 def test_the_same_bytes_with_any_number_of_threads(tmp_path: Path, runner: Runner, given: bool) -> None:
     true = board_capture(tmp_path / "cap")
     if given:
         transforms(tmp_path / "cap", true)
     runner.ingest(tmp_path / "cap")
     digests = []
-    for k, threads in enumerate((2, 3, 1)):
+    for k, threads in enumerate((2, 1)):
         _, done = runner.poses(out=f"poses {k}", threads=threads, max_features=1000)
         files = [path for path in done.out.rglob("*") if path.is_file()]
         digests.append({path.relative_to(done.out).as_posix(): sha256(path.read_bytes()).hexdigest() for path in files})
     assert {"points.ply", "cameras.json", "sparse/images.bin", "sparse/points3D.bin"} <= set(digests[0])
-    assert digests[0] == digests[1] and digests[0] == digests[2]
+    assert digests[0] == digests[1]
 
 
 def test_given_poses_keep_their_frame_and_points_are_triangulated(tmp_path: Path, runner: Runner) -> None:
@@ -130,6 +131,7 @@ def test_given_poses_keep_their_frame_and_points_are_triangulated(tmp_path: Path
     assert np.median(np.minimum(np.abs(height), np.abs(height - 0.4))) < 0.02  # on one of the board's two planes
 
 
+@pytest.mark.slow
 def test_points_are_triangulated_with_the_lens_of_a_telephoto(tmp_path: Path, runner: Runner) -> None:
     """Calibrations of long lenses have coefficients above 1, which COLMAP takes for a failure where it solves for them itself."""
     transforms(tmp_path / "cap", board_capture(tmp_path / "cap"))
@@ -151,6 +153,7 @@ def test_photos_of_unrelated_places(tmp_path: Path, runner: Runner) -> None:
         runner.poses(max_features=500)
 
 
+@pytest.mark.slow
 def test_steps_of_registration_are_reported(tmp_path: Path, runner: Runner) -> None:
     """A photo of another place: weaker thresholds are tried, and the report says what they gained."""
     board_capture(tmp_path / "cap")
@@ -173,6 +176,7 @@ def test_too_few_given_poses(tmp_path: Path, runner: Runner) -> None:
         runner.poses()
 
 
+@pytest.mark.slow
 def test_more_photos_cost_their_own_features_and_matches(tmp_path: Path) -> None:
     """With kept features and matches the result has the same bytes; damaged files are computed again."""
     board_capture(tmp_path / "cap", 7)

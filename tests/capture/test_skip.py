@@ -27,6 +27,7 @@ from gsbake.geometry.cameras import Camera, CameraSet
 from tests.capture.conftest import Runner
 from tests.capture.test_poses import board_capture, transforms
 from tests.support.cameras import look_at
+from tests.support.slow import slow
 
 
 def noise(seed: int, size: int, sigma: float, spread: float = 30.0) -> np.ndarray[Any, np.dtype[np.float32]]:
@@ -190,7 +191,7 @@ def test_ingest_halves_blurred_photos(tmp_path: Path, runner: Runner) -> None:
     assert "3 mask files" in done.line("masks")
 
 
-@pytest.mark.parametrize(("sharp", "mode", "width"), [(1, "auto", 1000), (0, "keep", 1000), (3, "skip", 500)])
+@pytest.mark.parametrize(("sharp", "mode", "width"), [(1, "auto", 1000), slow(0, "keep", 1000), slow(3, "skip", 500)])
 def test_ingest_keeps_the_size_of_sharp_photos(tmp_path: Path, runner: Runner, sharp: int, mode: str, width: int) -> None:
     blurred_photos(tmp_path / "images", sharp)
     _, done = runner.ingest(tmp_path, resolution=mode)
@@ -222,6 +223,7 @@ def test_given_poses_can_be_ignored_or_required(tmp_path: Path, runner: Runner) 
     assert results["poses"] == "solved" and "given for 8 of 8" in done.line("pose source")
 
 
+@pytest.mark.slow
 def test_poses_drops_a_duplicate_photo(tmp_path: Path, runner: Runner) -> None:
     true = board_capture(tmp_path / "cap")
     with Image.open(tmp_path / "cap" / "images" / "b2.png") as photo:

@@ -58,15 +58,18 @@ def damages(reference: Reference, folder: Path, count: int, seed: int, stages: t
     return outcomes
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(900)  # its fixture is a whole bake, on a fresh machine with the compilation of all kernels
 def test_a_few_kills(reference: Reference, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     tell(capsys, "kills", kills(reference, tmp_path, 1, 1))
 
 
+@pytest.mark.slow
 def test_a_few_damaged_files(reference: Reference, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     tell(capsys, "damaged files", damages(reference, tmp_path, 4, 2, ("ingest", "poses", "export", "report")))
 
 
+@pytest.mark.slow
 def test_clock_jumps(reference: Reference, tmp_path: Path) -> None:
     """Files from the future and from the past are the same files."""
     out = reference.copy(tmp_path / "shifted")

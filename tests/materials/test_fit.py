@@ -32,6 +32,7 @@ from gsbake.texturing.resampling import CoarseTexture
 from gsbake.texturing.texels import Texels, rasterise
 from tests.support.cameras import look_at
 from tests.support.monte_carlo import render
+from tests.support.slow import slow
 
 SIZE = 64
 EMISSION = np.array([0.0, 0.5, 0.9], np.float32)
@@ -191,6 +192,7 @@ def test_emission_is_separated_from_base_colour(glossy: Scene) -> None:
     assert np.median(fitted.values[found & known, :3]) < 0.05
 
 
+@pytest.mark.slow
 def test_normal_offsets_reduce_normal_error(glossy: Scene) -> None:
     n, truth = len(glossy.texels), glossy.normal
     tilt = 0.15 * np.sin(3 * truth[:, 2:]) * np.array([0.3, -0.5, 0.8])
@@ -216,6 +218,7 @@ def skip(done: int, total: int) -> None:
     """Do nothing after a step."""
 
 
+@pytest.mark.slow
 def test_trials_find_the_roughness(glossy: Scene) -> None:
     smooth, rough = trial_errors(glossy), trial_errors(Scene(0.85))
     dielectric = [(0.05, r) for r in (0.2, 0.45, 0.8)]
@@ -223,6 +226,7 @@ def test_trials_find_the_roughness(glossy: Scene) -> None:
     assert min(dielectric, key=lambda k: rough[k]) == (0.05, 0.8)
 
 
+@pytest.mark.slow
 def test_metal_is_found_from_the_best_start() -> None:
     """A sphere of two metals, in reference images: from the start that the trials choose, nearly all texels end as metal (median of five
     orders of the photos)."""
@@ -345,7 +349,7 @@ def test_coarse_texture_preserves_means_and_detail() -> None:
     assert np.abs(restored - stripes).mean() < 0.01
 
 
-@pytest.mark.parametrize(("roughness", "metallic"), [(0.35, 0.0), (0.15, 1.0)])
+@pytest.mark.parametrize(("roughness", "metallic"), [(0.35, 0.0), slow(0.15, 1.0)])
 def test_a_few_photos_tell_a_metal_from_a_dielectric(roughness: float, metallic: float) -> None:
     """The metal is smooth: the search for metals turns a rough one from the dielectric start too, and neither start is clearly better."""
     scene = Scene(roughness, reference=True, metallic=metallic)

@@ -25,6 +25,7 @@ from gsbake.shading.environment import EnvironmentLight
 from gsbake.shading.split_sum import shade
 from tests.support.linear import linear
 from tests.support.monte_carlo import render
+from tests.support.slow import slow
 
 Doubles = NDArray[np.float64]
 TEXELS, PHOTOS, SIZE = 400, 16, 16
@@ -120,7 +121,7 @@ def test_true_light_is_unchanged() -> None:
     assert np.allclose(found.intensity, 1) and found.contrast == 1 and found.improvement == 0
 
 
-@pytest.mark.parametrize("factor", [1.0, 1.7, 0.6])
+@pytest.mark.parametrize("factor", [slow(1.0), 1.7, slow(0.6)])
 def test_light_of_reference_photos_is_recovered(factor: float) -> None:
     found = Plastic(reference=True).search(adjust_radiance(TRUE, np.full(3, factor), 1.0, AREA))
     assert found.intensity * factor == pytest.approx(np.ones(3), rel=INTENSITY_FACTOR**1.5 - 1)
@@ -160,7 +161,7 @@ def test_true_roughness_is_unchanged() -> None:
     assert found.roughness_shift == 0 and found.improvement == 0
 
 
-@pytest.mark.parametrize(("true", "wrong"), [(0.2, -0.8), (0.85, -2.0)])
+@pytest.mark.parametrize(("true", "wrong"), [slow(0.2, -0.8), (0.85, -2.0)])
 def test_too_low_roughness_is_corrected(true: float, wrong: float) -> None:
     """Not by a dimmer, more uniform light, which would hide the reflections of the smoother material."""
     plastic = Plastic(roughness=true)

@@ -84,6 +84,7 @@ def test_small_holes_are_found_though_photos_blur_them_to_grey(period: int) -> N
     assert ((solved[:, 4] < 0.5) == hole)[INNER].mean() > 0.85
 
 
+@pytest.mark.slow
 def test_solver_approaches_bounded_least_squares() -> None:
     """One value per row of texels in the middle channel, against SciPy's solver."""
     rng = np.random.default_rng(0)

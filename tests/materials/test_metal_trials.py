@@ -16,6 +16,7 @@ from gsbake.materials.metal_trials import GROUPS, MIN_SHARE, TrialResult, Turn, 
 from gsbake.materials.options import FitSchedule
 from gsbake.materials.two_level_fit import FitPlan, _with_better_metals
 from tests.materials.test_fit import Scene
+from tests.support.slow import slow
 
 QUIET = FitSchedule(120, metal_searches_at=(), emission=False, light_searches_at=(), sparsity=False, normals=False)
 TRIAL = replace(QUIET, iterations=40, rate=0.3)
@@ -33,7 +34,7 @@ def tried(scene: Scene, start: float, validation: int = 2) -> tuple[MaterialFit,
     return fit, before, try_kinds(fit, before, level, TRIAL, nothing)
 
 
-@pytest.mark.parametrize("start", [0.05, 0.9])
+@pytest.mark.parametrize("start", [0.05, slow(0.9)])
 def test_groups_of_the_wrong_kind_are_turned(start: float) -> None:
     scene = Scene(0.25, metallic=1.0, striped=True)
     _, before, found = tried(scene, start)
@@ -48,6 +49,7 @@ def test_groups_of_the_wrong_kind_are_turned(start: float) -> None:
     assert found.fitted.held_out_loss < before.held_out_loss
 
 
+@pytest.mark.slow
 def test_groups_that_are_likelier_as_metal_are_turned_together(monkeypatch: pytest.MonkeyPatch) -> None:
     plain, tries = _Trials._try, []
 
@@ -65,12 +67,13 @@ def test_groups_that_are_likelier_as_metal_are_turned_together(monkeypatch: pyte
     assert found.turned[0].metal and found.turned[0].share > 2 * MIN_SHARE
 
 
+@pytest.mark.slow
 def test_groups_of_the_right_kind_stay() -> None:
     fit, before, _ = tried(Scene(0.25), 0.05)
     assert (fit.state().values[before.weight > 0.3, 4] > 0.5).mean() < 0.03
 
 
-@pytest.mark.parametrize("turned", [(), (Turn(True, 0.1, 0.1),)])
+@pytest.mark.parametrize("turned", [slow(()), (Turn(True, 0.1, 0.1),)])
 def test_the_light_is_searched_for_again_where_kinds_changed(turned: tuple[Turn, ...], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("gsbake.materials.two_level_fit.try_kinds", lambda _, fitted, *__: TrialResult(fitted, 1, turned))
     scene = Scene(0.25)
@@ -80,6 +83,7 @@ def test_the_light_is_searched_for_again_where_kinds_changed(turned: tuple[Turn,
     assert len(choice.fitted.light_adjustments) == len(turned)
 
 
+@pytest.mark.slow
 def test_the_fit_ends_in_the_state_that_was_kept() -> None:
     fit, _, found = tried(Scene(0.25, metallic=1.0), 0.05)
     kept = fit.state().values

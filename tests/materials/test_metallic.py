@@ -72,6 +72,7 @@ def wall() -> Wall:
     return Wall()
 
 
+@pytest.mark.slow
 def test_metals_in_reference_photos(wall: Wall) -> None:
     gold = np.tile(np.array([1.0, 0.77, 0.34], np.float32), (TEXELS, 1))
     metals = find_metals(wall.reference(gold, 0.35, 1.0), np.full(TEXELS, 0.8, np.float32))

@@ -19,11 +19,12 @@ from gsbake.shading.light_motion import Motion, light_rotations
 from tests.materials.test_fit import WEAK_PRIORS, Scene, cameras, room
 from tests.support.cameras import look_at
 from tests.support.recorder import Recorder
+from tests.support.slow import slow
 
 COUNT = 12
 
 
-@pytest.fixture(scope="module", params=["turntable", "camera"])
+@pytest.fixture(scope="module", params=["turntable", slow("camera")])
 def moving(request: pytest.FixtureRequest) -> tuple[Motion, Scene]:
     return request.param, Scene(0.25, COUNT, motion=request.param)
 

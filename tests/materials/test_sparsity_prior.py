@@ -95,6 +95,7 @@ def test_prior_removes_stains(glossy: Scene) -> None:
     assert colour_deviation(stained, WEAK_PRIORS) < 0.5 * colour_deviation(stained, replace(WEAK_PRIORS, sparsity=0.0))
 
 
+@pytest.mark.slow
 def test_continuous_base_colours_stay() -> None:
     scene = Scene(0.8, even=True)
     truth = encode(scene.base_color)

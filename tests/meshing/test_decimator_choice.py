@@ -77,6 +77,7 @@ def test_one_module_imports_pymeshlab_when_it_decimates() -> None:
     subprocess.run(python_command("-c", code), env=python_environment(), check=True, timeout=120)
 
 
+@pytest.mark.slow
 def test_the_mesh_stage_works_without_pymeshlab(capture: Path, tmp_path: Path) -> None:  # noqa: F811
     """Chamfer distance to the true torus within 3 % of that with pymeshlab."""
     pytest.importorskip("pymeshlab")

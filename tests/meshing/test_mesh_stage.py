@@ -18,6 +18,7 @@ from gsbake.meshing.extract import MeshOptions, extract_mesh
 from gsbake.surfels.model import create
 from tests.meshing.scenes import cameras_around, gradient, torus, trace
 from tests.support.recorder import Recorder
+from tests.support.slow import slow
 
 
 def run(root: Path, out: Path, monitor: Recorder | None = None, surfels: str = "refine", **mesh: Any) -> Any:
@@ -67,7 +68,7 @@ def test_torus_is_reconstructed(capture: Path, tmp_path: Path, field: str) -> No
     assert sorted(p.name for p in out.iterdir()) == ["dense.ply", "mesh.ply"]
 
 
-@pytest.mark.parametrize(("max_error", "max_faces"), [(0.5, 0), (0.5, 1300), (0.0, 0)])
+@pytest.mark.parametrize(("max_error", "max_faces"), [(0.5, 0), slow(0.5, 1300), slow(0.0, 0)])
 def test_error_bound_raises_the_face_count(capture: Path, tmp_path: Path, max_error: float, max_faces: int) -> None:
     monitor = Recorder()
     results = run(capture, tmp_path / "out", monitor, faces=1200, max_resolution=80, max_error=max_error, max_faces=max_faces)
@@ -92,7 +93,7 @@ def test_maximum_face_count() -> None:
     assert MeshOptions(Mesh(faces=20_000, max_faces=10_000)).max_faces == 20_000
 
 
-@pytest.mark.parametrize("support", ["remove", "keep"])
+@pytest.mark.parametrize("support", ["remove", slow("keep")])
 def test_without_masks_the_table_is_removed(tmp_path: Path, support: str) -> None:
     floor = -0.15
     for folder in ("poses/photos", "refine"):

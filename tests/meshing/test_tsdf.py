@@ -47,6 +47,7 @@ def test_exact_depth_reconstructs_the_shape(shape: Shape) -> None:
     assert found.watertight and found.components == 1
 
 
+@pytest.mark.slow
 def test_blocks_far_from_the_surface_do_not_matter() -> None:
     views = views_of(torus, cameras_around())
     vertices, faces, sparse = fuse(views)
@@ -106,6 +107,7 @@ def test_unobserved_bottom_is_closed_flat() -> None:
     assert np.abs(cylinder(seen)).mean() < 0.15 * CELL
 
 
+@pytest.mark.slow
 def test_unobserved_bottom_stays_open_without_filling() -> None:
     views = views_of(cylinder, cameras_around((15, 50), 8))
     vertices, faces, _ = fuse(views, close=False)
@@ -115,6 +117,7 @@ def test_unobserved_bottom_stays_open_without_filling() -> None:
     assert np.abs(cylinder(vertices)).max() < 3 * CELL
 
 
+@pytest.mark.slow
 def test_masks_remove_an_outlier_of_one_view() -> None:
     views = views_of(sphere, cameras_around())
     bad = views[0]
@@ -138,6 +141,7 @@ def test_without_masks_the_surface_is_cut_at_the_ball() -> None:
     assert clean.topology(vertices, faces).border_edges > 50
 
 
+@pytest.mark.slow
 def test_memory_is_proportional_to_the_surface() -> None:
     views = views_of(sphere, cameras_around((10,), 6))
     sizes = [fuse(views, cell)[2].nbytes for cell in (CELL, CELL / 2)]

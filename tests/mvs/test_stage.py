@@ -77,6 +77,7 @@ def test_carved_hull(poses: Path, done: tuple[Path, dict[str, Any]]) -> None:
     assert (np.linalg.norm(points, axis=1) > RADIUS - kept.cell).all()
 
 
+@pytest.mark.slow
 def test_resume_after_interruption(poses: Path, done: tuple[Path, dict[str, Any]], tmp_path: Path) -> None:
     with pytest.raises(InterruptedRun):
         run(poses, tmp_path / "cut", Recorder(("matching", 3)), tmp_path / "scratch")

@@ -112,6 +112,7 @@ def check_checkout(found: str) -> None:
     assert list(map(Path, where)) == [ROOT / "gsbake/__init__.py", ROOT / "stages/ingest.py", ROOT / "profiles/smoke.toml"]
 
 
+@pytest.mark.slow
 def test_first_stages_from_an_empty_folder(installed: Run, tmp_path: Path) -> None:
     installed("synth", "capture", "--views", 8, "--size", 64)
     assert "relight" in installed("profiles")

@@ -21,6 +21,7 @@ from gsbake.pipeline.shared_store import SharedStore, open_shared_store
 from gsbake.pipeline.store import Artifact, Store
 from gsbake.python_process import python_command, python_environment
 from tests.pipeline.toy import Recorder, Sum, Toy, engine
+from tests.support.slow import slow
 
 
 def bake(out: Path, photos: Path, url: str, seed: int = 0, patience: float = 0.5) -> tuple[Engine, Recorder, list[str]]:
@@ -48,6 +49,7 @@ def files(folder: Path) -> dict[str, bytes]:
     }
 
 
+@pytest.mark.parametrize("url", ["folder", "object server", slow("SSH server")], indirect=True)
 def test_a_second_machine_computes_nothing(url: str, photos: Path, tmp_path: Path) -> None:
     _, first, _ = bake(tmp_path / "one", photos, url)
     _, second, warnings = bake(tmp_path / "two", photos, url)

@@ -50,6 +50,7 @@ def test_white_furnace() -> None:
     assert (black >= 0).all() and (black <= shade(normal, view, albedo, rough, one, tables) + 1e-6).all()
 
 
+@pytest.mark.slow
 def test_sphere_against_the_rendering_equation() -> None:
     """Monte Carlo of the whole BRDF (attenuated Lambert + GGX, Smith, Fresnel, light between microfacets), cosine-sampled, on the analytic
     light."""

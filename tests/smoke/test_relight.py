@@ -72,6 +72,7 @@ def test_the_asset_is_valid(baked: tuple[Path, Path]) -> None:
     assert gltf_issues(baked[1] / "asset.glb") == []
 
 
+@pytest.mark.slow
 def test_a_bake_on_the_true_mesh_has_its_shape(baked: tuple[Path, Path], tmp_path: Path) -> None:
     bake_on_true_mesh(baked[1], baked[0], tmp_path, overrides=("bake.materials=none", "bake.size=256", "bake.occlusion_rays=8"))
     shape = measure(tmp_path / "asset.glb", baked[0])

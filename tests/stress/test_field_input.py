@@ -166,6 +166,9 @@ CASES = [
     *(("plain", "plain", mask) for mask in ("empty", "full", "none", "one pixel")),
 ]
 
+#: The cases that run with the quick tests.
+QUICK = {("plain", "plain", "disc"), ("some nan", "plain", "disc"), ("sdf nan", "plain", "disc"), ("plain", "plain", "empty")}
+
 
 def check(folder: Path, kind: str, cameras: str, mask: str, **settings: Any) -> None:
     views = CAMERAS[cameras]()
@@ -187,7 +190,9 @@ def check(folder: Path, kind: str, cameras: str, mask: str, **settings: Any) -> 
         assert len(mesh.faces) and np.isfinite(mesh.vertices).all() and np.abs(mesh.vertices).max() < 1.5
 
 
-@pytest.mark.parametrize(("kind", "cameras", "mask"), CASES)
+@pytest.mark.parametrize(
+    ("kind", "cameras", "mask"), [pytest.param(*case, marks=() if case in QUICK else pytest.mark.slow) for case in CASES]
+)
 def test_mesh_extraction_is_finite(tmp_path: Path, kind: str, cameras: str, mask: str) -> None:
     check(tmp_path, kind, cameras, mask)
 

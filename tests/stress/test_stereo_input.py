@@ -28,6 +28,8 @@ CASES = [
     *(("plain", kind, "disc") for kind in PHOTOS[1:]),
     *(("plain", "noise", kind) for kind in MASKS[1:]),
 ]
+#: The one of each kind that runs with the quick tests.
+QUICK = {("inside the object", "noise", "disc"), ("plain", PHOTOS[1], "disc"), ("plain", "noise", MASKS[1])}
 
 
 def check(folder: Path, cameras: str, pictures: str, outlines: str) -> None:
@@ -55,7 +57,9 @@ def check(folder: Path, cameras: str, pictures: str, outlines: str) -> None:
     assert initial is None or (np.isfinite(initial.points).all() and np.isfinite(initial.normals).all())
 
 
-@pytest.mark.parametrize(("cameras", "pictures", "outlines"), CASES)
+@pytest.mark.parametrize(
+    ("cameras", "pictures", "outlines"), [pytest.param(*case, marks=() if case in QUICK else pytest.mark.slow) for case in CASES]
+)
 def test_stereo_is_finite(tmp_path: Path, cameras: str, pictures: str, outlines: str) -> None:
     check(tmp_path, cameras, pictures, outlines)
 

@@ -20,6 +20,7 @@ from gsbake.surfels.raster.projection import Pinhole
 from gsbake.surfels.training.trainer import Plan, Trainer
 from gsbake.surfels.views import TrainView
 from tests.support.cameras import look_at_rotation
+from tests.support.slow import slow
 
 SIZE = 24
 STEPS = int(os.environ.get("GSBAKE_SOAK_STEPS", "20000"))
@@ -96,8 +97,14 @@ def soak(kinds: Sequence[str], shading: str, steps: int, turn: int) -> None:
     assert process.memory_info().rss - base < 200e6
 
 
-@pytest.mark.parametrize("shading", ["colour", "pbr"])
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(
+    ("kind", "shading"),
+    [
+        pytest.param(kind, shading, marks=() if kind in ("random photos", "empty masks") and shading == "pbr" else pytest.mark.slow)
+        for kind in KINDS
+        for shading in ("colour", "pbr")
+    ],
+)
 def test_short_soak(kind: str, shading: str) -> None:
     soak([kind], shading, 60, 60)
 
@@ -127,7 +134,7 @@ def final(count: int, shading: str, steps: int) -> dict[str, torch.Tensor]:
 
 
 @pytest.mark.usefixtures("one_thread_after")
-@pytest.mark.parametrize("shading", ["colour", "pbr"])
+@pytest.mark.parametrize("shading", [slow("colour"), "pbr"])
 def test_same_seed_is_bit_identical(shading: str) -> None:
     first, again, other = (final(n, shading, 120) for n in (2, 2, 1))
     assert all(torch.equal(v, again[k]) for k, v in first.items())

@@ -171,6 +171,7 @@ def test_too_small_is_a_usage_error(tmp_path: Path, views: int, size: int) -> No
         write_capture(tmp_path, views=views, size=size)
 
 
+@pytest.mark.slow
 def test_the_printed_marker_is_read_and_has_its_size(tmp_path: Path) -> None:
     rig, cells = studio_rig(), scene.marker_cells()
     target = np.array([*scene.MARKER_CENTRE, 0.0])

@@ -116,6 +116,7 @@ def test_masks_are_made_corrected_and_written_for_editing(
     assert intersection_over_union(kept > 127, edited > 127) == 1, "what the user edited is not corrected"
 
 
+@pytest.mark.slow
 def test_guesses_that_no_camera_agrees_with_are_not_used(capture: Path, network: Callable[[int], None], runner: Runner) -> None:
     network(0)
     poses = json.loads((capture / "transforms.json").read_text())

@@ -67,6 +67,7 @@ def test_errors_of_single_photos_are_corrected(tmp_path: Path) -> None:
             assert after > 0.9, camera.name
 
 
+@pytest.mark.slow
 def test_wrong_cameras_find_no_agreement(tmp_path: Path) -> None:
     files = bar_masks(tmp_path, ring())
     assert find_consensus(ring(), files).agreement > MIN_OVERLAP  # type: ignore[union-attr]

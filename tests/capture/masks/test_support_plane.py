@@ -103,6 +103,7 @@ def test_pixels_of_the_plane_are_confirmed_and_the_ball_is_not(capture: Any) -> 
         assert below[int(centre[1]), int(centre[0])] and 0.2 < below.sum() / mask.sum() < 1.4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tilt", [0.0, 0.6])
 def test_masks_of_what_stands_on_it(capture: Any, tmp_path: Path, tilt: float) -> None:
     """Guesses that found nothing do no harm; the frame of the world does not matter."""

@@ -127,6 +127,7 @@ def test_lenses() -> None:
     assert not is_plausible_lens(replace(camera, distortion=(-0.9, 0.0, 0.0, 0.0)))
 
 
+@pytest.mark.slow
 def test_a_right_model_of_one_position_beats_a_wrong_one_of_both(tmp_path: Path, answers: Callable[..., Jobs]) -> None:
     """An object that was laid down otherwise: whole photos register all of them on the table, the masks only one position."""
     entries = write_capture(tmp_path / "ingest", ring(), "guess")

@@ -19,6 +19,7 @@ from gsbake.meshing.refinement.photometric_reference import displacement_referen
 from gsbake.mvs.ncc import SamplingPattern
 from gsbake.mvs.pyramids import MatchingViews, Photo
 from tests.mvs.scenes import RADIUS, arc, photo, sphere_depth, texture
+from tests.support.slow import slow
 
 #: Size of a pixel on the part of the sphere that faces a camera.
 PIXEL = (3 - RADIUS) / 330
@@ -141,7 +142,7 @@ def test_a_round_improves_when_most_measurements_match_better() -> None:
     assert not improves(useless, before)
 
 
-@pytest.mark.parametrize("error", [1.0, -1.0])
+@pytest.mark.parametrize("error", [1.0, slow(-1.0)])
 def test_textured_sphere_is_recovered(error: float) -> None:
     result, left = refined("textured", error)
     # Patches match to a tenth of a pixel or better; photos BETWEEN apart make that 0.1 / sin(BETWEEN) of depth.
@@ -158,7 +159,7 @@ def test_true_sphere_is_unchanged() -> None:
     assert np.sqrt((left**2).mean()) < MIN_DISPLACEMENT
 
 
-@pytest.mark.parametrize(("surface", "error"), [("plain", 0.0), ("plain", 1.0), ("mirror", 0.0), ("mirror", 1.0)])
+@pytest.mark.parametrize(("surface", "error"), [slow("plain", 0.0), ("plain", 1.0), slow("mirror", 0.0), slow("mirror", 1.0)])
 def test_untextured_and_mirroring_spheres_are_unchanged(surface: str, error: float) -> None:
     """Without texture there is no measurement; reflections are inconsistent between photos."""
     vertices, _, seen = sphere(error)

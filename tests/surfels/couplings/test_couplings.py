@@ -14,6 +14,7 @@ from gsbake.surfels.couplings.priors import fit_scale_and_shift
 from gsbake.surfels.field import TrainingStep
 from gsbake.surfels.gbuffer import rasterise
 from gsbake.surfels.views import TrainView
+from tests.support.slow import slow
 from tests.surfels.couplings.scene import RADIUS, ball, field_of, inputs, normals_of, views
 
 
@@ -69,7 +70,7 @@ def test_depth_and_free_space_grow_with_the_difference(photos: list[TrainView]) 
 WITH_GRADIENT = [name for name in COUPLINGS if name not in ("opacity_target", "prior_depths")]
 
 
-@pytest.mark.parametrize(("name", "kind"), [*((name, "grid") for name in WITH_GRADIENT), ("eikonal", "hash"), ("colour", "hash")])
+@pytest.mark.parametrize(("name", "kind"), [*((name, "grid") for name in WITH_GRADIENT), slow("eikonal", "hash"), slow("colour", "hash")])
 def test_gradients_agree_with_differences(name: str, kind: str, photos: list[TrainView]) -> None:
     # free space is violated by a surface before the surfels alone
     field = field_of(kind, (1.1 if name == "free_space" else 0.97) * RADIUS, {"colour": 1.0})

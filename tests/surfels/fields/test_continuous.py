@@ -17,6 +17,7 @@ from gsbake.surfels.fields.known import KnownDistance, SphereDistance
 from gsbake.surfels.fields.registry import FIELDS, load_field, make_field, save_field
 from gsbake.surfels.initialisation import fibonacci_sphere, spacing
 from gsbake.surfels.model import Surfels, create
+from tests.support.slow import slow
 
 RADIUS = 0.6
 #: Small enough to be quick. Largest error of the start near the surface.
@@ -122,7 +123,7 @@ def test_points_on_the_surface_and_mesh(kind: str) -> None:
 
 
 @pytest.mark.parametrize("kind", FIELDS)
-@pytest.mark.parametrize("extra", [{}, {"colour": 1.0}])
+@pytest.mark.parametrize("extra", [{}, slow({"colour": 1.0})])
 def test_file_and_state_hold_all_of_it(kind: str, extra: dict[str, float], tmp_path: Path) -> None:
     surfels = ball(300)
     p = profile(kind, extra, splats=kind == "hash")
@@ -179,6 +180,7 @@ def test_known_distance_of_a_ball_and_of_a_thin_plate() -> None:
     assert np.allclose(SphereDistance(0.5).with_gradient(2 * np.eye(3))[1], np.eye(3))
 
 
+@pytest.mark.slow
 def test_nothing_known_is_a_field_too() -> None:
     empty = ball().select(torch.zeros(0, dtype=torch.long))
     for kind in FIELDS:

@@ -70,6 +70,7 @@ def test_jacobian_agrees_with_differences(kind: str) -> None:
         assert torch.allclose(jacobian[:, axis], numeric, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_gradients_of_the_table_agree_with_differences() -> None:
     levels = Levels(LOWER, UPPER, LEVELS["all"])
     table = torch.randn(levels.rows, 1, generator=torch.Generator().manual_seed(1), dtype=torch.float64, requires_grad=True)

@@ -30,7 +30,7 @@ def files(t: Trainer, folder: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in folder.iterdir()}
 
 
-@pytest.mark.parametrize("kind", ALL)
+@pytest.mark.parametrize("kind", [pytest.param(kind, marks=() if kind == "grid" else pytest.mark.slow) for kind in ALL])
 def test_resumed_equals_uninterrupted(kind: str, tmp_path: Path) -> None:
     whole = trainer(kind, "random photos", STEPS)
     finish(whole)

@@ -78,6 +78,7 @@ def posed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root / "out"
 
 
+@pytest.mark.slow
 def test_interrupted_stages_give_identical_files(posed: Path, tmp_path: Path) -> None:
     whole, interrupted = tmp_path / "whole", tmp_path / "interrupted"
     shutil.copytree(posed, whole)

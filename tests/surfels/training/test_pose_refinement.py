@@ -182,6 +182,7 @@ def test_failed_trial_leaves_training_unchanged(monkeypatch: pytest.MonkeyPatch)
     assert all(torch.equal(a.R, b.R) and torch.equal(a.rgb, b.rgb) for a, b in zip(t.views, given, strict=True))
 
 
+@pytest.mark.slow
 def test_stopped_trial_is_repeated_and_resumed_run_is_bit_identical(tmp_path: Path) -> None:
     given, _ = capture(0.06, 0.4)
     whole, decided = trained(given, "auto", "auto")

@@ -16,6 +16,7 @@ import triton
 from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource
 from gsbake.surfels.raster.cuda import kernels
+from tests.support.slow import slow
 
 TYPES = {"starts": "*i64", "used": "*i64", "slots": "*i64", "ids": "*i32", "tiles_x": "i32", "width": "i32", "height": "i32"}
 found = {}
@@ -30,7 +31,8 @@ print(json.dumps(found))
 """
 
 
-@pytest.mark.parametrize("capability", [pytest.param(80, marks=pytest.mark.slow), 90])
+@pytest.mark.slow
+@pytest.mark.parametrize("capability", [80, 90])
 def test_machine_code(capability: int, tmp_path: Path) -> None:
     environment = {k: v for k, v in os.environ.items() if k != "TRITON_INTERPRET"} | {"TRITON_CACHE_DIR": str(tmp_path)}
     done = subprocess.run([sys.executable, "-c", PROGRAM, str(capability)], env=environment, capture_output=True, text=True, check=False)
