@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -11,6 +12,7 @@ import pytest
 from gsbake.errors import BadInputError, InterruptedRun, UsageError
 from gsbake.pipeline.files import disk_error
 from gsbake.pipeline.registry import Registry
+from gsbake.pipeline.stage import Stage
 from gsbake.pipeline.supervise import StageFailed
 from tests.pipeline.toy import LaterSum, LaterToy, Read, Sum, Toy, engine, only
 
@@ -40,6 +42,24 @@ def test_second_run_is_cached(tmp_path: Path, photos: Path) -> None:
     second, again = engine(tmp_path / "out", photos)
     second.run()
     assert again.ran == [] and again.cached == ["read", "sum", "tell"]
+
+
+def test_only_stages_that_compute_are_announced_beforehand(tmp_path: Path, photos: Path) -> None:
+    engine(tmp_path / "out", photos)[0].run()
+    changed, _ = engine(tmp_path / "out", photos, Toy(sum=Sum(steps=11)))
+    announced: list[str] = []
+    changed.before_stage = lambda stage, check: announced.append(stage.name)
+    changed.run()
+    assert announced == ["sum", "tell"]
+
+    def stop(stage: Stage, check: Callable[[], None]) -> None:
+        raise InterruptedRun("Stopped on request.")
+
+    stopped, seen = engine(tmp_path / "out", photos, Toy(sum=Sum(steps=12)))
+    stopped.before_stage = stop
+    with pytest.raises(InterruptedRun):
+        stopped.run()
+    assert seen.ran == [] and [state.status for state in stopped.plan()] == ["cached", "run", "waits"]
 
 
 def test_manifest_content(tmp_path: Path, photos: Path) -> None:
@@ -213,7 +233,6 @@ def test_disk_error_ignores_other_errors(tmp_path: Path) -> None:
 
 
 # Stages and profiles of these tests only.
-from gsbake.pipeline.stage import Stage  # noqa: E402
 from tests.pipeline import toy  # noqa: E402
 
 WIDER_SUM = Stage("sum", 1, "Sum slowly", toy._sum, needs=("read",), settings=("sum.steps", "sum.step_seconds", "sum.extra"), seeded=True)
