@@ -64,8 +64,11 @@ def trace(shape: Shape, camera: Camera) -> tuple[NDArray[np.float32], NDArray[np
     rays = camera.rays()
     slant = np.linalg.norm(rays, axis=-1)
     z = np.full(slant.shape, 1.0)
+    on = np.ones(slant.shape, bool)  # rays that still move
     for _ in range(120):
-        z = np.minimum(z + 0.95 * shape(camera.centre + z[..., None] * rays) / slant, 20)
+        step = 0.95 * shape(camera.centre + z[on][:, None] * rays[on]) / slant[on]
+        z[on] = np.minimum(z[on] + step, 20)
+        on[on] = (np.abs(step) > 1e-12) & (z[on] < 20)
     points = camera.centre + z[..., None] * rays
     hit = np.abs(shape(points)) < 1e-3
     normal = gradient(shape, points) * hit[..., None]

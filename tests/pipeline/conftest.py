@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
+from tests.pipeline.toy import engine
 from tests.support.slow import slow
 from tests.support.ssh_server import ServerUnavailable, SshServer
+
+WORDS = "One two three"
 
 
 @pytest.fixture
@@ -16,8 +20,25 @@ def photos(tmp_path: Path) -> Path:
     """A folder with one file of three words."""
     folder = tmp_path / "photos"
     folder.mkdir()
-    (folder / "a.txt").write_text("One two three")
+    (folder / "a.txt").write_text(WORDS)
     return folder
+
+
+@pytest.fixture(scope="session")
+def toy_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The output folder of one run of the toy pipeline on such photos."""
+    root = tmp_path_factory.mktemp("toy")
+    (root / "photos").mkdir()
+    (root / "photos" / "a.txt").write_text(WORDS)
+    engine(root / "out", root / "photos")[0].run()
+    return root / "out"
+
+
+@pytest.fixture
+def finished(toy_run: Path, photos: Path, tmp_path: Path) -> Path:
+    """A copy of it, as if `photos` had been run into it."""
+    shutil.copytree(toy_run, tmp_path / "out", symlinks=True)
+    return tmp_path / "out"
 
 
 @pytest.fixture(scope="module")

@@ -21,9 +21,8 @@ from tests.pipeline.toy import Sum, Toy, artifact, engine
 
 
 @pytest.mark.parametrize("name", ["emissive.exr", ".hidden", "sub/planted.txt"])
-def test_planted_file_is_set_aside(tmp_path: Path, photos: Path, name: str) -> None:
-    out = tmp_path / "out"
-    engine(out, photos)[0].run()
+def test_planted_file_is_set_aside(photos: Path, name: str, finished: Path) -> None:
+    out = finished
     planted = artifact(out, "sum") / name
     planted.parent.mkdir(exist_ok=True)
     planted.write_text("stranger")
@@ -59,9 +58,8 @@ def test_only_the_artifacts_of_the_run_are_looked_at(tmp_path: Path, photos: Pat
     assert sum((folder / "emissive.exr").exists() for folder in old) == len(old) - 4
 
 
-def test_planted_file_in_a_replacement_is_set_aside(tmp_path: Path, photos: Path) -> None:
-    out, mine = tmp_path / "out", tmp_path / "mine.txt"
-    engine(out, photos)[0].run()
+def test_planted_file_in_a_replacement_is_set_aside(tmp_path: Path, photos: Path, finished: Path) -> None:
+    out, mine = finished, tmp_path / "mine.txt"
     mine.write_text("42")
     planted = replace_output(Store(out), "sum", {"total.txt": mine}, None).folder / "emissive.exr"
     planted.write_text("stranger")
@@ -70,9 +68,8 @@ def test_planted_file_in_a_replacement_is_set_aside(tmp_path: Path, photos: Path
     assert (artifact(out, "tell") / "tell.txt").exists()
 
 
-def test_planted_link_to_a_folder_is_set_aside(tmp_path: Path, photos: Path) -> None:
-    out = tmp_path / "out"
-    engine(out, photos)[0].run()
+def test_planted_link_to_a_folder_is_set_aside(photos: Path, finished: Path) -> None:
+    out = finished
     (artifact(out, "sum") / "etc").symlink_to("/etc")
     engine(out, photos)[0].run()
     assert not os.path.lexists(artifact(out, "sum") / "etc")
@@ -87,9 +84,8 @@ def test_file_managers_files_are_ignored(tmp_path: Path, photos: Path) -> None:
 @pytest.mark.parametrize(
     "text", ["", "{", "null", "[]", '{"folder": "../../x"}', '{"folder": "by-hand-zz"}', '{"folder": 5}', '{"folder": "by-hand-00000000"}']
 )
-def test_damaged_record_of_a_replacement_is_refused(tmp_path: Path, photos: Path, text: str) -> None:
-    out, mine = tmp_path / "out", tmp_path / "mine.txt"
-    engine(out, photos)[0].run()
+def test_damaged_record_of_a_replacement_is_refused(tmp_path: Path, photos: Path, text: str, finished: Path) -> None:
+    out, mine = finished, tmp_path / "mine.txt"
     mine.write_text("42")
     store = Store(out)
     replace_output(store, "sum", {"total.txt": mine}, None)
@@ -102,9 +98,8 @@ def test_damaged_record_of_a_replacement_is_refused(tmp_path: Path, photos: Path
     assert engine(out, photos)[0].plan()[1].status == "cached"
 
 
-def test_missing_record_of_a_replacement_is_refused(tmp_path: Path, photos: Path) -> None:
-    out, mine = tmp_path / "out", tmp_path / "mine.txt"
-    engine(out, photos)[0].run()
+def test_missing_record_of_a_replacement_is_refused(tmp_path: Path, photos: Path, finished: Path) -> None:
+    out, mine = finished, tmp_path / "mine.txt"
     mine.write_text("42")
     replace_output(Store(out), "sum", {"total.txt": mine}, None)
     (out / "stages" / "sum" / REPLACEMENT).unlink()
@@ -191,11 +186,10 @@ def test_bytes_flipped_below_the_file_system(tmp_path: Path, photos: Path) -> No
 @pytest.mark.parametrize(
     "change", [{"files": {"../../x": {"digest": "0", "bytes": 1}}}, {"files": []}, {"files": {"x": 5}}, {"files": {"x": {"digest": 1}}}]
 )
-def test_malformed_manifest_is_no_artifact(tmp_path: Path, photos: Path, change: dict[str, object]) -> None:
+def test_malformed_manifest_is_no_artifact(photos: Path, change: dict[str, object], finished: Path) -> None:
     from gsbake.pipeline.store import _seal
 
-    out = tmp_path / "out"
-    engine(out, photos)[0].run()
+    out = finished
     path = artifact(out, "sum") / MANIFEST
     body = {**json.loads(path.read_text()), **change}
     path.write_text(json.dumps({**body, "seal": _seal(body)}))

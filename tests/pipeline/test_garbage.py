@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 from pathlib import Path
 
 import pytest
@@ -14,20 +15,29 @@ from gsbake.pipeline.garbage import choose, delete, list_entries
 from gsbake.pipeline.lease import Lease, LeaseHolder
 from gsbake.pipeline.replace import replace_output
 from gsbake.pipeline.store import Store
+from tests.pipeline.conftest import WORDS
 from tests.pipeline.toy import Read, Toy, artifact, engine
 
 STAGES = ("read", "sum", "tell")
 
 
-@pytest.fixture
-def store(tmp_path: Path, photos: Path) -> Store:
-    """Two generations of every stage, the older one last used 40 days ago."""
-    out = tmp_path / "out"
-    engine(out, photos, Toy(read=Read(limit=1)))[0].run()
+@pytest.fixture(scope="module")
+def two_runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("garbage")
+    (root / "photos").mkdir()
+    (root / "photos" / "a.txt").write_text(WORDS)
+    engine(root / "out", root / "photos", Toy(read=Read(limit=1)))[0].run()
     for stage in STAGES:
-        os.utime(artifact(out, stage), (1.0, 1.0))
-    engine(out, photos)[0].run()
-    return Store(out)
+        os.utime(artifact(root / "out", stage), (1.0, 1.0))
+    engine(root / "out", root / "photos")[0].run()
+    return root / "out"
+
+
+@pytest.fixture
+def store(two_runs: Path, photos: Path, tmp_path: Path) -> Store:
+    """Two generations of every stage, the older one last used long ago."""
+    shutil.copytree(two_runs, tmp_path / "out", symlinks=True)
+    return Store(tmp_path / "out")
 
 
 def test_old_artifacts_go_and_the_newest_stay(store: Store, photos: Path) -> None:

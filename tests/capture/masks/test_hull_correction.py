@@ -35,12 +35,16 @@ def torus_mask(camera: Camera) -> np.ndarray:
     plane = np.stack(np.meshgrid(x, x), -1).reshape(-1, 2)
     if camera.distortion:
         plane = undistort_points(plane, camera.distortion)
-    rays = (np.column_stack([plane, np.ones(len(plane))]) @ camera.R).reshape(SIZE, SIZE, 3)
-    inside = np.zeros((SIZE, SIZE), bool)
+    rays = np.column_stack([plane, np.ones(len(plane))]) @ camera.R
+    nearest = np.linalg.norm(np.cross(rays, camera.centre), axis=1) / np.linalg.norm(rays, axis=1)
+    left = np.flatnonzero(nearest < MAJOR + MINOR)  # the others miss the ball around the torus
+    mask = np.zeros((SIZE, SIZE), np.uint8)
     for depth in np.linspace(3, 5, 61):
-        p = camera.centre + depth * rays
-        inside |= (np.hypot(p[..., 0], p[..., 1]) - MAJOR) ** 2 + p[..., 2] ** 2 < MINOR**2
-    return np.where(inside, 255, 0).astype(np.uint8)
+        p = camera.centre + depth * rays[left]
+        inside = (np.hypot(p[:, 0], p[:, 1]) - MAJOR) ** 2 + p[:, 2] ** 2 < MINOR**2
+        mask.flat[left[inside]] = 255
+        left = left[~inside]
+    return mask
 
 
 def photo_of(truth: np.ndarray) -> Callable[[], np.ndarray]:
