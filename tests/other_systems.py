@@ -29,7 +29,7 @@ POSIX = (
     "benchmarks/test_peers.py",
     "benchmarks/test_skip.py",
     "capture/photos/test_reader_pool.py",
-    "capture/sfm/test_colmap.py::test_sigterm_is_left_to_the_stage",
+    "capture/test_colmap.py::test_sigterm_is_left_to_the_stage",
     "capture/test_sources.py::test_mask_folder_that_leads_out_of_the_capture_must_be_named",
     "capture/test_sources.py::test_masks_are_images_inside_their_folder",
     "gltf/test_stages.py::test_a_known_distance_makes_metres",
