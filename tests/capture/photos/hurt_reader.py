@@ -11,10 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from gsbake.capture.masks import matching
 from gsbake.capture.photos import conversion, reader_process
 
-_READ_PHOTO, _READ_MASK = conversion.read_photo, matching.read_mask
+_READ_PHOTO, _READ_MASK = conversion.read_photo, conversion.read_mask
 
 
 def _hurt(path: Path) -> None:
@@ -44,6 +43,6 @@ def _read_mask(path: Path, *rest: Any) -> Any:
 
 
 def main() -> None:
-    conversion.read_photo, matching.read_mask = _read_photo, _read_mask
+    conversion.read_photo, conversion.read_mask = _read_photo, _read_mask
     os.write(1, b"a library that prints\n")
     reader_process.main()
