@@ -151,17 +151,18 @@ class PhotoBatch:
     def _shader(self, normal: Floats, tables: KernelTables, local: Floats, transport: Floats) -> Shader:
         """The function that shades the pixels with the `normal` (n, 3), their light transport `local` (n, 8), and that of the texels."""
         emission = local[:, EMISSION]
+        view, reflected = np.ascontiguousarray(self.view), np.ascontiguousarray(self.reflected)  # the kernels' layout
         light: list[tuple[Floats, Floats]] = []
         last: list[tuple[NDArray[np.float32], tuple[Floats, ...]]] = []
 
         def parts(roughness: NDArray[np.float32]) -> tuple[Floats, ...]:
             if not light:
                 light.append((np.empty_like(normal), np.empty_like(normal)))
-                fit_kernel.incident_light(normal, self.view, self.reflected, local, transport, *tables.arrays, *light[0])
+                fit_kernel.incident_light(normal, view, reflected, local, transport, *tables.arrays, *light[0])
             if not last or last[0][0] is not roughness:
                 out = tuple(np.empty_like(normal) for _ in range(4))
                 fit_kernel.linear_shading(
-                    self.dominant_texel, normal, self.view, self.reflected, local, *light[0], np.ascontiguousarray(roughness, np.float32),
+                    self.dominant_texel, normal, view, reflected, local, *light[0], np.ascontiguousarray(roughness, np.float32),
                     *tables.arrays, *out,
                 )  # fmt: skip
                 last[:] = [(roughness, out)]
@@ -196,7 +197,8 @@ def texel_weight(batches: Iterable[PhotoBatch], count: int) -> Floats:
 def interpolate(values: NDArray[Any], texel: NDArray[Any], bilinear: Floats) -> Floats:
     """`values` (texels, c) at pixels with the taps `texel` (n, 4) and weights `bilinear` (n, 4): (n, c)."""
     out = np.empty((len(texel), values.shape[1]), np.float32)
-    fit_kernel.interpolate_taps(np.ascontiguousarray(values, np.float32), texel, bilinear, out)
+    taps = np.ascontiguousarray(texel), np.ascontiguousarray(bilinear)
+    fit_kernel.interpolate_taps(np.ascontiguousarray(values, np.float32), *taps, out)
     return out
 
 

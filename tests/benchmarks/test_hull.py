@@ -33,6 +33,7 @@ def test_the_surface_of_a_hull_faces_outwards() -> None:
     assert (surface.normals(faces) * points).sum(1).min() > 0.9 * RADIUS
 
 
+@pytest.mark.slow
 def test_figures_of_a_ball(tmp_path: Path) -> None:
     """The hull is the ball, and what carving is said to have left is 0.06 too small."""
     z, turn = np.linspace(-0.95, 0.95, 30), 2.4 * np.arange(30)

@@ -11,6 +11,7 @@ from gsbake.shading import brdf, cubemap
 from gsbake.shading.environment import EnvironmentLight
 from gsbake.shading.specular_lobe import ROOT_COSINE, ROUGHNESS, fit_lobe, ggx_density, lobe_table, prefiltered_density
 from gsbake.shading.split_sum import shade
+from tests.support.slow import slow
 
 
 def test_density_integrates_to_the_directional_albedo() -> None:
@@ -52,7 +53,7 @@ def test_limits() -> None:
 
 
 @pytest.mark.parametrize(
-    ("roughness", "cosine", "ratio"), [(0.2, 0.3, 0.8), (0.3, 0.5, 0.75), (0.45, 0.4, 0.4), (0.6, 0.7, 0.5), (0.8, 0.3, 0.2)]
+    ("roughness", "cosine", "ratio"), [(0.2, 0.3, 0.8), slow(0.3, 0.5, 0.75), slow(0.45, 0.4, 0.4), slow(0.6, 0.7, 0.5), (0.8, 0.3, 0.2)]
 )
 def test_metal_under_a_lamp_is_nearer_to_ggx_than_one_lobe(roughness: float, cosine: float, ratio: float) -> None:
     """Displayed shading of a white metal under a lamp in many directions: the exact sum, `shade`, and the prefiltered lobe alone."""

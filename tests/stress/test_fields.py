@@ -64,8 +64,8 @@ SURFELS = (
     "plain", "empty", "one", "one place", "plane", "nan", "all nan", "inf", "no direction", "scale 1e-8", "scale 1e-4", "scale 10",
     "scale 1e4",
 )  # fmt: skip
-#: Quick: the surfels' own field on all of them, and every field on some that are not numbers.
-FEW_FIRST = [
+#: Quick are the field of the surfels themselves with all, and every field where some are not numbers.
+CASES = [
     pytest.param(kind, what, marks=() if kind == "samples" or what == "nan" else pytest.mark.slow) for what in SURFELS for kind in ALL
 ]
 POINTS = torch.tensor([
@@ -79,7 +79,7 @@ def profile(kind: str) -> SimpleNamespace:
     return SimpleNamespace(field=field, coupling=Coupling(**COUPLING), loss=Loss(), train=Train(sharpness="spacing", band=1.0))
 
 
-@pytest.mark.parametrize(("kind", "what"), FEW_FIRST)
+@pytest.mark.parametrize(("kind", "what"), CASES)
 def test_a_field_of_hostile_surfels_is_finite(kind: str, what: str) -> None:
     s = surfels(what)
     field: Field = make_field(s, profile(kind), 0)

@@ -78,6 +78,15 @@ def posed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root / "out"
 
 
+def test_training_that_was_asked_to_stop_gives_identical_files(posed: Path, tmp_path: Path) -> None:
+    whole, stopped = shutil.copytree(posed, tmp_path / "whole"), shutil.copytree(posed, tmp_path / "stopped")
+    assert run(whole, "train") == 0
+    assert run(stopped, "train", 90, signal.SIGTERM) == 75
+    assert run(stopped, "train") == 0
+    expected = results(whole)
+    assert {"train/surfels.safetensors", "train/light.safetensors"} <= expected.keys() and results(stopped) == expected
+
+
 @pytest.mark.slow
 def test_interrupted_stages_give_identical_files(posed: Path, tmp_path: Path) -> None:
     whole, interrupted = tmp_path / "whole", tmp_path / "interrupted"

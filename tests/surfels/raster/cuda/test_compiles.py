@@ -16,7 +16,6 @@ import triton
 from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource
 from gsbake.surfels.raster.cuda import kernels
-from tests.support.slow import slow
 
 TYPES = {"starts": "*i64", "used": "*i64", "slots": "*i64", "ids": "*i32", "tiles_x": "i32", "width": "i32", "height": "i32"}
 found = {}
