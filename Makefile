@@ -88,7 +88,9 @@ check: setup ## Lint, types on three systems, order of the layers, dead code
 	$(BIN)/lint-imports --no-logo --no-cache
 	$(BIN)/vulture
 
-test: kernels check node ## The checks and the quick tests, in two processes: WORKERS=2
+# The checks use one core and compiling kernels waits for its slowest one, so that both go on at once.
+test: setup node ## The checks and the quick tests, in two processes: WORKERS=2
+	@$(MAKE) --no-print-directory --jobs 2 kernels check
 	$(BIN)/pytest $(QUICK)
 
 # Compiled here by all cores, or every process of the tests would compile what it needs.

@@ -97,7 +97,7 @@ def test_solved_poses_are_the_true_ones(tmp_path: Path, runner: Runner) -> None:
     assert ups[:, 2].mean() > 0.5
 
 
-@pytest.mark.parametrize("given", [slow(False, id="solved"), pytest.param(True, id="given")])
+@pytest.mark.parametrize("given", [slow(False, id="solved"), slow(True, id="given")])
 def test_the_same_bytes_with_any_number_of_threads(tmp_path: Path, runner: Runner, given: bool) -> None:
     true = board_capture(tmp_path / "cap")
     if given:

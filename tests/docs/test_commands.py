@@ -23,6 +23,7 @@ from tests.support.cameras import look_at
 from tests.support.gltf_files import write_ball
 
 ROOT = Path(__file__).resolve().parents[2]
+CONSTRAINTS = (ROOT / "constraints.txt").read_text(encoding="utf-8")
 PAGES = sorted(
     path.relative_to(ROOT).as_posix()
     for path in [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").rglob("*.md")]
@@ -46,6 +47,7 @@ def _call(arguments: list[str], monkeypatch: pytest.MonkeyPatch) -> int:
     monkeypatch.setattr(gsbake.api, "REGISTRY", toy_stages.REGISTRY)
     monkeypatch.setattr(doctor, "MODULES", {"json": "json"})
     monkeypatch.setattr(doctor, "machine_findings", lambda out: [])  # the memory and disk that are free beside other work
+    monkeypatch.setattr("gsbake.capture.masks.weights.install", lambda: "there")
     monkeypatch.setattr(sys, "argv", ["gsbake", *arguments])
     code: Any = 0
     try:
@@ -109,6 +111,10 @@ def check(line: str, gsbake: Run) -> str | None:
         if arguments[:1] == ["-m"]:
             return None if find_spec(arguments[1]) else f"no module {arguments[1]}"
         return None if (ROOT / arguments[0]).is_file() else f"no file {arguments[0]}"
+    if program == "pip":  # what it installs is this folder, or pinned
+        wanted = [word for word in arguments[1:] if not word.startswith(("-", "https://"))]
+        unknown = [word for word in wanted if word != "." and not re.search(rf"(?m)^{re.escape(word)}==", CONSTRAINTS)]
+        return f"no pin for {unknown}" if arguments[0] != "install" or unknown else None
     return f"'{program}' is not known here"
 
 
