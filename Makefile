@@ -14,7 +14,7 @@ TORCH := $(shell grep '^torch==' constraints.txt)
 # PyTorch's builds for the CPU. The plain wheel of the package index brings gigabytes of CUDA on Linux; for a GPU: TORCH_INDEX=https://download.pytorch.org/whl/cu130
 TORCH_INDEX ?= https://download.pytorch.org/whl/cpu
 # Byte code is compiled when a module is first imported: most of what is installed never is.
-PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile --no-deps
+PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile
 DEMO_OUT ?= out/demo
 
 LOCK := --config-file packaging/uv.toml --universal --python-version 3.11.5 --generate-hashes --constraint constraints.txt \
@@ -49,15 +49,15 @@ $(RUNTIME): pyproject.toml constraints.txt packaging/runtime.lock
 	@test -n "$(PYTHON)" || { echo "gsbake needs Python 3.11, 3.12 or 3.13, and none is on the PATH; name one: make PYTHON=/path/to/python3.12" >&2; exit 1; }
 	@"$(PYTHON)" -c '$(IN_RANGE)' || { echo "gsbake needs Python 3.11, 3.12 or 3.13 (xatlas has no wheel for newer ones); $(PYTHON) is `"$(PYTHON)" --version 2>&1`" >&2; exit 1; }
 	@test -x $(BIN)/python || "$(PYTHON)" -m venv $(VENV) || { rm -rf $(VENV); echo "$(PYTHON) cannot make a virtual environment; on Debian: sudo apt-get install python3-venv" >&2; exit 1; }
+	$(PIP) --no-deps --require-hashes --requirement packaging/runtime.lock
 	@echo "Installing PyTorch from $(TORCH_INDEX)"
-	@$(PIP) --index-url $(TORCH_INDEX) --retries 1 $(TORCH) || { echo "Name another index of PyTorch's builds: make TORCH_INDEX=https://…" >&2; exit 1; }
-	$(PIP) --require-hashes --requirement packaging/runtime.lock
-	$(PIP) --no-build-isolation --editable .
+	@$(PIP) --index-url $(TORCH_INDEX) --retries 1 $(TORCH) || { echo "PyTorch is not to be had from $(TORCH_INDEX); name a mirror of it: make TORCH_INDEX=https://… (https://pypi.org/simple brings gigabytes of CUDA libraries on Linux)" >&2; exit 1; }
+	$(PIP) --no-deps --no-build-isolation --editable .
 	@$(BIN)/gsbake doctor --fetch-weights || echo "Without it masks are not made; everything else works." >&2
 	@touch $@
 
 $(DEV): $(RUNTIME) packaging/dev.lock
-	$(PIP) --require-hashes --requirement packaging/dev.lock
+	$(PIP) --no-deps --require-hashes --requirement packaging/dev.lock
 	@touch $@
 
 node: $(VENV)/node/.stamp ## Install the JavaScript reference implementations that tests compare with

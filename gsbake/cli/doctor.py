@@ -122,7 +122,7 @@ def library_findings() -> list[Finding]:
 def advice_for(library: str, error: str, *, installed: bool) -> str:
     """Advice for a library that does not load."""
     if not installed:
-        return f"pip install {library} (or run `make setup` again)"
+        return f"pip install {library} (or install gsbake again)"
     missing = re.search(r"(lib[\w.+-]+?\.so)[.\d]*: cannot open shared object file", error)
     if missing:
         package = DEBIAN.get(missing.group(1))
