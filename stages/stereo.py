@@ -25,7 +25,7 @@ KERNELS = (
 
 STAGE = Stage(
     name="stereo",
-    version=11,
+    version=12,
     title="Multi-view stereo",
     run=run,
     summary="{points} points, {confirmed_share:%} of the object confirmed",

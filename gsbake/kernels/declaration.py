@@ -4,9 +4,11 @@
     def sums(values, rows, factor): ...
 
 Numba compiles a function for the types that it is first called with, inside the call. A declared kernel is an ordinary Numba dispatcher
-beside its signature: `compile_module` compiles all kernels of a module, or loads them from Numba's cache on the disk. Functions that only
-kernels call need no declaration; they are compiled with the kernel. Types are Numba's, as text: `f4[:, ::1]` is a contiguous float32 array
-of two dimensions, `i8` a 64-bit integer, `b1` a boolean.
+beside its signature: `compile_module` compiles all kernels of a module, or loads them from Numba's cache on the disk. Types are Numba's,
+as text: `f4[:, ::1]` is a contiguous float32 array of two dimensions, `i8` a 64-bit integer, `b1` a boolean.
+
+Functions that only kernels call need no declaration; they are compiled with the kernel, and take over its fast-math flags unless they name
+their own. What kernels with and without such flags call must name them: its rounding would depend on which is compiled first.
 """
 
 from __future__ import annotations

@@ -21,7 +21,7 @@ from gsbake.shading.octahedral import MIN_L1_NORM
 #: No fast-math flags: Numba optimises the body of a parallel loop once for the process that compiles it and once more for the copy on the
 #: disk, so with them a first run would round differently from all later ones. Small functions are inlined by LLVM (`forceinline`): inlined
 #: by Numba, before it infers types and analyses parallel loops, they make the compilation of a long kernel eight times as long.
-_FLAGS: Any = {"error_model": "numpy", "cache": True, "nogil": True}
+_FLAGS: Any = {"fastmath": False, "error_model": "numpy", "cache": True, "nogil": True}
 
 #: Pixel chunks with separate gradient tables; fixed, for results that do not depend on the number of threads.
 CHUNKS = 8

@@ -54,3 +54,34 @@ def test_stages_name_every_module_with_kernels_and_its_types_are_valid() -> None
     for name in sorted(named):
         for dispatcher, types in declared(name):
             assert len(types) == dispatcher.py_func.__code__.co_argcount, dispatcher
+
+
+def compiled_functions() -> dict[tuple[str, str], tuple[str, set[str]]]:
+    """{(file, function): (its options as text, names of the functions it calls)} of all compiled functions of the library."""
+    found = {}
+    for path in sorted((ROOT / "gsbake").rglob("*.py")):
+        tree = ast.parse(path.read_text("utf-8"))
+        assigned = [node for node in ast.walk(tree) if isinstance(node, ast.AnnAssign) and node.value is not None]
+        shared = {ast.unparse(node.target): ast.unparse(node.value) for node in assigned if node.value is not None}
+        for function in ast.walk(tree):
+            if isinstance(function, ast.FunctionDef):
+                texts = [ast.unparse(one) for one in function.decorator_list]
+                options = " ".join(text for text in texts if "njit" in text or text.startswith("kernel("))
+                if options:
+                    options += "".join(f" {value}" for name, value in shared.items() if f"**{name}" in options)
+                    options += " fastmath" if "**JIT" in options else ""  # of the rasteriser's blocks
+                    calls = {one.func.id for one in ast.walk(function) if isinstance(one, ast.Call) and isinstance(one.func, ast.Name)}
+                    found[path.name, function.name] = (options, calls)
+    return found
+
+
+def test_what_a_kernel_with_fast_math_calls_names_its_own_flags() -> None:
+    functions = compiled_functions()
+    named = {name for (_, name), (options, _) in functions.items() if "fastmath" in options}
+    names = {name for _, name in functions}
+    missing = {
+        (file, name, call)
+        for (file, name), (options, calls) in functions.items() if "fastmath" in options and "fastmath=False" not in options
+        for call in calls & names - named
+    }  # fmt: skip
+    assert len(functions) > 100 and not missing

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from gsbake.geometry.cameras import Camera
 
 
-@nb.njit(error_model="numpy", nogil=True, cache=True)
+@nb.njit(fastmath=False, error_model="numpy", nogil=True, cache=True)
 def project_point(x: float, y: float, z: float, p: Any, intrinsics: Any, size: Any) -> tuple[int, int, float]:
     """Column, row and z-depth of a point in a photo (arrays of `camera_arrays`); depth 0 behind the camera or outside the frame."""
     here = p[2, 0] * x + p[2, 1] * y + p[2, 2] * z + p[2, 3]
@@ -25,7 +25,7 @@ def project_point(x: float, y: float, z: float, p: Any, intrinsics: Any, size: A
     return int(across), int(down), here
 
 
-@nb.njit(error_model="numpy", nogil=True, cache=True)
+@nb.njit(fastmath=False, error_model="numpy", nogil=True, cache=True)
 def half_steps_inside(solid: Any, i: float, j: float, k: float, dx: float, dy: float, dz: float, most: int) -> int:
     """Half-cell steps of a ray inside the cells `solid` (n, n, n), counted from the point (i, j, k), in cells, in both directions of the
     vector (dx, dy, dz); stops at `most`. The point itself does not count."""
@@ -42,7 +42,7 @@ def half_steps_inside(solid: Any, i: float, j: float, k: float, dx: float, dy: f
     return count
 
 
-@nb.njit(error_model="numpy", nogil=True, cache=True)
+@nb.njit(fastmath=False, error_model="numpy", nogil=True, cache=True)
 def trilinear(field: Any, x: Any, y: Any, z: Any) -> Any:
     """Value of a `field` (n0, n1, n2) at lattice coordinates; 1000 beyond the grid."""
     n0, n1, n2 = field.shape
