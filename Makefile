@@ -13,7 +13,8 @@ PYTHON ?= $(shell for p in python3.11 python3.12 python3.13 python3 python; do \
 TORCH := $(shell grep '^torch==' constraints.txt)
 # PyTorch's builds for the CPU. The plain wheel of the package index brings gigabytes of CUDA on Linux; for a GPU: TORCH_INDEX=https://download.pytorch.org/whl/cu130
 TORCH_INDEX ?= https://download.pytorch.org/whl/cpu
-# Byte code is compiled when a module is first imported: most of what is installed never is.
+# Byte code is compiled when a module is first imported, as most of what is installed never is, and kept, as every stage is a process of its own.
+unexport PYTHONDONTWRITEBYTECODE
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile
 DEMO_OUT ?= out/demo
 
