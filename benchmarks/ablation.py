@@ -29,9 +29,9 @@ from unittest.mock import patch
 
 import numpy as np
 
-from benchmarks.csv_rows import read_rows, today, write_rows
+from benchmarks.csv_rows import current_commit, read_rows, today, write_rows
 from benchmarks.materials import truth_subset
-from benchmarks.objects.__main__ import FIGURES, PYTHON, SCORER, current_commit, score
+from benchmarks.objects.__main__ import FIGURES, PYTHON, SCORER, score
 from benchmarks.timeline import ROOT
 from benchmarks.upper_bound import finished_folders
 from gsbake.config.load import load_profile

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import subprocess
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, fields
 from datetime import UTC, datetime
@@ -13,6 +14,15 @@ from typing import Any, ClassVar, Protocol, TypeVar
 def today() -> str:
     """Today's date (UTC), year first."""
     return datetime.now(UTC).date().isoformat()
+
+
+def current_commit() -> str:
+    """The short hash of the checkout, with a plus where it has changes."""
+
+    def git(*arguments: str) -> str:
+        return subprocess.run(["git", *arguments], cwd=Path(__file__).parent, capture_output=True, text=True, check=False).stdout.strip()
+
+    return git("rev-parse", "--short", "HEAD") + ("+" if git("status", "--porcelain", "--untracked-files=no") else "")
 
 
 class KeyedRow(Protocol):

@@ -17,8 +17,7 @@ from typing import Any
 
 import torch
 
-from benchmarks.csv_rows import today
-from benchmarks.fields import commit
+from benchmarks.csv_rows import current_commit, today
 from benchmarks.raster import sphere
 from gsbake.config.schema import Profile
 from gsbake.pipeline.machine import missing_cuda_requirement
@@ -168,7 +167,7 @@ def main() -> int:
         print("  ".join(f"{v:18.2f}" for v in row.values()))
     if args.csv:
         with open(args.csv, "w", newline="") as file:
-            origin = {"commit": commit(), "host": f"{torch.cuda.get_device_name()}, torch {torch.__version__}", "date": today()}
+            origin = {"commit": current_commit(), "host": f"{torch.cuda.get_device_name()}, torch {torch.__version__}", "date": today()}
             writer = csv.DictWriter(file, [*rows[0], *origin])
             writer.writeheader()
             writer.writerows(row | origin for row in rows)

@@ -29,8 +29,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from benchmarks.csv_rows import today
-from benchmarks.fields import KEY, commit, parse, run_options, write
+from benchmarks.csv_rows import current_commit, today
+from benchmarks.fields import KEY, parse, run_options, write
 from benchmarks.timeline import ROOT
 from benchmarks.truth import Surface, camera_frame, nearest, nearest_on_faces, read_centres, read_truth
 from gsbake.api import open_session
@@ -172,7 +172,7 @@ def measure(capture: str, system: str, seed: int, settings: Sequence[str], out: 
                 spacing_cells=spacing / cell,
                 surfels=len(surfels),
                 counts=" ".join(f"{k}: {v}" for k, v in counts.items()),
-                commit=commit(), host=platform.node(),
+                commit=current_commit(), host=platform.node(),
             )
         )  # fmt: skip
     return rows

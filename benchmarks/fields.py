@@ -20,7 +20,6 @@ import json
 import os
 import platform
 import shutil
-import subprocess
 import sys
 import tomllib
 from collections.abc import Sequence
@@ -30,7 +29,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.csv_rows import today
+from benchmarks.csv_rows import current_commit, today
 from benchmarks.skip import CpuClock
 from benchmarks.timeline import BUILT_IN, CAPTURES, ROOT, manifests, names
 from benchmarks.truth import measure_stage, read_truth
@@ -76,15 +75,6 @@ class Row:
     commit: str = ""
     host: str = ""
     date: str = field(default_factory=today)
-
-
-def commit() -> str:
-    """The short hash of the checkout, with a plus where it has changes."""
-
-    def git(*arguments: str) -> str:
-        return subprocess.run(["git", *arguments], cwd=ROOT, capture_output=True, text=True, check=False).stdout.strip()
-
-    return git("rev-parse", "--short", "HEAD") + ("+" if git("status", "--porcelain", "--untracked-files=no") else "")
 
 
 def sizes() -> list[str]:
@@ -154,7 +144,7 @@ def run_options(capture: str, system: str, seed: int, settings: Sequence[str], o
 
 def measure(capture: str, system: str, seed: int, settings: Sequence[str], out: Path, threads: int) -> Row:
     """Run one system on one capture up to the mesh (or use cached stages), and measure it."""
-    row = Row(capture, system, " ".join(settings), seed, commit=commit(), host=platform.node())
+    row = Row(capture, system, " ".join(settings), seed, commit=current_commit(), host=platform.node())
     options, truth = run_options(capture, system, seed, settings, out, threads)
     clock = CpuClock(options.out / "cpu.json")
     try:

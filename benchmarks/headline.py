@@ -14,12 +14,11 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import SimpleNamespace
 
 import psutil
 
-from benchmarks.csv_rows import read_rows, today, write_rows
-from benchmarks.objects.__main__ import SCORER, bake, current_commit, score
+from benchmarks.csv_rows import current_commit, read_rows, today, write_rows
+from benchmarks.objects.__main__ import FIGURES, SCORER, bake, score
 from benchmarks.timeline import ROOT
 from gsbake.system.limits import cpu_name
 
@@ -57,12 +56,15 @@ def measure(capture: Path, profile: str, out: Path, scorer: Path) -> Row:
     seconds = bake(capture, out, argparse.Namespace(profile=profile, seed=0, settings=[]))
     stages = [json.loads(path.read_text(encoding="utf-8")) for path in out.glob("stages/*/*/manifest.json")]
     solved = json.loads(next(out.glob("stages/poses/*/cameras.json")).read_text(encoding="utf-8"))["poses"] != "given"
-    found = SimpleNamespace(**score(capture, out / "asset.glb", out / "cameras.json" if solved else None, scorer))
+    found = score(capture, out / "asset.glb", out / "cameras.json" if solved else None, scorer)
+    columns = ("chamfer_pct", "normal_deg", *(("relit_scaled", "base_scaled") if profile == "relight" else ()))
+    figures = {column: round(float(found[FIGURES[column]]), 4) for column in columns}
+    figures = dict.fromkeys(("relit_scaled", "base_scaled")) | figures
     peak = max(stage["peak_bytes"] for stage in stages) / 1e6
-    maps = (round(found.relight_psnr_scaled, 3), round(found.albedo_psnr_scaled, 3)) if profile == "relight" else (None, None)
     processors = f"{psutil.cpu_count()} x {cpu_name()}"
-    shape = round(found.chamfer_pct, 4), round(found.normal_deg, 3)
-    return Row(capture.name, profile, seconds, round(peak, 1), *shape, *maps, "measured", processors, current_commit())
+    return Row(
+        capture.name, profile, seconds, round(peak, 1), source="measured", processors=processors, commit=current_commit(), **figures
+    )  # fmt: skip
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

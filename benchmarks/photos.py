@@ -10,9 +10,7 @@ leaves out (`benchmarks.rigidity`). CPU seconds are those of both stages. Rows o
 
 from __future__ import annotations
 
-import argparse
 import shutil
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -20,8 +18,8 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.csv_rows import read_rows, today, write_rows
-from benchmarks.fields import commit
+from benchmarks.captures import measure_captures
+from benchmarks.csv_rows import current_commit, today
 from benchmarks.masks import compare
 from benchmarks.rigidity import shares
 from benchmarks.skip import CpuClock
@@ -30,7 +28,7 @@ from gsbake.api import RunOptions, open_session
 from gsbake.capture.hull.visual_hull import read_masks
 from gsbake.capture.posed_photos import PosedPhotos
 from gsbake.capture.sources import PHOTO_FOLDERS, list_photos
-from gsbake.errors import GsbakeError, UsageError
+from gsbake.errors import UsageError
 from gsbake.pipeline.machine import cpu_name
 
 RESULTS = ROOT / "benchmarks" / "results" / "photos.csv"
@@ -107,7 +105,7 @@ def measure(capture: Path, profile: str, out: Path) -> Row:
         _rounded(float(min(overlaps)) if overlaps else None),
         _rounded(left_out_pct(folders["poses"]) if masks else None),
         round(clock.total(states), 1),
-        commit(),
+        current_commit(),
         cpu_name(),
     )
 
@@ -118,19 +116,10 @@ def _rounded(value: float | None) -> float | None:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Measure the captures, writing a row after each."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("captures", nargs="*", default=list(NAMES))
-    parser.add_argument("--profile", default="preview")
-    parser.add_argument("--out", type=Path, default=ROOT / "out" / "bench" / "photos")
-    parser.add_argument("--csv", type=Path, default=RESULTS)
-    options = parser.parse_args(arguments)
-    for name in options.captures:
-        try:
-            row = measure(CAPTURES / name, options.profile, options.out / f"{name}-{options.profile}")
-        except GsbakeError as error:
-            parser.error(f"{name}: {error}")
-        write_rows(options.csv, [*read_rows(options.csv, Row), row])
-        sys.stdout.write(f"{row}\n")
+    def run(name: str, profile: str, out: Path) -> Row:
+        return measure(CAPTURES / name, profile, out / f"{name}-{profile}")
+
+    measure_captures(__doc__, NAMES, RESULTS, Row, run, arguments)
 
 
 if __name__ == "__main__":

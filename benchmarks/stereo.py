@@ -10,23 +10,21 @@ Rows of other captures in the CSV stay.
 
 from __future__ import annotations
 
-import argparse
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
-from benchmarks.csv_rows import read_rows, today, write_rows
-from benchmarks.fields import commit
+from benchmarks.captures import measure_captures
+from benchmarks.csv_rows import current_commit, today
 from benchmarks.hull import measure_folders
 from benchmarks.skip import CpuClock
 from benchmarks.timeline import ROOT, find_capture, manifests
 from benchmarks.truth import ALIGNMENT_POINTS, align_points, nearest, read_centres, read_truth
 from gsbake.api import RunOptions, open_session
 from gsbake.capture.posed_photos import PosedPhotos
-from gsbake.errors import GsbakeError, UsageError
+from gsbake.errors import UsageError
 from gsbake.mvs.point_cloud import StereoCloud
 from gsbake.pipeline.machine import cpu_name
 
@@ -89,24 +87,12 @@ def measure(name: str, profile: str, out: Path) -> Row:
     shown = [round(float(v), 4) for v in (*figures, hulls.hull.chamfer_pct, hulls.carved.chamfer_pct)]
     spent = round(clock.total([s for s in states if s.name == "stereo"]), 1)
     share = round(100 * float(results["confirmed_share"]), 1)
-    return Row(name, profile, share, len(distance), *shown, spent, commit(), cpu_name())
+    return Row(name, profile, share, len(distance), *shown, spent, current_commit(), cpu_name())
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Measure the captures, writing a row after each."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("captures", nargs="*", default=list(NAMES))
-    parser.add_argument("--profile", default="preview")
-    parser.add_argument("--out", type=Path, default=ROOT / "out" / "bench" / "stereo")
-    parser.add_argument("--csv", type=Path, default=RESULTS)
-    options = parser.parse_args(arguments)
-    for name in options.captures:
-        try:
-            row = measure(name, options.profile, options.out)
-        except GsbakeError as error:
-            parser.error(f"{name}: {error}")
-        write_rows(options.csv, [*read_rows(options.csv, Row), row])
-        sys.stdout.write(f"{row}\n")
+    measure_captures(__doc__, NAMES, RESULTS, Row, measure, arguments)
 
 
 if __name__ == "__main__":

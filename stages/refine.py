@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from gsbake.pipeline.stage import Context, Stage
+from gsbake.surfels import KERNELS
 
 
 def run(ctx: Context) -> dict[str, Any]:
@@ -20,13 +21,6 @@ def run(ctx: Context) -> dict[str, Any]:
     )  # fmt: skip
 
 
-def kernels(settings: Any) -> tuple[str, ...]:
-    """See `gsbake.surfels.KERNELS`."""
-    from gsbake.surfels import KERNELS
-
-    return KERNELS
-
-
 STAGE = Stage(
     name="refine",
     version=4,
@@ -40,5 +34,5 @@ STAGE = Stage(
     ),
     uses_device=True,
     seeded=True,
-    kernels=kernels,
+    kernels=lambda settings: KERNELS,
 )  # fmt: skip

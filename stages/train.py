@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from gsbake.pipeline.stage import Context, Stage
+from gsbake.surfels import KERNELS
 
 
 def run(ctx: Context) -> dict[str, Any]:
@@ -21,13 +22,6 @@ def run(ctx: Context) -> dict[str, Any]:
     )  # fmt: skip
 
 
-def kernels(settings: Any) -> tuple[str, ...]:
-    """See `gsbake.surfels.KERNELS`."""
-    from gsbake.surfels import KERNELS
-
-    return KERNELS
-
-
 STAGE = Stage(
     name="train",
     version=12,
@@ -42,5 +36,5 @@ STAGE = Stage(
     ),
     uses_device=True,
     seeded=True,
-    kernels=kernels,
+    kernels=lambda settings: KERNELS,
 )  # fmt: skip

@@ -31,7 +31,6 @@ def test_a_module_in_the_current_folder_is_not_imported(tmp_path: Path, monkeypa
     assert "imported from the current folder" in unguarded.stderr  # the trap works
 
 
-@pytest.mark.slow
 def test_commands_of_the_tool_in_a_folder_with_such_a_file(tmp_path: Path) -> None:
     for name in ("dataclasses", "numpy", "psutil", "json"):
         (tmp_path / f"{name}.py").write_text("import os\nos.write(2, b'imported from the current folder')\nraise SystemExit(9)\n")

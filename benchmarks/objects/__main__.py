@@ -21,7 +21,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from benchmarks.csv_rows import read_rows, today, write_rows
+from benchmarks.csv_rows import current_commit, read_rows, today, write_rows
 from benchmarks.objects.entries import Entry, read_entries
 from benchmarks.timeline import ROOT
 from gsbake.errors import GsbakeError
@@ -133,14 +133,6 @@ def score(capture: Path, asset: Path, cameras: Path | None, scorer: Path) -> dic
     command += ["--cameras", str(cameras)] if cameras else []
     found = subprocess.run(command, check=True, capture_output=True, text=True).stdout
     return dict(json.loads(found[found.index("{") :]))
-
-
-def current_commit() -> str:
-    """Short hash of the tree's commit, with a plus sign when files differ from it."""
-    git = ["git", "-C", str(ROOT)]
-    found = subprocess.run([*git, "rev-parse", "--short", "HEAD"], check=True, capture_output=True, text=True).stdout.strip()
-    changed = subprocess.run([*git, "status", "--porcelain", "--untracked-files=no"], check=True, capture_output=True, text=True).stdout
-    return found + ("+" if changed.strip() else "")
 
 
 def main() -> None:

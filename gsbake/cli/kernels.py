@@ -73,10 +73,10 @@ def main() -> None:
     settings = load_profile("relight").profile
     modules = [name for stage in REGISTRY.up_to() for name in stage.kernels(settings)]
     compilation = Compilation(modules, processes())
-    compilation.start()
+    missing = compilation.start()
     compilation.wait(modules, lambda: None, lambda done, total: None)
     compilation.close()
-    sys.stdout.write(f"Kernels of {compilation.missing} modules compiled.\n")
+    sys.stdout.write(f"Kernels of {len(missing)} modules compiled.\n")
 
 
 if __name__ == "__main__":

@@ -24,44 +24,47 @@ from blake3 import blake3
 
 import gsbake
 from gsbake.python_process import python_command, python_environment
+from gsbake.system.limits import cpu_name
 
 #: Seconds between two looks at a stop request while waiting.
 _POLL = 0.1
 
 
 class Compilation:
-    """Compiles `modules` in this order in `processes` processes, from `start` on; those that the record names are left out."""
+    """Compiles `modules` in this order in `processes` processes, from `start` on; those that the record names are left out.
+
+    Nothing is read before `start`: most runs compute nothing, or nothing with kernels.
+    """
 
     def __init__(self, modules: Sequence[str], processes: int) -> None:
-        self._record = record_folder()
-        self._waiting = [name for name in dict.fromkeys(modules) if not self._compiled(name)]
-        self.missing = len(self._waiting)
+        self._modules = list(dict.fromkeys(modules))
+        self._processes = processes
+        self._record: Path | None = None
+        self._missing: list[str] | None = None
         self._done: set[str] = set()
         self._changed = threading.Condition()
-        self._processes = processes
         self._children: list[subprocess.Popen[str]] = []
         self._feeders: list[threading.Thread] = []
         self._queue: queue.SimpleQueue[str] = queue.SimpleQueue()
 
-    def start(self) -> None:
-        """Start the processes; nothing when all modules are compiled, or a second time."""
-        if self._children or not self._waiting:
-            return
-        for name in self._waiting:
-            self._queue.put(name)
-        for _ in range(min(self._processes, len(self._waiting))):
-            child = subprocess.Popen(
-                python_command("-m", "gsbake.kernels.compilation"), env=python_environment(), stdin=subprocess.PIPE, stdout=subprocess.PIPE,
-                stderr=subprocess.DEVNULL, text=True, encoding="utf-8",
-            )  # fmt: skip
-            self._children.append(child)
-            self._feeders.append(threading.Thread(target=self._feed, args=(child,), daemon=True))
-            self._feeders[-1].start()
+    def start(self) -> list[str]:
+        """Read the record and start the processes, once; the modules that were not compiled yet."""
+        if self._missing is None:
+            self._record = record_folder()
+            self._missing = [name for name in self._modules if self._record is None or not (self._record / name).exists()]
+            for name in self._missing:
+                self._queue.put(name)
+            for _ in range(min(self._processes, len(self._missing))):
+                self._start_process()
+        return self._missing
 
     def wait(self, modules: Sequence[str], check: Callable[[], None], report: Callable[[int, int], None]) -> None:
-        """Return when `modules` are compiled. While there is something to wait for, `check`, which may raise, and `report(done, total)` are
-        called several times a second. Returns early when all processes have ended."""
-        needed = [name for name in dict.fromkeys(modules) if name in self._waiting]
+        """Start where that was not done, and return when `modules` are compiled, or when all processes have ended.
+
+        While there is something to wait for, `check`, which may raise, and `report(done, total)` are called several times a second.
+        """
+        missing = self.start()
+        needed = [name for name in dict.fromkeys(modules) if name in missing]
         while True:
             with self._changed:
                 done = sum(name in self._done for name in needed)
@@ -78,8 +81,14 @@ class Compilation:
         for feeder in self._feeders:
             feeder.join()
 
-    def _compiled(self, module: str) -> bool:
-        return self._record is not None and (self._record / module).exists()
+    def _start_process(self) -> None:
+        child = subprocess.Popen(
+            python_command("-m", "gsbake.kernels.compilation"), env=python_environment(), stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL, text=True, encoding="utf-8",
+        )  # fmt: skip
+        self._children.append(child)
+        self._feeders.append(threading.Thread(target=self._feed, args=(child,), daemon=True))
+        self._feeders[-1].start()
 
     def _feed(self, child: subprocess.Popen[str]) -> None:
         """Give one process module after module until none is left or the process has ended."""
@@ -115,20 +124,13 @@ def record_folder() -> Path | None:
         content = path.read_bytes()
         if b"njit" in content or b"@kernel" in content:
             hasher.update(content)
-    hasher.update("\n".join((sys.version, version("numba"), platform.machine(), _processor())).encode())
+    hasher.update("\n".join((sys.version, version("numba"), platform.machine(), cpu_name())).encode())
     folder = Path(os.environ.get("NUMBA_CACHE_DIR") or package / "__pycache__") / f"kernels-{hasher.hexdigest(8)}"
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError:
         return None
     return folder if os.access(folder, os.W_OK) else None
-
-
-def _processor() -> str:
-    """The processor as Numba's cache tells processors apart."""
-    from llvmlite import binding
-
-    return f"{binding.get_host_cpu_name()} {binding.get_host_cpu_features().flatten()}"
 
 
 def main() -> None:

@@ -45,15 +45,14 @@ def wait(compilation: Compilation, modules: list[str]) -> list[tuple[int, int]]:
 
 def test_compiled_once_and_what_fails_is_left_to_its_caller(modules: list[str], tmp_path: Path) -> None:
     first = Compilation(modules, 2)
-    assert first.missing == 3
-    first.start()
+    assert first.start() == modules and first.start() == modules
     reports = wait(first, modules)
     assert reports and all(total == 3 and done < 3 for done, total in reports)
     assert len(list((tmp_path / "cache").rglob("*.nbc"))) == 2
     folder = record_folder()
     assert folder is not None and sorted(path.name for path in folder.iterdir()) == ["first_kernels", "second_kernels"]
     again = Compilation(modules, 2)
-    assert again.missing == 1 and not again._children
+    assert not again._children and again.start() == modules[2:]
     assert wait(again, modules[:2]) == []
 
 
