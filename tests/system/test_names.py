@@ -10,7 +10,7 @@ import pytest
 from gsbake.batch.captures import BatchOptions, plan_captures
 from gsbake.capture.ingest import photo_names
 from gsbake.errors import BadInputError, UsageError
-from gsbake.system.names import MAX_NAME_BYTES, portable_name, same_file_key
+from gsbake.system.names import MAX_NAME_BYTES, is_digest, portable_name, same_file_key, unusable_name
 
 
 @pytest.mark.parametrize("name", ["IMG_0001", "übung 3", "a.b", "console", "com10", "con-1", "[bold]", "photo %00", "写真"])
@@ -48,3 +48,29 @@ def test_captures_that_are_one_folder_elsewhere(tmp_path: Path) -> None:
         (tmp_path / name).mkdir(parents=True)
     with pytest.raises(UsageError, match="have the same name 'cup'"):
         plan_captures([tmp_path / "one/Cup", tmp_path / "two/cup"], BatchOptions(tmp_path / "out", "smoke"))
+
+
+@pytest.mark.parametrize("name", ["asset.glb", "photos/IMG_0001.png", ".hidden/a", "a" * 200 + ".png", "übung/写真.jpg", "a/b/c"])
+def test_names_that_may_be_files_of_an_artifact(name: str) -> None:
+    assert unusable_name([name, "manifest.json"]) is None
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["", ".", "..", "../x", "a/../b", "/etc/passwd", "a//b", "a/", "a\\b", "c:x", "a\x00b", "a\nb", "n" * 256, "n/" * 600 + "n", "con",
+     os.fsdecode(b"a\xff"), 7, None, ["a"]],
+)  # fmt: skip
+def test_names_that_may_not(name: object) -> None:
+    found = unusable_name(["asset.glb", name])
+    assert found is not None and found.isprintable() and len(found) <= 40
+
+
+def test_a_file_and_a_folder_of_one_name() -> None:
+    assert unusable_name(["a", "a.b", "ab/c"]) is None
+    assert unusable_name(["a/b/c", "x", "a/b"]) == "'a/b'"
+
+
+def test_digests() -> None:
+    assert is_digest("0" * 64)
+    for wrong in ("", "0" * 63, "0" * 65, "G" * 64, "0" * 64 + "\n", "../home/thesis.odt", 0, None):
+        assert not is_digest(wrong)
