@@ -89,8 +89,9 @@ class Session:
             raise UsageError("No target is set: name them, as in --target web,ar:usdz (settings: targets.files).")
         self.engine.shared = open_shared_store(self.store)
         try:
-            states = self.engine.run(until, on_accepted=lambda: self.project.save(self.out))
-            files = self._publish(states)
+            with self.engine.uses:  # until the results are copied
+                states = self.engine.run(until, on_accepted=lambda: self.project.save(self.out))
+                files = self._publish(states)
         except GsbakeError:
             with suppress(OSError):  # the first error is the one to report
                 self._publish(self.engine.finished)

@@ -25,6 +25,7 @@ from gsbake.errors import InterruptedRun
 from gsbake.pipeline.files import ensure_output_folder
 from gsbake.pipeline.lease import HEARTBEAT_TIMEOUT, LeaseHolder
 from gsbake.pipeline.machine import default_threads
+from gsbake.pipeline.shared_store import refuse_other_folders
 from gsbake.pipeline.supervise import StopSignals
 from gsbake.timing.estimate import History
 
@@ -71,6 +72,7 @@ def run_batch(
         execution = Execution(options.threads or default_threads())
     options = options.absolute()
     root = options.root
+    refuse_other_folders(options.store)
     ensure_output_folder(root)
     (root / FOLDER).mkdir(exist_ok=True)
     lock = FileLock(root / FOLDER / "lock")

@@ -20,6 +20,7 @@ from gsbake.batch.slurm import SlurmOptions
 from gsbake.cli.output import cell, print_json, print_table, print_text
 from gsbake.errors import BadInputError, InterruptedRun, UsageError
 from gsbake.pipeline.machine import default_threads
+from gsbake.pipeline.shared_store import refuse_other_folders
 from gsbake.text import duration, size
 from gsbake.timing.estimate import History
 
@@ -31,6 +32,7 @@ def plan(captures: Sequence[Path], options: BatchOptions, form: str | None) -> N
     if form is not None and form not in FORMATS:
         raise UsageError(f"--emit is one of {', '.join(FORMATS)}, not '{form}'.")
     options = options.absolute()
+    refuse_other_folders(options.store)
     plans = plan_captures(captures, options)
     outs = sorted(path.parent for path in options.root.glob("*/project.json"))
     jobs = make_jobs(plans, options, History.of_runs(outs, api.REGISTRY.names), options.threads or default_threads())

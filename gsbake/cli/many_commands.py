@@ -114,7 +114,7 @@ def cache_ls_command(out: OutOption = None, store: StoreOption = None, as_json: 
     from gsbake.cli import cache, shared_cache
 
     options = Options(out=out, store=store, as_json=as_json)
-    (cache if store is None else shared_cache).list_outputs(options)
+    (cache if out is not None or store is None else shared_cache).list_outputs(options)
 
 
 @command(cache_app, "verify")
@@ -125,7 +125,7 @@ def cache_verify_command(
     from gsbake.cli import cache, shared_cache
 
     options = Options(out=out, store=store, quiet=quiet, as_json=as_json)
-    (cache if store is None else shared_cache).verify(options)
+    (cache if out is not None or store is None else shared_cache).verify(options)
 
 
 @command(cache_app, "gc")
@@ -146,7 +146,7 @@ def cache_gc_command(
     from gsbake.cli import cache, shared_cache
 
     options = Options(out=out, store=store, dry_run=dry_run, quiet=quiet, as_json=as_json)
-    (cache if store is None else shared_cache).collect_garbage(options, keep, older)
+    (cache if out is not None or store is None else shared_cache).collect_garbage(options, keep, older)
 
 
 @command(cache_app, "quota")

@@ -25,6 +25,7 @@ from gsbake.pipeline.digest import DigestCache, tree_digest
 from gsbake.pipeline.files import remove_tree, sync_tree
 from gsbake.pipeline.key import KEY_PREFIX_LENGTH, CacheKey
 from gsbake.system import disk
+from gsbake.system.names import is_digest, unusable_name
 
 MANIFEST = "manifest.json"
 #: Name of the folder of parts of a stage's work that later runs use again.
@@ -34,9 +35,17 @@ REPLACEMENT = "replaced.json"
 REPLACEMENT_PREFIX = "by-hand"
 #: Folder name of a computed artifact, and of a replacement.
 ARTIFACT_FOLDER = re.compile(rf"[0-9a-f]{{{KEY_PREFIX_LENGTH}}}")
+#: Name of a temporary folder of an artifact or a replacement, and of an incomplete lease file.
+TEMPORARY_FOLDER = re.compile(rf"([0-9a-f]{{{KEY_PREFIX_LENGTH}}}|{REPLACEMENT_PREFIX})\.tmp-[0-9a-f]{{8}}")
+LEASE_LEFTOVER = re.compile(rf"\.([0-9a-f]{{{KEY_PREFIX_LENGTH}}}|{REPLACEMENT_PREFIX})\.lease\.[0-9a-f.]{{1,64}}\.tmp")
 _REPLACEMENT_FOLDER = re.compile(rf"{REPLACEMENT_PREFIX}-[0-9a-f]{{8}}")
+#: Kinds of a manifest's fields that may be absent.
+_KINDS: Mapping[str, type] = {
+    "settings": dict, "inputs": dict, "results": dict, "parts": dict, "host": dict, "versions": dict, "decisions": list, "warnings": list,
+    "stage": str, "key": str,
+}  # fmt: skip
 #: Files that file managers leave in folders they show; no stage reads them.
-_FILE_MANAGER_FILES = frozenset({".DS_Store", "Thumbs.db", "desktop.ini", ".directory"})
+FILE_MANAGER_FILES = frozenset({".DS_Store", "Thumbs.db", "desktop.ini", ".directory"})
 
 
 @dataclass(frozen=True)
@@ -178,12 +187,25 @@ class Store:
 
     def remove_leftovers(self, stage: str, key: str) -> None:
         """Delete temporary files of killed runs for this key; the caller holds its lease."""
-        with suppress(FileNotFoundError):
-            for entry in self.stage_folder(stage).iterdir():
-                if entry.name.startswith(f"{key[:KEY_PREFIX_LENGTH]}.tmp-"):
-                    remove_tree(entry)
-                elif entry.name.startswith(f".{key[:KEY_PREFIX_LENGTH]}.") and entry.suffix == ".tmp":  # an incomplete lease file
-                    entry.unlink(missing_ok=True)
+        prefix = key[:KEY_PREFIX_LENGTH]
+        for entry in self.own_entries(stage):
+            if TEMPORARY_FOLDER.fullmatch(entry.name) and entry.name.startswith(prefix) and entry.is_dir():
+                remove_tree(entry)
+            elif LEASE_LEFTOVER.fullmatch(entry.name) and entry.name.startswith(f".{prefix}.") and entry.is_file():
+                entry.unlink(missing_ok=True)
+
+    def own_entries(self, stage: str) -> list[Path]:
+        """What is in a stage's folder, without links; nothing where the folder itself is one, or `stages/`, because it may be anybody's."""
+        if self.behind_link(stage) is not None:
+            return []
+        with suppress(FileNotFoundError, NotADirectoryError):
+            return [entry for entry in sorted(self.stage_folder(stage).iterdir()) if not entry.is_symlink()]
+        return []
+
+    def behind_link(self, stage: str) -> Path | None:
+        """The link that the stage's folder is or lies behind, inside the output folder."""
+        folder = self.stage_folder(stage)
+        return next((path for path in (folder.parent, folder) if path.is_symlink()), None)
 
     def verify(self, stage: str) -> list[tuple[Path, list[str]]]:
         """(folder, faults) of every artifact and replacement of a stage, from the bytes on the disk."""
@@ -244,12 +266,18 @@ class Store:
         return Artifact(folder, files, manifest, replaced=bool(manifest.get("replaced")))
 
 
+def lease_path(folder: Path) -> Path:
+    """The lease file of an artifact, replacement, checkpoint or temporary folder."""
+    prefix = REPLACEMENT_PREFIX if folder.name.startswith(REPLACEMENT_PREFIX) else folder.name[:KEY_PREFIX_LENGTH]
+    return folder.with_name(f"{prefix}.lease")
+
+
 def _list_all(folder: Path) -> list[str]:
     """Sorted relative POSIX names of all files, hidden ones included, and of links to folders; without those of file managers."""
     found = []
     for root, folders, names in os.walk(folder):
         links = [name for name in folders if os.path.islink(os.path.join(root, name))]
-        found += [Path(root, name).relative_to(folder).as_posix() for name in [*names, *links] if name not in _FILE_MANAGER_FILES]
+        found += [Path(root, name).relative_to(folder).as_posix() for name in [*names, *links] if name not in FILE_MANAGER_FILES]
     return sorted(found)
 
 
@@ -274,16 +302,20 @@ def parse_manifest(content: bytes) -> dict[str, Any] | None:
         intact = isinstance(body, dict) and body.get("seal") == _seal(body)
     except (ValueError, RecursionError):
         return None
-    return body if intact and _well_formed(body.get("files")) and isinstance(body.get("settings", {}), dict) else None
+    return body if intact and _well_formed(body) else None
 
 
-def _well_formed(files: object) -> bool:
-    """Whether a manifest's list of files has digests and sizes, and names inside the artifact's folder only."""
-    if not isinstance(files, dict):
+def _well_formed(body: Mapping[str, Any]) -> bool:
+    """Whether a manifest's fields are of the kinds that gsbake writes, and its files have digests, sizes, and names of files that can lie
+    together in the artifact's folder. The seal does not tell: anybody can make one."""
+    files, inputs = body.get("files"), body.get("inputs", {})
+    if not isinstance(files, dict) or not all(isinstance(body.get(name, kind()), kind) for name, kind in _KINDS.items()):
         return False
-    inside = all(not name.startswith("/") and ".." not in name.split("/") and not {"\\", ":"} & set(name) for name in files)
     entries = [entry if isinstance(entry, dict) else {} for entry in files.values()]
-    return inside and all(isinstance(e.get("digest"), str) and isinstance(e.get("bytes"), int) for e in entries)
+    sized = all(is_digest(e.get("digest")) and type(e.get("bytes")) is int and e["bytes"] >= 0 for e in entries)
+    nested = [entry for known in inputs.values() for entry in (known, isinstance(known, dict) and known.get("files", {}))]
+    named = MANIFEST not in files and unusable_name([*files, MANIFEST]) is None
+    return sized and named and all(isinstance(entry, dict) for entry in nested)
 
 
 def _seal(manifest: Mapping[str, Any]) -> str:
