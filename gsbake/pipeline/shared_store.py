@@ -383,7 +383,7 @@ def _in_words() -> Iterator[None]:
         yield
     except PermissionError as error:
         raise StoreUnreachableError("it may not be read") from error
-    except OSError as error:
-        if error.errno in DISK_FULL:
+    except (OSError, ValueError) as error:  # ValueError: a stage whose name a store cannot have
+        if isinstance(error, OSError) and error.errno in DISK_FULL:
             raise
         raise StoreUnreachableError(in_words(error)) from error

@@ -25,6 +25,8 @@ from gsbake.pipeline.store import lease_path
 
 FOLDER = "running"
 _NAME = re.compile(r"[0-9a-f]{32}\.json")
+#: Name of such a file while it is written.
+_HALF_WRITTEN = re.compile(r"\.[0-9a-f]{32}\.json\.[0-9]+\.[0-9a-f]{8}\.tmp")
 #: Seconds after which a file of another host, whose clock may differ, is stale.
 _FORGOTTEN = 3600.0
 #: Times that the folder is made, which another run may delete when it ends.
@@ -88,7 +90,7 @@ class Uses:
 def in_use(out: Path) -> frozenset[str]:
     """The artifacts, as "<stage>/<folder>", that runs in progress use."""
     found: set[str] = set()
-    for path in _files(out):
+    for path in _files(out, _NAME):
         with suppress(OSError, ValueError, RecursionError):
             names = json.loads(path.read_bytes()).get("uses", [])
             if not _is_stale(path):
@@ -98,15 +100,15 @@ def in_use(out: Path) -> frozenset[str]:
 
 def forget_killed(out: Path) -> None:
     """Delete the files of runs that were killed."""
-    for path in _files(out):
+    for path in (*_files(out, _NAME), *_files(out, _HALF_WRITTEN)):
         if _is_stale(path):
             path.unlink(missing_ok=True)
 
 
-def _files(out: Path) -> list[Path]:
+def _files(out: Path, pattern: re.Pattern[str]) -> list[Path]:
     folder = out / FOLDER
     with suppress(OSError):
-        return [path for path in folder.iterdir() if _NAME.fullmatch(path.name) and not folder.is_symlink() and not path.is_symlink()]
+        return [path for path in folder.iterdir() if pattern.fullmatch(path.name) and not folder.is_symlink() and not path.is_symlink()]
     return []
 
 

@@ -212,6 +212,9 @@ def test_files_of_killed_runs_do_not_count(store: Store) -> None:
     for number, text in enumerate((json.dumps({**holder, "uses": [entry.name]}), "{", "[" * 100_000)):
         (folder / f"{number:032x}.json").write_text(text)
         os.utime(folder / f"{number:032x}.json", (1.0, 1.0))
+    half = folder / f".{7:032x}.json.17.0123abcd.tmp"
+    half.write_text("{")
+    os.utime(half, (1.0, 1.0))
     (folder / "notes.json").write_text("mine")
     assert not in_use(store.out) and delete(store, [entry]) == [entry]
     assert [path.name for path in folder.iterdir()] == ["notes.json"]
