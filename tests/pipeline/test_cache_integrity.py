@@ -31,7 +31,7 @@ def test_planted_file_is_set_aside(photos: Path, name: str, finished: Path) -> N
     again, recorder = engine(out, photos)
     again.run()
     assert recorder.cached == ["read", "sum", "tell"]
-    moved = [path for path in (out / "unexpected").rglob("*") if path.is_file()]
+    moved = [path for path in (out / "set-aside").rglob("*") if path.is_file()]
     assert [path.read_text() for path in moved] == ["stranger"] and not planted.exists()
 
 
@@ -64,7 +64,7 @@ def test_planted_file_in_a_replacement_is_set_aside(tmp_path: Path, photos: Path
     planted = replace_output(Store(out), "sum", {"total.txt": mine}, None).folder / "emissive.exr"
     planted.write_text("stranger")
     engine(out, photos)[0].run()
-    assert not planted.exists() and [path.read_text() for path in out.glob("unexpected/sum/*/*")] == ["stranger"]
+    assert not planted.exists() and [path.read_text() for path in out.glob("set-aside/sum/*/*")] == ["stranger"]
     assert (artifact(out, "tell") / "tell.txt").exists()
 
 
