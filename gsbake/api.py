@@ -95,38 +95,40 @@ class Session:
         self.engine.shared = open_shared_store(self.store)
         try:
             states = self.engine.run(until, on_accepted=lambda: self.project.save(self.out))
-            files = self._publish(states)
+            files, notes = self._publish(states)
         except GsbakeError:
-            with suppress(OSError):  # the first error is the one to report
+            with suppress(OSError, GsbakeError):  # the first error is the one to report
                 self._publish(self.engine.finished)
             raise
         except OSError as error:
             raise disk_error(error, self.out) or BadInputError(
                 f"The output folder '{self.out}' cannot be written ({error.strerror}); choose another with --out."
             ) from error
-        return Result(self.out, files, tuple(states))
+        return Result(self.out, files, tuple(states), notes)
 
-    def _publish(self, states: Sequence[StageState]) -> dict[str, Path]:
-        """Copy the results of these stages to the output folder; returns {file: path}."""
+    def _publish(self, states: Sequence[StageState]) -> tuple[dict[str, Path], tuple[str, ...]]:
+        """Copy the results of these stages to the output folder; returns {file: path} and what needs a word."""
         artifacts = artifacts_by_stage(states)
         if not RESULTS.keys() & artifacts.keys():
-            return {}
+            return {}, ()
         store = self.engine.store
         done = publish_results(self.out, artifacts, self.project, store, overwrite=self.overwrite)
         done.project.save(self.out)
         store.digests.save()
         for stage, text in done.notes:
             self.engine.warn(stage, text)
-        return done.files
+        return done.files, tuple(text for _, text in done.notes)
 
 
 @dataclass(frozen=True)
 class Result:
-    """A finished run: output folder, published `files` by name ("asset.glb", …) and the state of every stage."""
+    """A finished run: output folder, published `files` by name ("asset.glb", …), the state of every stage, and sentences on files that lie
+    elsewhere than usual, because others are in their places."""
 
     out: Path
     files: Mapping[str, Path]
     stages: tuple[StageState, ...]
+    notes: tuple[str, ...] = ()
 
     def results(self, stage: str) -> Mapping[str, Any]:
         """Figures that a stage reported, for example `results("poses")["registered"]`.

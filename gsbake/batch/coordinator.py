@@ -173,5 +173,6 @@ def _outcomes(plans: Sequence[CapturePlan], failures: dict[str, Record], ran: se
         elif record is not None and record.final and plan.name in ran:
             found.append(Outcome(plan, "failed", record.message, record.exit_code))
         else:
-            found.append(Outcome(plan, "unfinished", record.message if record is not None else "", InterruptedRun.exit_code))
+            message = record.message if record is not None and record.exit_code else ""
+            found.append(Outcome(plan, "unfinished", message, InterruptedRun.exit_code))
     return found

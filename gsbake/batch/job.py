@@ -38,7 +38,7 @@ def run_job(document: dict[str, Any], job_id: str) -> Record:
         )  # fmt: skip
         session = open_session(options, registry=Registry(document["stages"]))
         try:
-            session.run(job["stages"][-1])
+            message = " ".join(session.run(job["stages"][-1]).notes)
         except GsbakeError:
             key = plan_state_key(session)
             raise

@@ -35,8 +35,8 @@ def require_own_records(root: Path) -> None:
 
 @dataclass(frozen=True)
 class Record:
-    """End of a job: exit code and sentence, seconds, host, `key`, the cache key of the first stage that it had to run, and the nodes of a
-    farm on which it was interrupted."""
+    """End of a job: exit code and sentence (of a job that is done: on files of the user's in the places of results), seconds, host, `key`,
+    the cache key of the first stage that it had to run, and the nodes of a farm on which it was interrupted."""
 
     capture: str
     job: str
