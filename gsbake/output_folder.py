@@ -50,9 +50,11 @@ def require_outside_sources(folder: Path, project: Project) -> None:
 
 
 def check_same_photos(out: Path, stored: Project | None, project: Project) -> UsageError | None:
-    """The refusal of photos that are not those of the output folder's run by their path; None where they are."""
+    """The refusal of photos that are not those of the output folder's run by their path; None where they are, or lie inside the folder."""
     if stored is None or stored.photos is None or project.photos is None or stored.photos == project.photos:
         return None
+    if out.resolve() in Path(project.photos).parents:
+        return None  # photos that moved together with their output folder, as the demo's do
     with suppress(OSError):
         if os.path.samefile(stored.photos, project.photos):
             return None

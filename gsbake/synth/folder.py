@@ -44,7 +44,7 @@ def require_unchanged(folder: Path, known: dict[str, list[str]]) -> None:
     for name in _files(folder):
         path = folder / name
         if path.is_symlink() or not path.is_file() or blake3(path.read_bytes()).hexdigest() not in known.get(name, ()):
-            raise UsageError(f"'{path}' was added or changed by hand; move it away, or name a new folder for the built-in capture.")
+            raise UsageError(f"'{path}' is not as gsbake wrote it; move it away, or name a new folder for the built-in capture.")
 
 
 def replace_capture(new: Path, folder: Path) -> None:

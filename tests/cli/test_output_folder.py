@@ -57,6 +57,8 @@ def test_the_demo_lies_around_its_capture(run: Run, capture: Path, tmp_path: Pat
     assert run("ingest", demo / "capture", "--out", demo).code == 2  # a capture of somebody's
     (demo / "capture" / MARK).write_text(json.dumps({"format": 1, "files": {}}))
     assert run("ingest", demo / "capture", "--out", demo).code == 0
+    copied = shutil.copytree(demo, tmp_path / "copy" / "demo")
+    assert run("ingest", copied / "capture", "--out", copied, "--json").json["stages"][0]["status"] == "cached"
 
 
 def test_an_output_among_the_photos_is_refused(run: Run, capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

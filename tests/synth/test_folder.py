@@ -59,7 +59,7 @@ def test_edited_and_added_files_are_kept(tmp_path: Path, name: str) -> None:
     write_capture(tmp_path)
     (tmp_path / name).write_text("mine")
     before = contents(tmp_path)
-    with pytest.raises(UsageError, match="added or changed by hand") as caught:
+    with pytest.raises(UsageError, match="is not as gsbake wrote it") as caught:
         write_capture(tmp_path)
     assert name in str(caught.value).replace("\\", "/") and contents(tmp_path) == before
 
@@ -90,6 +90,6 @@ def test_a_capture_of_an_earlier_version_is_recognised_by_its_layout(tmp_path: P
     write_capture(tmp_path)
     (tmp_path / MARK).unlink()
     (tmp_path / "images" / "000.png").write_text("edited")
-    with pytest.raises(UsageError, match="added or changed by hand"):
+    with pytest.raises(UsageError, match="is not as gsbake wrote it"):
         write_capture(tmp_path)
     assert (tmp_path / "images" / "000.png").read_text() == "edited"
