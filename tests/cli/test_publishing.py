@@ -12,7 +12,7 @@ import gsbake
 import gsbake.api
 from gsbake.pipeline.project import PROJECT, Project
 from gsbake.pipeline.store import Store
-from gsbake.publish import Publication, publish_results
+from gsbake.publish import RESULTS, Publication, publish_results
 from tests.cli import toy_bake
 from tests.cli.conftest import Run
 
@@ -22,11 +22,12 @@ def names(out: Path, pattern: str) -> set[str]:
 
 
 def publish(out: Path, text: str, *, overwrite: bool = False) -> Publication:
-    """Publish an export whose asset holds `text`, as a run that computed it does."""
+    """Publish an export whose files hold `text`, as a run that computed it does."""
     store = Store(out)
     key = blake3(text.encode()).hexdigest()
     temporary = store.temporary("export", key)
-    (temporary / "asset.glb").write_text(text)
+    for name in RESULTS["export"]:
+        (temporary / name).write_text(text)
     artifact = store.publish(temporary, store.folder("export", key), {"stage": "export"})
     done = publish_results(out, {"export": artifact}, Project.load(out) or Project(), store, overwrite=overwrite)
     done.project.save(out)
@@ -98,27 +99,27 @@ def test_what_a_killed_run_published_is_known_as_gsbakes(tmp_path: Path) -> None
     assert (tmp_path / "asset.glb").read_text() == "three" and names(tmp_path, "asset*") == {"asset.glb"}
 
 
-def test_what_gsbake_never_published_stays(run: Run, capture: Path, tmp_path: Path) -> None:
+def test_what_gsbake_never_published_stays(tmp_path: Path) -> None:
     """A file, a link and a folder in the place of a result."""
-    out, elsewhere = tmp_path / "o", tmp_path / "elsewhere.glb"
-    run("mesh", capture, "--out", "o")
+    elsewhere = tmp_path / "elsewhere.glb"
     elsewhere.write_text("precious")
-    (out / "asset.glb").symlink_to(elsewhere)
-    (out / "report.html").mkdir()
-    (out / "cameras.json").write_text("mine")
-    assert run("run", "--out", "o").code == 0
-    assert elsewhere.read_text() == "precious" and (out / "asset.glb").is_symlink() and (out / "cameras.json").read_text() == "mine"
-    assert (out / "asset.new.glb").read_text() == "glb ply 30000" and (out / "report.new.html").read_text() == "<html>"
-    run("run", "--out", "o", "--overwrite")
-    assert elsewhere.read_text() == "precious" and not (out / "asset.glb").is_symlink() and (out / "report.html").is_file()
-    assert (out / "set-aside" / "asset.glb").is_symlink() and (out / "set-aside" / "report.html").is_dir()
-    assert (out / "set-aside" / "cameras.json").read_text() == "mine"
+    (tmp_path / "asset.glb").symlink_to(elsewhere)
+    (tmp_path / "light.hdr").mkdir()
+    (tmp_path / "cameras.json").write_text("mine")
+    files = publish(tmp_path, "glb").files
+    assert {path.name for path in files.values()} == {"asset.new.glb", "light.new.hdr", "cameras.new.json"}
+    assert {path.read_text() for path in files.values()} == {"glb"} and elsewhere.read_text() == "precious"
+    assert (tmp_path / "asset.glb").is_symlink() and (tmp_path / "cameras.json").read_text() == "mine"
+    publish(tmp_path, "glb", overwrite=True)
+    assert elsewhere.read_text() == "precious" and all((tmp_path / name).read_text() == "glb" for name in files)
+    assert not (tmp_path / "asset.glb").is_symlink() and (tmp_path / "set-aside" / "asset.glb").is_symlink()
+    assert (tmp_path / "set-aside" / "light.hdr").is_dir() and (tmp_path / "set-aside" / "cameras.json").read_text() == "mine"
 
 
 def test_an_output_of_targets_and_a_projects_record_decide_no_path(
     run: Run, capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Only files of targets are published, and nothing but results is deleted."""
+    """Only files of targets are published, not through a link, and nothing but results is deleted."""
     monkeypatch.setattr(gsbake.api, "REGISTRY", toy_bake.WITH_TARGETS)
     end = run("run", capture, "--out", "o", "--target", "web")
     out = tmp_path / "o"
@@ -134,17 +135,10 @@ def test_an_output_of_targets_and_a_projects_record_decide_no_path(
     for name in victims:
         (out / name).write_text("from the targets")
     (out / "project.json").write_text(json.dumps({**project, "published": {**dict.fromkeys(victims, digest), "light.hdr": "0"}}))
-    assert run("run", "--out", "o").code == 0
+    (out / "asset_film").rename(tmp_path / "moved")
+    (tmp_path / "elsewhere").mkdir()
+    (out / "asset_film").symlink_to(tmp_path / "elsewhere")
+    end = run("run", "--out", "o")
+    assert end.code == 0 and "'asset_film/base_color.exr' is not published" in end.err and not list((tmp_path / "elsewhere").iterdir())
     assert all((out / name).read_text() == "from the targets" for name in victims)
     assert not set(victims) & json.loads((out / "project.json").read_text())["published"].keys()
-
-
-def test_a_folder_of_masters_that_is_a_link_is_not_written_through(
-    run: Run, capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(gsbake.api, "REGISTRY", toy_bake.WITH_TARGETS)
-    run("mesh", capture, "--out", "o")
-    (tmp_path / "elsewhere").mkdir()
-    (tmp_path / "o" / "asset_film").symlink_to(tmp_path / "elsewhere")
-    end = run("run", "--out", "o", "--target", "web")
-    assert end.code == 0 and list((tmp_path / "elsewhere").iterdir()) == [] and "'asset_film/base_color.exr' is not published" in end.err
