@@ -98,7 +98,7 @@ def stage_command(until: str, plan: CapturePlan, options: BatchOptions, threads:
     words = ["gsbake", until, str(plan.photos), "--out", str(plan.out), "--profile", options.profile, "--seed", str(options.seed)]
     for override in options.overrides:
         words += ["--set", override]
-    words += ["--threads", str(threads), "--quiet"]
+    words += ["--threads", str(threads), "--quiet", *(["--moved"] if options.moved else [])]
     return tuple(words + (["--store", options.store] if options.store else []))
 
 

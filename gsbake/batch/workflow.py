@@ -204,8 +204,8 @@ def _prepare(jobs: Sequence[Job], options: BatchOptions, execution: Execution, w
     ]  # fmt: skip
     document = {
         "root": str(options.root), "profile": options.profile, "overrides": list(options.overrides), "seed": options.seed,
-        "store": options.store, "stages": api.REGISTRY.references, "grow": cluster is not None, "most_memory_mb": memory, "nodes": nodes,
-        "records": str(options.root / FOLDER / "records"), "resources": chosen, "levels": LEVELS,
+        "store": options.store, "moved": options.moved, "stages": api.REGISTRY.references, "grow": cluster is not None,
+        "most_memory_mb": memory, "nodes": nodes, "records": str(options.root / FOLDER / "records"), "resources": chosen, "levels": LEVELS,
         "nice": 0 if cluster is None else cluster.nice, "jobs": rows,
     }  # fmt: skip
     write_atomic(path, json.dumps(document))

@@ -14,7 +14,7 @@ from gsbake.batch.captures import BatchOptions, plan_captures
 from gsbake.batch.coordinator import Outcome, outcomes_now, run_batch
 from gsbake.batch.emit import FORMATS, emit
 from gsbake.batch.jobs import Job, make_jobs
-from gsbake.batch.page import write_index
+from gsbake.batch.page import INDEX, write_index
 from gsbake.batch.records import Record, load_batch
 from gsbake.batch.slurm import SlurmOptions
 from gsbake.cli.output import cell, print_json, print_table, print_text
@@ -77,7 +77,7 @@ def batch(
             print_text(f"{record.capture}: {record.message or f'{record.job} done in {duration(record.seconds)}'}")
 
     outcomes = run_batch(captures, options, executor, retry_failed=retry_failed, workers=workers, slurm=slurm, on_record=on_record)
-    index = write_index(outcomes, options.root.absolute())
+    index = _write_index(outcomes, options.root)
     if as_json:
         print_json({**_document(outcomes), "index": str(index), "seconds": round(time.perf_counter() - start, 3)})
     elif not quiet:
@@ -91,7 +91,7 @@ def status(root: Path, as_json: bool) -> None:
     """Print how far each capture of the batch in `root` is, and write the index."""
     captures, options = load_batch(root)
     outcomes = outcomes_now(captures, options)
-    write_index(outcomes, root.absolute())
+    _write_index(outcomes, root)
     if as_json:
         print_json(_document(outcomes))
         return
@@ -100,6 +100,14 @@ def status(root: Path, as_json: bool) -> None:
         for o in outcomes
     ]
     print_table(("capture", "state", "stages", "message"), rows)
+
+
+def _write_index(outcomes: Sequence[Outcome], root: Path) -> Path:
+    """Write the index; where another page has its name, say so and where the index is."""
+    path = write_index(outcomes, root.absolute())
+    if path.name != INDEX:
+        print_text(f"gsbake: warning: '{path.with_name(INDEX)}' is not as gsbake wrote it and stays; the index is '{path}'.", error=True)
+    return path
 
 
 def _document(outcomes: Sequence[Outcome]) -> dict[str, Any]:

@@ -8,8 +8,9 @@ import time
 from gsbake.cli.options import Options
 from gsbake.cli.output import print_json, print_table, print_text
 from gsbake.errors import BadInputError, UsageError
+from gsbake.own_files import SET_ASIDE
 from gsbake.pipeline.store import Store
-from gsbake.text import size
+from gsbake.text import shortlist, size
 
 _SIZE_UNITS = {"": 1, "B": 1, "KB": 10**3, "MB": 10**6, "GB": 10**9, "TB": 10**12}
 _AGE_UNITS = {"h": 3600.0, "d": 86_400.0, "w": 604_800.0}
@@ -74,6 +75,10 @@ def collect_garbage(options: Options, keep: str | None, older: str | None) -> No
     entries = list_entries(store, stages)
     chosen = choose(entries, *limits)
     done = chosen if options.dry_run else delete(store, chosen)
+    moved = store.take_moved()
+    if moved and not options.quiet:
+        names = shortlist([path.name for path in moved])
+        print_text(f"{names}: not what a stage wrote; moved to '{store.out / SET_ASIDE}'.", error=True)
     freed, left = sum(e.size for e in done), sum(e.size for e in entries) - sum(e.size for e in done)
     if options.as_json:
         rows = [{"path": str(e.path), "kind": e.kind, "bytes": e.size} for e in done]

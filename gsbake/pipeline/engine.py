@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from gsbake.errors import GsbakeError, InterruptedRun, UsageError
+from gsbake.own_files import SET_ASIDE
 from gsbake.pipeline.digest import file_stamps
 from gsbake.pipeline.events import EventLog, now
 from gsbake.pipeline.files import disk_error, ensure_output_folder, remove_tree
@@ -143,13 +144,22 @@ class Engine:
         return states
 
     def _set_aside_unexpected(self, stage: Stage, artifacts: Mapping[str, Artifact]) -> None:
-        name, known = stage.name, all(need in artifacts for need in stage.needs)
-        moved = self.store.set_aside_unexpected(name, self.planner.cache_key(stage, artifacts) if known else None)
+        known = all(need in artifacts for need in stage.needs)
+        self.store.set_aside_unexpected(stage.name, self.planner.cache_key(stage, artifacts) if known else None)
+        self._report_moved(stage.name)
+
+    def _report_moved(self, name: str) -> None:
+        """Say which files were set aside, and where."""
+        moved = self.store.take_moved()
         if moved:
-            names, folder = shortlist([path.name for path in moved]), self.request.out / "unexpected"
-            text = printable(f"{names}: not part of the stage's output; moved to '{folder}'.")
-            self.events.write("warning", stage=name, text=text)
-            self.observer.warning(name, text)
+            folder = self.request.out / SET_ASIDE
+            self.warn(name, f"{shortlist([path.name for path in moved])}: not what the stage wrote; moved to '{folder}'.")
+
+    def warn(self, name: str, text: str) -> None:
+        """A warning that does not come from a stage's own work."""
+        text = printable(text)
+        self.events.write("warning", stage=name, text=text)
+        self.observer.warning(name, text)
 
     def _compute(self, stage: Stage, state: StageState, artifacts: Mapping[str, Artifact], stop: StopSignals) -> StageState:
         """Run a stage under its lease, unless another process has published its artifact meanwhile."""
@@ -201,6 +211,7 @@ class Engine:
                 return None
             own = {name: value for name, value in manifest.items() if name not in ("files", "digest", "seal")}
             artifact = self.store.publish(temporary, self.store.folder(stage.name, cache_key.digest), own)
+            self._report_moved(stage.name)
         except (StoreUnreachableError, UsageError) as error:
             self._give_store_up(stage.name, error)
             return None
@@ -250,9 +261,7 @@ class Engine:
             self._warn_of_store(name, text)
 
     def _warn_of_store(self, name: str, what: str) -> None:
-        text = printable(f"Shared store '{self.shared.url if self.shared is not None else ''}': {what}")
-        self.events.write("warning", stage=name, text=text)
-        self.observer.warning(name, text)
+        self.warn(name, f"Shared store '{self.shared.url if self.shared is not None else ''}': {what}")
 
     def _execute(
         self, stage: Stage, state: StageState, cache_key: CacheKey, artifacts: Mapping[str, Artifact], stop: StopSignals, lease: Lease
@@ -281,6 +290,7 @@ class Engine:
             if not lease.held():
                 raise InterruptedRun("Another process took over the lease; the same command goes on with its result.")
             artifact = store.publish(temporary, store.folder(stage.name, cache_key.digest), manifest)
+            self._report_moved(stage.name)
         except StageFailed as error:
             raise StageFailed(f"{stage.title} failed: {error}; the traceback is in '{self._save_traceback(stage.name, error)}'.") from error
         except InterruptedRun as error:

@@ -108,6 +108,8 @@ def delete(store: Store, entries: Iterable[Entry]) -> list[Entry]:
         held.acquire()
         try:
             if entry.path.is_dir() and entry.name not in in_use(store.out):  # a lease file goes with the lease's release
+                if entry.kind == "artifact":
+                    store.set_aside_changed(entry.path)  # what was edited there is the user's
                 remove_tree(entry.path)
         finally:
             held.release()

@@ -20,8 +20,8 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from gsbake.errors import GsbakeError
+from gsbake.own_files import FILE_MANAGER_FILES
 from gsbake.pipeline.files import DISK_FULL, LASTING, NOT_WRITABLE
-from gsbake.pipeline.store import FILE_MANAGER_FILES
 from gsbake.system import disk
 
 #: File that marks a folder as a store, and holds its quota.

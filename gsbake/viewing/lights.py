@@ -16,6 +16,13 @@ FACE_SIZE = 64
 LIGHT_FILE = "light.hdr"
 
 
+def light_files(light: str, beside: Path) -> tuple[Path, ...]:
+    """The file of a light as `load_light` takes it; none of a procedural one."""
+    if light.lower() in map(str.lower, PROCEDURAL_LIGHTS):
+        return ()
+    return (beside / LIGHT_FILE if light == "hdr" else Path(light),)
+
+
 def load_light(light: str, beside: Path) -> LitShader:
     """Shader under `light`: "studio", "sunset", "hdr" (`light.hdr` in the folder `beside`) or the path of an HDR or EXR image.
 
@@ -24,7 +31,7 @@ def load_light(light: str, beside: Path) -> LitShader:
     named = {name.lower(): name for name in PROCEDURAL_LIGHTS}
     if light.lower() in named:
         return procedural(named[light.lower()])
-    path = beside / LIGHT_FILE if light == "hdr" else Path(light)
+    (path,) = light_files(light, beside)
     if not path.is_file():
         if light == "hdr":
             raise UsageError(f"There is no {LIGHT_FILE} in '{beside}'; name an HDR image with --light, or use --light studio.")

@@ -79,6 +79,17 @@ def test_leftovers_go_and_the_users_files_stay(store: Store, tmp_path: Path) -> 
     assert [path.read_text() for path in folder.glob("by-hand-*/total.txt")] == ["42"]
 
 
+def test_files_that_were_edited_are_set_aside(store: Store) -> None:
+    old = next(e for e in choose(list_entries(store, STAGES), older=30 * 86400) if e.stage == "sum")
+    name = next(name for name in sorted(p.name for p in old.path.iterdir()) if name != "manifest.json")
+    (old.path / name).write_text("edited by hand")
+    (old.path / "note.txt").write_text("added by hand")
+    assert delete(store, [old]) == [old]
+    aside = store.out / "set-aside" / "sum" / old.path.name
+    assert sorted(store.take_moved()) == sorted([aside / name, aside / "note.txt"])
+    assert (aside / name).read_text() == "edited by hand" and (aside / "note.txt").read_text() == "added by hand"
+
+
 def test_the_cache_of_a_stage_goes_with_age_and_size(store: Store, photos: Path) -> None:
     cache = store.cache("sum")
     (cache / "features").mkdir(parents=True)
