@@ -71,6 +71,10 @@ def answer(request: dict[str, Any]) -> dict[str, Any]:
         np.save(Path(request["target"]), decode_pixels(path.read_bytes(), name))
     except BadInputError as error:
         return {"error": str(error)}
+    except MemoryError:
+        raise
+    except Exception as error:  # bindings of native code raise what they like
+        return {"error": f"{name} cannot be decoded ({' '.join(repr(error).split())[:120]})."}
     return {}
 
 

@@ -30,7 +30,7 @@ Floats = NDArray[np.float32]
 #: Default of `ingest.max_megapixels`.
 MAX_MEGAPIXELS = 250.0
 #: Bytes per pixel of the conversion to linear colours and their filter.
-CONVERSION_BYTES = 28
+CONVERSION_BYTES = 36
 #: Largest edge in pixels and most channels of an image that is decoded at all.
 _MAX_EDGE, _MAX_CHANNELS = 100_000, 16
 #: Alpha (of 255) below which the colour of a pixel is undefined.
