@@ -78,12 +78,17 @@ def read_file(path: Path, most: int = -1) -> bytes:
 _Body = TypeVar("_Body")
 
 
+def read_json_text(path: Path) -> bytes:
+    """The content of a JSON file. Raises BadInputError as `read_file`, and when its objects would take more memory than there is."""
+    content = read_file(path)
+    check(json_bytes(content), str(path))
+    return content
+
+
 def read_json(path: Path, kind: type[_Body], what: str) -> _Body:
     """The content of a JSON file as `kind`, a model or a container of models. Raises BadInputError when it is no valid `what`."""
     try:
-        content = read_file(path)
-        check(json_bytes(content), str(path))
-        return TypeAdapter(kind).validate_json(content)
+        return TypeAdapter(kind).validate_json(read_json_text(path))
     except ValidationError as error:
         raise BadInputError(f"{path} is not a valid {what} ({first_error(error)}).") from error
 
