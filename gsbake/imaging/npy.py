@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 import warnings
 from pathlib import Path
+from tokenize import TokenError
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,8 @@ from gsbake.memory_budget import check
 
 #: Bytes per number of the array, of what is made of it in single precision, and of a copy.
 NUMBER_BYTES = 12
+#: What NumPy raises for headers that it cannot parse, besides ValueError; some come from Python's own tokenizer and parser.
+HEADER_ERRORS = (EOFError, SyntaxError, TokenError, TypeError, KeyError, OverflowError, RecursionError, MemoryError)
 
 
 def read_npy(path: Path) -> NDArray[Any]:
@@ -38,5 +41,5 @@ def read_npy(path: Path) -> NDArray[Any]:
             check(stated + NUMBER_BYTES * math.prod(shape), f"'{path}'")
             file.seek(0)
             return np.asarray(np.load(file, allow_pickle=False))
-        except (EOFError, OverflowError, TypeError, SyntaxError, RecursionError, MemoryError) as error:
+        except HEADER_ERRORS as error:
             raise ValueError(" ".join(str(error).split())[:200] or "damaged") from error
