@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import json
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -75,6 +76,10 @@ def few_bytes(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("gsbake.gltf.audit.OVERLAP_SIZE", 64)
 
 
+#: The light of all renders.
+STUDIO = cache(lambda: procedural("Studio"))
+
+
 def look_at(path: Path, good: Scene) -> object:
     """Everything that the commands do with a file; its scene, or None where it is refused."""
     figures = outcome(lambda: inspect_file(path), BadInputError)
@@ -88,7 +93,7 @@ def look_at(path: Path, good: Scene) -> object:
     def draw() -> object:
         renderer = SceneRenderer(scene, 1)
         (camera,) = orbit(renderer.centre, renderer.radius, 1, 8)
-        image = renderer.draw(camera, procedural("Studio"), 1)
+        image = renderer.draw(camera, STUDIO(), 1)
         return compare_images(image, image)
 
     outcome(draw, BadInputError)
@@ -116,6 +121,7 @@ def test_glb_scene(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     fuzz(capsys, "GLB scenes", st.one_of(documents, documents, documents, chunks, damaged([repack(document, binary)])), check)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("few_bytes")
 def test_gltf_with_a_file_beside_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     document, binary = scene_document(tmp_path)
