@@ -15,8 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsbake.errors import BadInputError
-from gsbake.gltf.document import decode_image, image_format
+from gsbake.gltf.document import FAULTS
 from gsbake.gltf.read import GltfAsset, parse_glb
+from gsbake.imaging.encoded import image_format, image_size
 from gsbake.texturing.texels import overlapping
 
 Severity = Literal["error", "warning", "info"]
@@ -46,14 +47,20 @@ class Finding:
 
 
 def audit(
-    data: bytes, name: str, max_megabytes: float, max_triangles: int, extensions: frozenset[str] = frozenset(), budget: Severity = "warning"
+    data: bytes,
+    name: str,
+    max_megabytes: float,
+    max_triangles: int,
+    extensions: frozenset[str] = frozenset(),
+    budget: Severity = "warning",
+    foreign: bool = False,
 ) -> list[Finding]:
     """Audit the bytes of a GLB; `name` identifies it in errors. An unreadable file gives one failed finding.
 
-    `extensions` may be required by the file; `budget` is the severity of a file that is too large.
+    `extensions` may be required by the file; `budget` is the severity of a file that is too large; `foreign` as for `parse_glb`.
     """
     try:
-        asset = parse_glb(data, name)
+        asset = parse_glb(data, name, foreign)
     except BadInputError as error:
         return [Finding("readable GLB", False, str(error), "error")]
     found: list[Finding] = []
@@ -70,7 +77,7 @@ def audit(
             _images(asset, check)
     except BadInputError as error:
         check("readable images", False, str(error))
-    except (KeyError, IndexError, ValueError, TypeError, AttributeError, OverflowError, struct.error) as error:
+    except (*FAULTS, struct.error) as error:
         check("well-formed document", False, " ".join(repr(error).split())[:200])
     megabytes = len(data) / 1e6
     check("file size", megabytes <= max_megabytes, f"{megabytes:.2f} MB of {max_megabytes:g} MB", budget)
@@ -183,7 +190,8 @@ def _images(asset: GltfAsset, check: Any) -> None:
         if form == "png":
             width, height = _png_header(role, content, occlusion_only, check)
         elif form == "jpeg" or (form != "unknown" and _extension_of(form) in asset.document.get("extensionsRequired", [])):
-            height, width = decode_image(content, role).shape[:2]
+            size = image_size(content, role)
+            width, height = size.width, size.height
             check(f"{role}: image format", True, f"{width}x{height}, {form}")
         else:
             check(f"{role}: PNG", False, f"{form}: neither PNG, JPEG nor of an extension that the file requires")

@@ -35,6 +35,33 @@ def peak_memory() -> int:
     return peak if platform.system() == "Darwin" else peak * 1024
 
 
+def available_memory() -> int:
+    """Bytes that this process may take: what the machine has free, its container (control group) leaves, its address space allows."""
+    found = [int(psutil.virtual_memory().available)]
+    found += [max(0, limit - used) for limit, used in _group_memory()]
+    resource = _resource()
+    if resource is not None and (limit := resource.getrlimit(resource.RLIMIT_AS)[0]) != resource.RLIM_INFINITY:
+        found.append(max(0, limit - int(psutil.Process().memory_info().vms)))
+    return min(found)
+
+
+def _group_memory() -> list[tuple[int, int]]:
+    """(limit, memory in use without the file cache) of the control groups (version 2) that this process is in, of those with a limit."""
+    found: list[tuple[int, int]] = []
+    with suppress(OSError, StopIteration):
+        lines = Path("/proc/self/cgroup").read_text(encoding="ascii", errors="replace").splitlines()
+        inner = Path("/sys/fs/cgroup") / next(line for line in lines if line.startswith("0::"))[3:].strip("/")
+        for group in (inner, *inner.parents):
+            if not group.is_relative_to("/sys/fs/cgroup"):
+                break
+            with suppress(OSError, ValueError):  # "max" is no limit
+                limit = int((group / "memory.max").read_text(encoding="ascii"))
+                cached = re.search(r"^inactive_file (\d+)", (group / "memory.stat").read_text(encoding="ascii"), re.MULTILINE)
+                used = int((group / "memory.current").read_text(encoding="ascii")) - (int(cached.group(1)) if cached else 0)
+                found.append((limit, max(0, used)))
+    return found
+
+
 def limit_address_space(memory: int) -> bool:
     """Limit this process's address space to `memory` bytes beyond what it has mapped; a later call replaces the limit.
 

@@ -6,7 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from gsbake.errors import BadInputError, UsageError
+from gsbake.errors import UsageError
+from gsbake.imaging.image_process import read_light
 from gsbake.report.lights import PROCEDURAL_LIGHTS, LitShader, procedural
 from gsbake.shading.environment import EnvironmentLight
 
@@ -36,11 +37,5 @@ def load_light(light: str, beside: Path) -> LitShader:
         if light == "hdr":
             raise UsageError(f"There is no {LIGHT_FILE} in '{beside}'; name an HDR image with --light, or use --light studio.")
         raise UsageError(f"The light '{light}' is neither {', '.join(named)} or hdr nor an image.")
-    import OpenImageIO as oiio
-
-    source = oiio.ImageInput.open(str(path))
-    pixels = None if source is None else source.read_image(oiio.FLOAT)
-    if source is None or pixels is None or pixels.ndim != 3 or pixels.shape[2] < 3 or not np.isfinite(pixels).all():
-        raise BadInputError(f"'{path}' is not a readable HDR image of three channels ({oiio.geterror().strip() or 'damaged'}).")
-    image = np.maximum(pixels[..., :3], 0).astype(np.float64)
+    image = np.maximum(read_light(path), 0).astype(np.float64)
     return LitShader(EnvironmentLight.from_equirectangular(image, FACE_SIZE, convention="gltf"))

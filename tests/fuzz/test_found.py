@@ -122,7 +122,7 @@ def test_glb_that_states_more_than_it_holds(tmp_path: Path) -> None:
         changed = json.loads(json.dumps(document))
         change(changed)
         data = repack(changed, binary)
-        with pytest.raises(BadInputError, match="no readable triangle mesh"):
+        with pytest.raises(BadInputError, match="no readable triangle mesh|of memory to be read"):
             parse_glb(data, "a.glb")
         assert [finding.rule for finding in failed(audit(data, "a.glb", 10, 100))] == ["readable GLB"]
 

@@ -16,11 +16,12 @@ from gsbake.config.targets import is_target_file
 from gsbake.errors import BadInputError
 from gsbake.geometry.tangents import frame_to_world
 from gsbake.gltf.audit import MAX_NON_UNIT, non_unit_share
-from gsbake.gltf.document import Document, decode_image
+from gsbake.gltf.document import Document
 from gsbake.gltf.encode import TextureMaps, quantise
 from gsbake.gltf.read import read_glb
 from gsbake.gltf.scene import open_scene
 from gsbake.gltf.write import GltfMesh
+from gsbake.imaging.encoded import decode_image
 from gsbake.imaging.jpeg import encode_jpeg
 from gsbake.imaging.srgb import decode_bytes
 from gsbake.publish import INTERNAL
