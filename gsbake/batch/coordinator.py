@@ -21,7 +21,7 @@ from gsbake.batch.jobs import make_jobs
 from gsbake.batch.records import FOLDER, Record, RecordReader, all_records, earlier_failures, forget_records, save_batch
 from gsbake.batch.slurm import SlurmOptions, ask_cluster
 from gsbake.batch.workflow import Execution, end_orphan, require_snakemake, run_workflow
-from gsbake.errors import InterruptedRun
+from gsbake.errors import InterruptedRun, UsageError
 from gsbake.pipeline.files import ensure_output_folder
 from gsbake.pipeline.lease import HEARTBEAT_TIMEOUT, LeaseHolder
 from gsbake.pipeline.machine import default_threads
@@ -60,11 +60,15 @@ def run_batch(
     """Bring all captures up to date; returns how each one ended, in order.
 
     `workers` is the number of jobs in Slurm's queue at a time (0: two for each core); `on_record` is called at the end of each job.
-    Raises UsageError when an executor is unknown or not installed, InterruptedRun when another batch works in the same folder, or on a
-    stop request.
+    Raises UsageError when an executor is unknown, not installed or cannot use the folder's name, InterruptedRun when another batch works
+    in the same folder, or on a stop request.
     """
     require_snakemake(executor)
     if executor == "slurm":
+        if "%" in str(options.root.absolute()):
+            raise UsageError(
+                f"'{options.root}' holds '%', which Slurm takes for a variable in the paths of its logs; choose another --out."
+            )
         cluster = ask_cluster(slurm)
         execution = Execution(cluster.cores, cluster, slurm, workers or max(_LEAST_QUEUE, _QUEUE_FACTOR * cluster.cores))
     else:

@@ -5,7 +5,7 @@
 import json
 from pathlib import Path
 
-with open(config["jobs"], encoding="utf-8") as file:
+with open("jobs.json", encoding="utf-8") as file:
     BATCH = json.load(file)
 JOBS = {job["id"]: job for job in BATCH["jobs"]}
 

@@ -221,7 +221,8 @@ class Engine:
         return None
 
     def _give_store_up(self, name: str, error: Exception) -> None:
-        self._warn_of_store(name, f"it does not answer ({error}); the run goes on without it.")
+        why = str(error) if isinstance(error, StoreUnreachableError) else "it may not be read"  # a library's words may quote the address
+        self._warn_of_store(name, f"it does not answer ({why}); the run goes on without it.")
         self.shared = None
 
     def _warn_of_store(self, name: str, what: str) -> None:

@@ -29,6 +29,7 @@ from gsbake.pipeline.digest import file_digest
 from gsbake.pipeline.files import DISK_FULL, NOT_WRITABLE
 from gsbake.pipeline.key import CacheKey
 from gsbake.pipeline.store import MANIFEST, Artifact, parse_manifest
+from gsbake.pipeline.store_url import hide_credentials, public_url
 from gsbake.system import disk
 
 #: Seconds during which a store that does not answer is tried again.
@@ -76,7 +77,7 @@ def open_shared_store(url: str | None, patience: float = PATIENCE) -> SharedStor
 
     protocol = url.partition("://")[0] if "://" in url else "file"
     if protocol not in _PROTOCOLS:
-        raise UsageError(f"--store takes a folder or a URL of file, s3 or sftp, not '{url}'.")
+        raise UsageError(f"--store takes a folder or a URL of file, s3 or sftp, not '{public_url(url)}'.")
     try:
         if protocol in ("sftp", "ssh"):
             system, path = _open_sftp(url)
@@ -88,7 +89,9 @@ def open_shared_store(url: str | None, patience: float = PATIENCE) -> SharedStor
     except GsbakeError:
         raise
     except Exception as error:  # a server that refuses, a wrong port: each library has its own exceptions
-        raise InterruptedRun(f"The shared store '{url}' cannot be opened ({_words(error)}); check the address and try again.") from error
+        raise InterruptedRun(
+            f"The shared store '{public_url(url)}' cannot be opened ({_words(error, url)}); check the address and try again."
+        ) from error
     return SharedStore(url, system, path.rstrip("/"), protocol, patience)
 
 
@@ -100,10 +103,10 @@ def _open_sftp(url: str) -> tuple[Any, str]:
 
 
 class SharedStore:
-    """A shared store; `read_only` once a write was refused, or when its owner set it."""
+    """A shared store; `read_only` once a write was refused, or when its owner set it. `url` has no credentials; it is for people."""
 
     def __init__(self, url: str, system: Any, path: str, protocol: str, patience: float = PATIENCE) -> None:
-        self.url = url
+        self.url, self._address = public_url(url), url
         self.read_only = False
         self.damaged: list[str] = []
         self._fs, self._root, self._patience = system, path, patience
@@ -367,7 +370,7 @@ class SharedStore:
                     raise
                 # Each library behind fsspec has its own exceptions.
                 if time.monotonic() - start + pause > self._patience:
-                    raise StoreUnreachableError(_words(error)) from error
+                    raise StoreUnreachableError(_words(error, self._address)) from error
             check()
             time.sleep(pause)
             pause = min(2 * pause, 8.0)
@@ -394,6 +397,6 @@ def _modified(info: Mapping[str, Any]) -> float:
     return value.timestamp() if isinstance(value, datetime) else float(value)
 
 
-def _words(error: Exception) -> str:
-    """One line that says what failed."""
-    return " ".join(f"{type(error).__name__}: {error}".split())[:200]
+def _words(error: Exception, url: str) -> str:
+    """One line that says what failed, without the credentials of the store's `url`, which libraries quote."""
+    return " ".join(hide_credentials(f"{type(error).__name__}: {error}", url).split())[:200]
