@@ -104,6 +104,14 @@ def snakemake_arguments(cluster: Cluster, prefix: str) -> Sequence[str]:
     )  # fmt: skip
 
 
+def submit_options(nice: int, failed_on: object, nodes: int) -> str:
+    """Options of `sbatch` for a job: its order in the queue, and the nodes on which it was interrupted, unless all `nodes` are among them.
+    `failed_on` is from a record on disk: what is no name of Slurm's is left out, because Snakemake's plugin hands it to a shell."""
+    names = failed_on if isinstance(failed_on, list) else []
+    failed = [name for name in names if isinstance(name, str) and _NAME.fullmatch(name)]
+    return f"--nice={nice} --exclude={','.join(failed)}" if failed and len(failed) < nodes else f"--nice={nice}"
+
+
 def node_name() -> str:
     """Slurm's name of the node that this process runs on; empty outside of Slurm."""
     name = os.environ.get("SLURMD_NODENAME", "")

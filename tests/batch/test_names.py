@@ -196,6 +196,11 @@ def test_a_folder_that_slurm_cannot_use(make_capture: Make, tmp_path: Path, monk
         run_batch([make_capture("one")], BatchOptions(tmp_path / "100%j", "smoke"), "slurm")
 
 
+def test_nodes_in_a_record_of_somebody_else() -> None:
+    assert slurm.submit_options(3, ["n1", "n2 --uid=0", "$(touch owned)", 7, "n3"], 4) == "--nice=3 --exclude=n1,n3"
+    assert slurm.submit_options(3, ["n1"], 1) == slurm.submit_options(3, "n1", 4) == slurm.submit_options(3, None, 4) == "--nice=3"
+
+
 @pytest.mark.parametrize("name", ["a b", "x;touch owned", "$(id)", "-p", "", "a\nb", "é"])
 def test_names_that_slurm_has_not(name: str) -> None:
     for options in (SlurmOptions(partition=name), SlurmOptions(account=name)):
