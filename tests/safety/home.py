@@ -138,7 +138,7 @@ class Damage:
 
     def __str__(self) -> str:
         kinds = {"missing": self.missing, "changed": self.changed, "new": self.intruding}
-        return "\n".join(f"{kind}: {line}" for kind, lines in kinds.items() for line in lines)
+        return "\n".join(f"{len(lines)} {kind}: {', '.join(sorted(lines)[:8])}" for kind, lines in kinds.items() if lines)
 
     def __bool__(self) -> bool:
         return bool(self.missing or self.changed or self.intruding)
@@ -172,9 +172,8 @@ class Home:
         shutil.rmtree(self.root)
         shutil.copytree(self.copy, self.root, symlinks=True)
 
-    def damage(self, places: tuple[str, ...]) -> Damage:
-        """What happened since; new files may be in `places`, and in gsbake's own folders."""
-        now = snapshot(self.root)
+    def damage(self, now: dict[str, Entry], places: tuple[str, ...]) -> Damage:
+        """What happened until the snapshot `now`; new files may be in `places`, and in gsbake's own folders."""
         found = Damage()
         for name, entry in self.user_files.items():
             if name not in now:

@@ -24,7 +24,7 @@ from gsbake.batch.job import run_job
 from gsbake.batch.records import save_batch
 from tests.cli.conftest import Run, run
 from tests.safety import stages
-from tests.safety.home import BATCH, FEW, FOLDERS, FOREIGN, FREE, OWN, STORE, Damage, Home, make_old, snapshot, write_home
+from tests.safety.home import BATCH, FEW, FOLDERS, FOREIGN, FREE, LINKS, OWN, STORE, Damage, Home, make_old, snapshot, write_home
 from tests.support.gltf_files import write_ball
 
 __all__ = ["run"]
@@ -59,7 +59,7 @@ COMMANDS = (
     Command("mesh scans/mug --out TARGET"),
     Command("run scans/mug --out new/run --store TARGET", places=("new/run",)),
     Command("run scans/mug", (TARGET,)),
-    Command("batch scans/mug scans/tankard --out TARGET"),
+    Command("batch scans/mug --out TARGET"),
     Command("batch scans/mug --out new/batch --store TARGET", places=("new/batch",)),
     Command("batch status --out TARGET"),
     Command("plan scans/mug --out TARGET --emit sh"),
@@ -85,8 +85,8 @@ COMMANDS = (
     Command("cache quota 5MB --store TARGET"),
     Command("status --out TARGET"),
     Command("explain --out TARGET"),
-    Command("doctor --out TARGET"),
-    Command("check TARGET"),
+    Command("doctor --out TARGET", (".", "proj", "empty", "new/folder")),  # it imports every library each time
+    Command("check TARGET", ("photos", "capture", "scans/mug", "thesis.odt")),
     Command("profiles", (TARGET,)),
     Command("inspect ball.glb", (TARGET,)),
     Command("compare ball.glb ball.glb --views 1 --size 16 --sheet TARGET", IMAGES),
@@ -166,10 +166,10 @@ def _in_this_process(jobs: Any, options: Any, execution: Any, reader: Any, stop:
 
 def places_of(command: Command, target: str) -> tuple[str, ...]:
     """Where a command may make new files in the home."""
-    if command.words.startswith("batch scans/mug scans/tankard") and target in FOREIGN:
-        # a folder of outputs may hold other things too; the captures' own folders must be free
-        names = {".batch", "index.html", "index.new.html", "mug", "tankard"}
-        return tuple(os.path.normpath(f"{target}/{name}") for name in names)
+    if command.words == "batch scans/mug --out TARGET" and target in FOREIGN:
+        # a folder of outputs may hold other things too; the capture's own folder must be free
+        folder = LINKS.get(target, target)
+        return tuple(os.path.normpath(f"{folder}/{name}") for name in (".batch", "index.html", "index.new.html", "mug"))
     free = target in FREE or target == "new.png"
     return (*command.places, *((target,) if free else ()))
 
@@ -184,10 +184,10 @@ def run_everywhere(run: Run, home: Home, command: Command, targets: Sequence[str
         if end.code not in (0, 2, 42, 75):
             errors.append(f"{' '.join(words)}: {end.err}")
         places = [place for place in places_of(command, target) if place in FREE or place not in home.before]
-        done = home.damage(tuple(places))
-        total.add(done, " ".join(words))
+        now = snapshot(home.root)
+        total.add(home.damage(now, tuple(places)), " ".join(words))
         os.chdir(home.copy)
-        if done or snapshot(home.root) != home.before:
+        if now != home.before:
             home.restore()
     return total, errors
 
@@ -216,7 +216,7 @@ def test_every_command_everywhere(run: Run, home: Home, command: Command, capsys
 
 
 def test_the_harness_sees_damage(home: Home) -> None:
-    assert not home.damage(())
+    assert not home.damage(snapshot(home.root), ())
     (home.root / "thesis.odt").write_text("lost")
     (home.root / "tmp" / "draft.txt").unlink()
     (home.root / "photos" / "out.txt").write_text("new")
@@ -225,6 +225,6 @@ def test_the_harness_sees_damage(home: Home) -> None:
     os.utime(home.root / "report.html")
     for path in (home.root / OWN / "stages" / "mesh").glob("*/dense.ply"):
         path.write_text("gone")
-    found = home.damage(())
+    found = home.damage(snapshot(home.root), ())
     assert sorted(found.changed) == ["repo/.git/hooks/post-checkout", "report.html", "thesis.odt"]
     assert found.missing[0] == "tmp/draft.txt" and len(found.missing) == 2 and found.intruding == ["photos/out.txt"]
