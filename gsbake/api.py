@@ -31,6 +31,7 @@ from gsbake.pipeline.project import Project
 from gsbake.pipeline.registry import Registry
 from gsbake.pipeline.shared_store import open_shared_store
 from gsbake.pipeline.store import Store
+from gsbake.pipeline.store_url import VARIABLE as STORE_VARIABLE
 from gsbake.publish import RESULTS, publish_results
 from gsbake.stages import REGISTRY
 from gsbake.system.names import portable_name
@@ -255,7 +256,7 @@ def open_session(options: RunOptions, observer: Observer | None = None, registry
         threads=options.threads or default_threads(),
         source_names=_source_names(sources),
     )
-    store = options.store or os.environ.get("GSBAKE_STORE") or None
+    store = options.store or os.environ.get(STORE_VARIABLE) or None
     stages = registry or REGISTRY
     wanted = profile.profile.targets
     require_packages(parse_target(text) for text in wanted.files)

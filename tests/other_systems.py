@@ -11,6 +11,8 @@ TESTS = Path(__file__).parent
 LINUX = (
     "faults/test_faults.py",
     "slurm",
+    "safety",
+    "batch/test_names.py",
     "cli/test_commands.py",
     "cli/test_hostile_names.py",
     "capture/test_hostile_files.py::test_name_that_is_no_text",
@@ -39,6 +41,7 @@ POSIX = (
     "capture/test_colmap.py::test_sigterm_is_left_to_the_stage",
     "capture/test_sources.py::test_mask_folder_that_leads_out_of_the_capture_must_be_named",
     "capture/test_sources.py::test_masks_are_images_inside_their_folder",
+    "packaging/test_make.py",
     "gltf/test_stages.py::test_a_known_distance_makes_metres",
     "gltf/test_stages.py::test_materials_and_light_of_a_relightable_asset",
     "pipeline/test_cache_integrity.py::test_links_to_folders_are_not_followed",

@@ -16,6 +16,7 @@ from gsbake.capture.sources import PHOTO_FOLDERS
 from gsbake.errors import BadInputError, GsbakeError, UsageError
 from gsbake.pipeline.engine import artifacts_by_stage
 from gsbake.pipeline.plan import StageState
+from gsbake.pipeline.store_url import has_credentials
 from gsbake.publish import published_results
 from gsbake.system.names import portable_name, same_file_key
 from gsbake.timing.photos import USUAL_MEGAPIXELS, PhotoSet, photos_of_request
@@ -39,6 +40,11 @@ class BatchOptions:
         profile = str(Path(self.profile).absolute()) if Path(self.profile).is_file() else self.profile
         store = self.store if self.store is None or "://" in self.store else str(Path(self.store).absolute())
         return replace(self, root=self.root.absolute(), profile=profile, store=store)
+
+    @property
+    def named_store(self) -> str | None:
+        """The store as files and commands may name it; None where its address has credentials and jobs take it from GSBAKE_STORE."""
+        return None if has_credentials(self.store) else self.store
 
 
 @dataclass(frozen=True)

@@ -30,7 +30,7 @@ from gsbake.batch.records import (
 )
 from gsbake.batch.slurm import SlurmOptions, ask_cluster
 from gsbake.batch.workflow import Execution, end_orphan, require_snakemake, run_workflow
-from gsbake.errors import InterruptedRun
+from gsbake.errors import InterruptedRun, UsageError
 from gsbake.pipeline.files import ensure_output_folder
 from gsbake.pipeline.lease import HEARTBEAT_TIMEOUT, LeaseHolder
 from gsbake.pipeline.machine import default_threads
@@ -75,16 +75,20 @@ def run_batch(
     """
     require_snakemake(executor)
     if executor == "slurm":
+        if "%" in str(options.root.absolute()):
+            raise UsageError(
+                f"'{options.root}' holds '%', which Slurm takes for a variable in the paths of its logs; choose another --out."
+            )
         cluster = ask_cluster(slurm)
         execution = Execution(cluster.cores, cluster, slurm, workers or max(_LEAST_QUEUE, _QUEUE_FACTOR * cluster.cores))
     else:
         execution = Execution(options.threads or default_threads())
     options = options.absolute()
     root = options.root
-    refuse_other_folders(options.store)
     require_own_records(root)
     if not (root / FOLDER).exists():
         plan_captures(captures, options)  # refuses wrong folders before anything is written
+    refuse_other_folders(options.store)
     ensure_output_folder(root)
     (root / FOLDER).mkdir(exist_ok=True)
     lock = FileLock(root / FOLDER / "lock")

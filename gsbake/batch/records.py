@@ -123,7 +123,7 @@ def save_batch(captures: Sequence[Path], options: BatchOptions) -> None:
     """Write the captures and options, for `gsbake batch status`."""
     folder = options.root / FOLDER
     folder.mkdir(parents=True, exist_ok=True)
-    body = {**asdict(options), "root": None, "captures": [str(path.absolute()) for path in captures]}
+    body = {**asdict(options), "root": None, "store": options.named_store, "captures": [str(path.absolute()) for path in captures]}
     write_atomic(folder / "batch.json", json.dumps(body, indent=1))
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -21,6 +22,7 @@ from gsbake.cli.output import cell, print_json, print_table, print_text
 from gsbake.errors import BadInputError, InterruptedRun, UsageError
 from gsbake.pipeline.machine import default_threads
 from gsbake.pipeline.shared_store import refuse_other_folders
+from gsbake.pipeline.store_url import VARIABLE
 from gsbake.text import duration, size
 from gsbake.timing.estimate import History
 
@@ -37,7 +39,9 @@ def plan(captures: Sequence[Path], options: BatchOptions, form: str | None) -> N
     outs = sorted(path.parent for path in options.root.glob("*/project.json"))
     jobs = make_jobs(plans, options, History.of_runs(outs, api.REGISTRY.names), options.threads or default_threads())
     if form is not None:
-        typer.echo(emit(form, jobs), nl=False)
+        typer.echo(os.fsencode(emit(form, jobs)), nl=False)  # names that are no text keep their bytes
+        if jobs and options.store is not None and options.named_store is None:
+            print_text(f"The store's address has credentials and is not in the jobs; set {VARIABLE} where they run.", error=True)
     else:
         _print_jobs(jobs, sum(plan.done for plan in plans))
     failed = [plan for plan in plans if plan.error]

@@ -28,6 +28,7 @@ from gsbake.pipeline.key import CacheKey
 from gsbake.pipeline.store import MANIFEST, Artifact, parse_manifest
 from gsbake.pipeline.store_files import BLOBS, ENTRIES, MARKER, Properties, StoreFiles, StoreUnreachableError, in_words
 from gsbake.pipeline.store_marker import MAX_ENTRY_BYTES, is_marked, marker, read_quota, recognise
+from gsbake.pipeline.store_url import public_url
 
 #: Seconds during which a store that does not answer is tried again, and where nothing depends on it.
 PATIENCE, SHORT_PATIENCE = 120.0, 10.0
@@ -66,7 +67,7 @@ def open_shared_store(url: str | None, patience: float = PATIENCE) -> SharedStor
 
     protocol = url.partition("://")[0] if "://" in url else "file"
     if protocol not in _PROTOCOLS:
-        raise UsageError(f"--store takes a folder or a URL of file, s3 or sftp, not '{url}'.")
+        raise UsageError(f"--store takes a folder or a URL of file, s3 or sftp, not '{public_url(url)}'.")
     try:
         if protocol in ("sftp", "ssh"):
             system, path = _open_sftp(url)
@@ -78,7 +79,9 @@ def open_shared_store(url: str | None, patience: float = PATIENCE) -> SharedStor
     except GsbakeError:
         raise
     except Exception as error:  # a server that refuses, a wrong port: each library has its own exceptions
-        raise InterruptedRun(f"The shared store '{url}' cannot be opened ({in_words(error)}); check the address and try again.") from error
+        raise InterruptedRun(
+            f"The shared store '{public_url(url)}' cannot be opened ({in_words(error, url)}); check the address and try again."
+        ) from error
     return SharedStore(url, system, path.rstrip("/"), protocol, patience)
 
 
@@ -98,21 +101,23 @@ def refuse_other_folders(url: str | None) -> None:
 
 
 class SharedStore:
-    """A shared store; `read_only` once a write was refused, or when its owner set it. `notices` are sentences for the user, `damaged` the
-    names of what was damaged; who prints them takes them out."""
+    """A shared store; `url` is its address without credentials; `read_only` once a write was refused, or when its owner set it.
+
+    `notices` are sentences for the user, `damaged` the names of what was damaged; who prints them takes them out.
+    """
 
     def __init__(self, url: str, system: Any, path: str, protocol: str, patience: float = PATIENCE) -> None:
-        self.url = url
+        self.url, self._address = public_url(url), url
         self.read_only = False
         self.damaged: list[str] = []
         self.notices: list[str] = []
-        self.files = StoreFiles(system, path, protocol, patience)
+        self.files = StoreFiles(system, path, protocol, patience, url)
         self._kind = "new"
         self._used: int | None = None
 
     def require(self) -> None:
         """Raise UsageError where something else than a shared store is there, or StoreUnreachableError."""
-        with _in_words():
+        with _in_words(self._address):
             self._look()
 
     def fetch(self, cache_key: CacheKey, folder: Path, check: Callable[[], None] = lambda: None) -> dict[str, Any] | None:
@@ -120,7 +125,7 @@ class SharedStore:
 
         `check` may raise to cancel. Raises StoreUnreachableError.
         """
-        with _in_words():
+        with _in_words(self._address):
             return self._fetch(cache_key, folder, check) if self._look() != "new" else None
 
     def _fetch(self, cache_key: CacheKey, folder: Path, check: Callable[[], None]) -> dict[str, Any] | None:
@@ -141,7 +146,8 @@ class SharedStore:
             except (OSError, ValueError) as error:
                 if isinstance(error, OSError) and error.errno in DISK_FULL | NOT_WRITABLE:
                     raise
-                self.notices.append(f"{entry} names a file that this system cannot have ({in_words(error)}); it is not used.")
+                words = in_words(error, self._address)
+                self.notices.append(f"{entry} names a file that this system cannot have ({words}); it is not used.")
                 return None
             if not self._read_blob(file["digest"], file["bytes"], target, check):
                 self.damaged.append(entry)
@@ -160,7 +166,7 @@ class SharedStore:
         manifest = artifact.manifest
         entry = _entry_name(str(manifest["stage"]), str(manifest["key"]))
         files = {str(file["digest"]): (artifact.folder / name, int(file["bytes"])) for name, file in manifest["files"].items()}
-        with _in_words():
+        with _in_words(self._address):
             if self._look() != "new" and self.files.status(entry, check) is not None:
                 return None
             try:
@@ -183,7 +189,7 @@ class SharedStore:
 
     def digest_of(self, cache_key: CacheKey, check: Callable[[], None] = lambda: None) -> str | None:
         """Content digest of the artifact that the store has for a key; None when it has none. Raises StoreUnreachableError."""
-        with _in_words():
+        with _in_words(self._address):
             manifest = self._read_entry(_entry_name(cache_key.stage, cache_key.digest), check) if self._look() != "new" else None
         return None if manifest is None else str(manifest.get("digest"))
 
@@ -377,7 +383,7 @@ def _new_file(folder: Path, name: str) -> Path:
 
 
 @contextmanager
-def _in_words() -> Iterator[None]:
+def _in_words(url: str) -> Iterator[None]:
     """Turn what cannot be helped by trying again into StoreUnreachableError; a full disk of this machine stays an OSError."""
     try:
         yield
@@ -386,4 +392,4 @@ def _in_words() -> Iterator[None]:
     except (OSError, ValueError) as error:  # ValueError: a stage whose name a store cannot have
         if isinstance(error, OSError) and error.errno in DISK_FULL:
             raise
-        raise StoreUnreachableError(in_words(error)) from error
+        raise StoreUnreachableError(in_words(error, url)) from error

@@ -22,6 +22,7 @@ from typing import Any, TypeVar
 from gsbake.errors import GsbakeError
 from gsbake.own_files import FILE_MANAGER_FILES
 from gsbake.pipeline.files import DISK_FULL, LASTING, NOT_WRITABLE
+from gsbake.pipeline.store_url import hide_credentials
 from gsbake.system import disk
 
 #: File that marks a folder as a store, and holds its quota.
@@ -57,10 +58,10 @@ def is_store_name(name: str) -> bool:
 class StoreFiles:
     """The files under one folder or prefix. All methods raise StoreUnreachableError, and PermissionError where the store refuses."""
 
-    def __init__(self, system: Any, root: str, protocol: str, patience: float) -> None:
+    def __init__(self, system: Any, root: str, protocol: str, patience: float, url: str) -> None:
         self.system = system
         self.local = protocol in ("file", "local")
-        self._root, self._patience, self._objects = root, patience, protocol in OBJECT_STORES
+        self._root, self._patience, self._objects, self._address = root, patience, protocol in OBJECT_STORES, url
         self._plain: set[str] = set()
 
     def path(self, name: str) -> str:
@@ -250,7 +251,7 @@ class StoreFiles:
                     raise
                 # Each library behind fsspec has its own exceptions.
                 if time.monotonic() - start + pause > self._patience:
-                    raise StoreUnreachableError(in_words(error)) from error
+                    raise StoreUnreachableError(in_words(error, self._address)) from error
             check()
             time.sleep(pause)
             pause = min(2 * pause, 8.0)
@@ -278,6 +279,6 @@ def _properties(info: Mapping[str, Any]) -> Properties | None:
     return Properties(int(info["size"]), time_) if info.get("type") == "file" else None
 
 
-def in_words(error: Exception) -> str:
-    """One line that says what failed."""
-    return " ".join(f"{type(error).__name__}: {error}".split())[:200]
+def in_words(error: Exception, url: str) -> str:
+    """One line that says what failed, without the credentials of the store's `url`, which libraries quote."""
+    return " ".join(hide_credentials(f"{type(error).__name__}: {error}", url).split())[:200]

@@ -151,17 +151,6 @@ def test_openjd_template_is_valid(count: int) -> None:
         as_openjd([job(0, name="{{x}}")])
 
 
-def test_snakefile_is_one_that_snakemake_reads(tmp_path: Path) -> None:
-    pytest.importorskip("snakemake")
-    from gsbake.python_process import python_command, python_environment
-
-    (tmp_path / "Snakefile").write_text(emit("snakemake", [job(0, "mesh", name="{a} 'b'"), job(0, "bake", ("c0000_mesh",))]))
-    command = python_command("-m", "snakemake", "--dry-run", "--cores", "1", "--printshellcmds")
-    done = subprocess.run(command, cwd=tmp_path, env=python_environment(), capture_output=True, text=True, timeout=120, check=False)
-    assert done.returncode == 0, done.stdout + done.stderr
-    assert shlex.quote("/photos/{a} 'b'") in done.stdout + done.stderr
-
-
 def test_an_unknown_format_is_named(run: Run, make_capture: Make) -> None:
     end = run("plan", make_capture("one"), "--emit", "tractor")
     assert end.code == 2 and ", ".join(FORMATS) in end.err
