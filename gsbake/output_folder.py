@@ -14,6 +14,7 @@ from pathlib import Path
 from gsbake.capture.sources import SKIPPED_FOLDERS, reads_subfolders
 from gsbake.errors import UsageError
 from gsbake.own_files import SET_ASIDE, entries, require_own_folder
+from gsbake.pipeline.digest import is_digest_cache
 from gsbake.pipeline.project import PROJECT, Project
 from gsbake.pipeline.uses import FOLDER as RUNNING
 from gsbake.publish import is_result
@@ -29,7 +30,7 @@ def check_output_folder(out: Path, stored: Project | None, project: Project) -> 
 
     `stored` is the project of the folder, None without one; `project` that of the run. Raises UsageError.
     """
-    require_own_folder(out, stored is not None or _has_own_layout(out), "the output")
+    require_own_folder(out, (stored is not None and stored.photos is not None) or _has_own_layout(out), "the output")
     require_outside_sources(out, project)
     photos, stages = project.sources().get("photos"), out.resolve() / "stages"
     if photos is not None and stages in (photos.resolve(), *photos.resolve().parents):
@@ -66,7 +67,7 @@ def check_same_photos(out: Path, stored: Project | None, project: Project) -> Us
 
 
 def _has_own_layout(out: Path) -> bool:
-    found = [name for name in entries(out) if name != DIGESTS and not is_capture(out / name)]
+    found = [name for name in entries(out) if not (name == DIGESTS and is_digest_cache(out / name)) and not is_capture(out / name)]
     return not found or (_is_event_log(out / EVENTS) and all(name in _MADE or _is_published_name(name, out) for name in found))
 
 

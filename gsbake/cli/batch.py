@@ -110,7 +110,11 @@ def _write_index(outcomes: Sequence[Outcome], root: Path) -> Path:
     """Write the index; where another page has its name, say so and where the index is."""
     path = write_index(outcomes, root.absolute())
     if path.name != INDEX:
-        print_text(f"gsbake: warning: '{path.with_name(INDEX)}' is not as gsbake wrote it and stays; the index is '{path}'.", error=True)
+        print_text(
+            f"gsbake: warning: '{path.with_name(INDEX)}' is not as gsbake wrote it and stays; the index is '{path}'. "
+            "Move yours away to have it there.",
+            error=True,
+        )
     return path
 
 

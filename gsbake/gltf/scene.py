@@ -22,7 +22,7 @@ from gsbake.geometry.vectors import unit
 from gsbake.gltf.document import Document, texture_infos, texture_source
 
 TRIANGLES, STRIP, FAN = 4, 5, 6
-#: Numbers in a row of the attributes that are read, by the start of their names.
+#: Numbers in a row of the attributes that are read; there may be several of TEXCOORD_.
 WIDTHS = {"POSITION": (3,), "NORMAL": (3,), "TANGENT": (4,), "TEXCOORD_": (2,), "COLOR_0": (3, 4)}
 #: Deepest chain of nodes.
 MAX_DEPTH = 256
@@ -30,6 +30,8 @@ MAX_DEPTH = 256
 MAX_TRIANGLES, MAX_PARTS = 50_000_000, 100_000
 #: Bytes that a vertex, a triangle and a part take in a scene and what is made of it: its arrays twice, ray tracing, sampled surfaces.
 VERTEX_BYTES, TRIANGLE_BYTES, PART_BYTES = 200, 350, 4000
+#: UV sets that the bytes of a vertex include, and bytes of each further one.
+USUAL_UV_SETS, UV_SET_BYTES = 2, 24
 #: Largest coordinate, texture coordinate, and factor of a material: beyond, single precision overflows.
 MAX_COORDINATE, MAX_UV, MAX_FACTOR = 1e15, 1e6, 1e9
 
@@ -150,7 +152,9 @@ def _count(document: Document, meshes: list[int]) -> int:
             corners = document.count(primitive["indices"]) if "indices" in primitive else vertices
             faces = corners // 3 if mode == TRIANGLES else max(0, corners - 2)
             triangles, parts = triangles + placed * faces, parts + placed
-            needed += placed * (PART_BYTES + max(vertices, 3 * faces) * VERTEX_BYTES + faces * TRIANGLE_BYTES)
+            sets = sum(key.startswith("TEXCOORD_") for key in primitive["attributes"])
+            vertex = VERTEX_BYTES + UV_SET_BYTES * max(0, sets - USUAL_UV_SETS)
+            needed += placed * (PART_BYTES + max(vertices, 3 * faces) * vertex + faces * TRIANGLE_BYTES)
     if triangles > MAX_TRIANGLES:
         raise BadInputError(f"'{document.name}' has {triangles} triangles, more than {MAX_TRIANGLES}; simplify it first.")
     if parts > MAX_PARTS:
@@ -204,7 +208,7 @@ def _part(document: Document, name: str, primitive: dict[str, Any], matrix: NDAr
     stated = primitive["attributes"]
     if len({document.count(index) for index in stated.values()}) != 1:
         raise ValueError(f"the attributes of {name} differ in number")
-    attributes = {key: _attribute(document, key, index) for key, index in stated.items() if key.startswith(tuple(WIDTHS))}
+    attributes = {key: _attribute(document, key, index) for key, index in stated.items() if _width_name(key) is not None}
     position = attributes["POSITION"].astype(np.float64) @ matrix[:3, :3].T + matrix[:3, 3]
     count = len(position)
     if not (np.abs(position) <= MAX_COORDINATE).all():
@@ -247,10 +251,16 @@ def _part(document: Document, name: str, primitive: dict[str, Any], matrix: NDAr
     return replace(_rows(part, frames.source), tangent=frames.tangent, faces=frames.faces)
 
 
+def _width_name(key: str) -> str | None:
+    """The entry of `WIDTHS` for a vertex attribute; None of those that are not read."""
+    name = "TEXCOORD_" if key.startswith("TEXCOORD_") else key
+    return name if name in WIDTHS else None
+
+
 def _attribute(document: Document, key: str, index: int) -> NDArray[Any]:
     """Values of a vertex attribute. Raises ValueError unless it has a width that the specification gives it."""
     values = document.accessor(index)
-    widths = next(found for start, found in WIDTHS.items() if key.startswith(start))
+    widths = WIDTHS[_width_name(key) or key]
     if values.ndim != 2 or values.shape[1] not in widths:
         raise ValueError(f"{key} has rows of the shape {values.shape[1:]}")
     return values

@@ -11,6 +11,9 @@ from typing import Any
 
 import psutil
 
+#: Limits that `limit_address_space` has set: a later one must not be derived from them, so that only the hard limit counts then.
+_own_limits: list[int] = []
+
 
 def usable_processors() -> int:
     """Number of logical processors that this process may use: all, or those of its CPU affinity where the system has one."""
@@ -40,7 +43,7 @@ def available_memory() -> int:
     found = [int(psutil.virtual_memory().available)]
     found += [max(0, limit - used) for limit, used in _group_memory()]
     resource = _resource()
-    if resource is not None and (limit := resource.getrlimit(resource.RLIMIT_AS)[0]) != resource.RLIM_INFINITY:
+    if resource is not None and (limit := resource.getrlimit(resource.RLIMIT_AS)[bool(_own_limits)]) != resource.RLIM_INFINITY:
         found.append(max(0, limit - int(psutil.Process().memory_info().vms)))
     return min(found)
 
@@ -77,6 +80,7 @@ def limit_address_space(memory: int) -> bool:
     highest = resource.getrlimit(resource.RLIMIT_AS)[1]
     limit = mapped + memory if highest == resource.RLIM_INFINITY else min(mapped + memory, highest)
     resource.setrlimit(resource.RLIMIT_AS, (limit, highest))
+    _own_limits.append(limit)
     return True
 
 

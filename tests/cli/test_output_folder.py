@@ -46,6 +46,20 @@ def test_new_empty_and_own_folders_are_taken(run: Run, capture: Path, tmp_path: 
     assert run("ingest", capture, "--out", "empty").code == 2
 
 
+@pytest.mark.parametrize(
+    ("name", "content"), [("digests.json", '{"thesis.odt": "d41d8cd9"}'), ("project.json", "{}"), ("project.json", '{"name": "shop"}')]
+)
+def test_files_of_other_programs_with_names_of_its_own_are_not_its_mark(
+    run: Run, capture: Path, tmp_path: Path, name: str, content: str
+) -> None:
+    home = tmp_path / "shop"
+    home.mkdir()
+    (home / name).write_text(content)
+    done = run("ingest", capture, "--out", home)
+    assert done.code in (2, 42) and "name " in done.err and "delete" not in done.err
+    assert contents(home) == {name: content.encode()}
+
+
 def test_a_run_that_found_no_usable_photos_does_not_block_its_folder(run: Run, capture: Path) -> None:
     assert run("run", capture, "--out", "o", "--set", "ingest.min_photos=9").code == 42
     assert run("ingest", capture, "--out", "o").code == 0

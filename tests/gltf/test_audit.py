@@ -71,6 +71,14 @@ def test_mirrored_and_overlapping_uvs(mesh: GltfMesh, images: GltfTextures) -> N
     assert "no overlapping UVs" in broken(build_glb(squeezed, images, "b", "g", "", EXTRAS))
 
 
+def test_triangles_that_cover_the_square_often_overlap_without_a_look_at_the_texels(
+    mesh: GltfMesh, images: GltfTextures, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("gsbake.gltf.audit.MAX_COVERED", 0.01)
+    monkeypatch.setattr("gsbake.gltf.audit.overlapping", None)
+    assert "no overlapping UVs" in broken(build_glb(mesh, images, "b", "g", "", EXTRAS))
+
+
 def test_tangents_out_of_the_surface(mesh: GltfMesh, images: GltfTextures) -> None:
     leaning = replace(mesh, tangent=np.column_stack([mesh.normal, mesh.tangent[:, 3]]).astype(np.float32))
     assert "tangents in the surface" in broken(build_glb(leaning, images, "b", "g", "", EXTRAS))

@@ -44,6 +44,14 @@ def refused(path: Path, message: str) -> None:
     assert peak < 50_000_000
 
 
+def test_every_uv_set_counts(tmp_path: Path) -> None:
+    document = many_primitives(30_000, 1)
+    primitive = document["meshes"][0]["primitives"][0]
+    document["accessors"].append({"componentType": 5126, "count": 30_000, "type": "VEC2"})
+    primitive["attributes"] |= {f"TEXCOORD_{k}": len(document["accessors"]) - 1 for k in range(1000)}
+    refused(write_json(tmp_path / "a.gltf", document), r"needs 0?\.?7[\d.]* GB of memory")
+
+
 @pytest.mark.parametrize(
     ("document", "message"),
     [

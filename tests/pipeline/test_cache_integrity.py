@@ -225,7 +225,7 @@ def test_malformed_manifest_is_no_artifact(photos: Path, change: dict[str, objec
 )  # fmt: skip
 def test_damaged_project_is_one_sentence(tmp_path: Path, text: str) -> None:
     (tmp_path / "project.json").write_bytes(text.encode("latin-1"))
-    with pytest.raises(BadInputError, match="delete it and give the photos again") as caught:
+    with pytest.raises(BadInputError, match="move it away and give the photos again") as caught:
         Project.load(tmp_path)
     assert "\n" not in str(caught.value)
 
