@@ -32,6 +32,8 @@ OVERLAP_SIZE = 2048
 MAX_OVERLAP_SHARE = 1e-5
 #: Area of the triangles, in unit squares, above which they overlap without a look at the texels.
 MAX_COVERED = 100.0
+#: Area of the triangles' boxes, in unit squares, up to which the texels are looked at: seconds.
+MAX_BOXES = 1000.0
 #: Share of texels of a normal map whose vectors may be off unit length.
 MAX_NON_UNIT = 0.02
 #: PNG chunks that viewers interpret differently.
@@ -174,6 +176,11 @@ def _uv_layout(asset: GltfAsset, check: Any) -> None:
     covered = float(np.abs(area).sum())
     if covered > MAX_COVERED:  # filling the texels of so many could take hours
         check("no overlapping UVs", False, f"the triangles cover {covered:.0f} times the square")
+        return
+    corners = np.stack([a, b, c])
+    boxes = float(np.prod(corners.max(0) - corners.min(0), axis=1).sum())
+    if boxes > MAX_BOXES:  # long oblique triangles, each of which is looked for in its whole box
+        check("no overlapping UVs", True, "not looked at: many long oblique triangles", "info")
         return
     shared = overlapping(uv, faces, OVERLAP_SIZE)
     check("no overlapping UVs", shared <= MAX_OVERLAP_SHARE * OVERLAP_SIZE**2, f"{shared} of {OVERLAP_SIZE}² texels")

@@ -20,18 +20,24 @@ from gsbake.errors import BadInputError
 from gsbake.imaging import ktx2
 from gsbake.memory_budget import check
 
+#: Most bytes that deflate makes of one (zlib's technical details: 1032, and what the file has besides).
+MAX_DEFLATE = 1032
+#: Channels of a PNG by its colour type.
+_PNG_CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}
 #: Bytes per pixel while 8-bit pixels are decoded and made RGBA: what the decoder holds, its pixels, planes, and the result.
 PIXEL_BYTES = 24
 
 
 @dataclass(frozen=True)
 class ImageSize:
-    """What an image's header states: `format` ("png", "jpeg", "webp", "ktx2"), `width`, `height`, and `bits` per channel."""
+    """What an image's header states: `format` ("png", "jpeg", "webp", "ktx2"), `width`, `height`, `bits` per channel, and of PNG the bytes
+    of pixels that are `stored` before compression."""
 
     format: str
     width: int
     height: int
     bits: int = 8
+    stored: int = 0
 
     @property
     def needed(self) -> int:
@@ -61,6 +67,9 @@ def image_size(content: bytes, name: str) -> ImageSize:
         stated = f"{found.width} × {found.height} pixels"
         raise BadInputError(f"{name} cannot be decoded: it states {stated}, and textures have 1 to {ktx2.MAX_EDGE} a side; reduce it.")
     check(found.needed, name)
+    if len(content) * MAX_DEFLATE < found.stored:
+        stated = f"{found.width} × {found.height} pixels in {len(content)} bytes"
+        raise BadInputError(f"{name} cannot be decoded: its data is cut off ({stated}); export it again.")
     return found
 
 
@@ -109,11 +118,11 @@ def as_rgba(pixels: NDArray[Any], name: str) -> NDArray[np.uint8]:
     return np.ascontiguousarray(np.stack(planes, -1), np.uint8)
 
 
-def _png(content: bytes) -> tuple[int, int, int]:
-    width, height, bits = struct.unpack_from(">IIB", content, 16)
+def _png(content: bytes) -> tuple[int, int, int, int]:
+    width, height, bits, colours = struct.unpack_from(">IIBB", content, 16)
     if content[12:16] != b"IHDR":
         raise ValueError
-    return width, height, bits
+    return width, height, bits, height * (width * bits * _PNG_CHANNELS[colours] // 8)
 
 
 def _jpeg(content: bytes) -> tuple[int, int, int]:

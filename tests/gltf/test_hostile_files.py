@@ -113,6 +113,14 @@ def test_the_header_of_an_image_is_enough(tmp_path: Path) -> None:
         read_glb(path).image("base_color")
 
 
+def test_a_png_that_is_cut_off_is_not_decoded() -> None:
+    """Deflate makes at most 1032 bytes of one, so a header of 2000² with a hundred bytes is refused before a decoder fills 12 MB."""
+    with pytest.raises(BadInputError, match=r"its data is cut off \(2000 × 2000 pixels in \d+ bytes\)"):
+        image_size(png_header(2000, 2000), "a.png")
+    black = cv2.imencode(".png", np.zeros((2048, 2048, 3), np.uint8))[1].tobytes()  # compresses as well as any can
+    assert image_size(black, "a.png").width == 2048
+
+
 @pytest.mark.parametrize("suffix", [".png", ".jpg", ".webp"])
 def test_sizes_in_headers_are_those_of_the_pixels(suffix: str) -> None:
     pixels = np.random.default_rng(0).integers(0, 255, (21, 34, 3), dtype=np.uint8)
