@@ -54,12 +54,14 @@ def test_json_takes_no_more_than_is_counted(text: str) -> None:
     assert size(json.loads(text)) <= json_bytes(text.encode())
 
 
+def given(memory: int) -> str:
+    """Lines of a script whose process was given an address space of `memory` bytes from outside (ulimit -v)."""
+    return f"import resource\nresource.setrlimit(resource.RLIMIT_AS, ({memory}, resource.getrlimit(resource.RLIMIT_AS)[1]))\n"
+
+
 def test_a_limit_of_the_process_counts() -> None:
     """In a process of its own, which may map 600 MB more than it has."""
-    script = (
-        "from gsbake.system.limits import available_memory, limit_address_space\n"
-        "if limit_address_space(600 << 20): print(available_memory() <= 600 << 20)\nelse: print(True)"
-    )
+    script = f"{given(600 << 20)}from gsbake.system.limits import available_memory\nprint(available_memory() <= 600 << 20)"
     done = subprocess.run(python_command("-c", script), env=python_environment(), capture_output=True, text=True, timeout=60)
     assert done.stdout.strip() == "True", done.stderr
 
@@ -68,10 +70,7 @@ def test_inspect_under_a_limit_ends_in_a_sentence(tmp_path: Path) -> None:
     """A file of 5 kB whose primitives take gigabytes, in a process that may map 2 GB: exit code 42, not a MemoryError."""
     path = write_json(tmp_path / "a.gltf", many_primitives(200_000, 100))
     assert path.stat().st_size < 6000
-    script = (
-        "import sys\nfrom gsbake.system.limits import limit_address_space\nlimit_address_space(2 << 30)\n"
-        f"sys.argv = ['gsbake', 'inspect', {str(path)!r}]\nfrom gsbake.cli import main\nmain()"
-    )
+    script = f"{given(2 << 30)}import sys\nsys.argv = ['gsbake', 'inspect', {str(path)!r}]\nfrom gsbake.cli import main\nmain()"
     done = subprocess.run(python_command("-c", script), env=python_environment(), capture_output=True, text=True, timeout=60)
     assert done.returncode == 42 and "a.gltf' needs" in done.stderr and "Traceback" not in done.stderr, done.stderr
 

@@ -11,8 +11,9 @@ from typing import Any
 
 import psutil
 
-#: Limits that `limit_address_space` has set: a later one must not be derived from them, so that only the hard limit counts then.
-_own_limits: list[int] = []
+#: The limit of the address space that this process was given, once `limit_address_space` has set one of its own, from which no later one
+#: may be derived.
+_given_limit: list[int] = []
 
 
 def usable_processors() -> int:
@@ -43,9 +44,14 @@ def available_memory() -> int:
     found = [int(psutil.virtual_memory().available)]
     found += [max(0, limit - used) for limit, used in _group_memory()]
     resource = _resource()
-    if resource is not None and (limit := resource.getrlimit(resource.RLIMIT_AS)[bool(_own_limits)]) != resource.RLIM_INFINITY:
+    if resource is not None and (limit := _address_space_given(resource)) != resource.RLIM_INFINITY:
         found.append(max(0, limit - int(psutil.Process().memory_info().vms)))
     return min(found)
+
+
+def _address_space_given(resource: Any) -> int:
+    """The limit of the address space from outside, in bytes; RLIM_INFINITY without one."""
+    return _given_limit[0] if _given_limit else int(resource.getrlimit(resource.RLIMIT_AS)[0])
 
 
 def _group_memory() -> list[tuple[int, int]]:
@@ -77,10 +83,10 @@ def limit_address_space(memory: int) -> bool:
         mapped = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0]) * resource.getpagesize()
     except OSError:
         return False
-    highest = resource.getrlimit(resource.RLIMIT_AS)[1]
-    limit = mapped + memory if highest == resource.RLIM_INFINITY else min(mapped + memory, highest)
+    given, highest = _address_space_given(resource), resource.getrlimit(resource.RLIMIT_AS)[1]
+    limit = mapped + memory if given == resource.RLIM_INFINITY else min(mapped + memory, given)
     resource.setrlimit(resource.RLIMIT_AS, (limit, highest))
-    _own_limits.append(limit)
+    _given_limit[:] = [given]
     return True
 
 

@@ -7,14 +7,23 @@ import sys
 
 import pytest
 
-SCRIPT = """
+OWN = """
 from gsbake.system.limits import available_memory, limit_address_space
 before = available_memory()
 print(not limit_address_space(1 << 28) or available_memory() > 0.5 * before)
 """
+GIVEN = """
+import resource
+resource.setrlimit(resource.RLIMIT_AS, (1 << 30, resource.getrlimit(resource.RLIMIT_AS)[1]))
+from gsbake.system.limits import available_memory, limit_address_space
+limit_address_space(1 << 28)
+limit_address_space(1 << 40)
+print(available_memory() < 1 << 30 and resource.getrlimit(resource.RLIMIT_AS)[0] == 1 << 30)
+"""
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="no such limit here")
-def test_a_small_photo_first_does_not_limit_a_large_one_later() -> None:
-    done = subprocess.run([sys.executable, "-c", SCRIPT], capture_output=True, text=True, check=True)
+@pytest.mark.parametrize("script", [OWN, GIVEN], ids=["a small photo first does not limit a large one later", "a limit from outside stays"])
+def test_limits_of_the_address_space(script: str) -> None:
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "True"
