@@ -31,9 +31,9 @@ OVERLAP_SIZE = 2048
 #: Largest share of overlapping texels, for rounding at shared edges.
 MAX_OVERLAP_SHARE = 1e-5
 #: Area of the triangles, in unit squares, above which they overlap without a look at the texels.
-MAX_COVERED = 100.0
+MAX_COVERED = 10.0
 #: Area of the triangles' boxes, in unit squares, up to which the texels are looked at: seconds.
-MAX_BOXES = 1000.0
+MAX_BOXES = 200.0
 #: Share of texels of a normal map whose vectors may be off unit length.
 MAX_NON_UNIT = 0.02
 #: PNG chunks that viewers interpret differently.

@@ -22,6 +22,8 @@ from gsbake.memory_budget import check
 
 #: Most bytes that deflate makes of one (zlib's technical details: 1032, and what the file has besides).
 MAX_DEFLATE = 1032
+#: Most pixels of a JPEG for a byte: each block of 64 has a DC coefficient of at least one bit (ITU-T T.81, F.1.2.1).
+MAX_JPEG_PIXELS = 512
 #: Channels of a PNG by its colour type.
 _PNG_CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}
 #: Bytes per pixel while 8-bit pixels are decoded and made RGBA: what the decoder holds, its pixels, planes, and the result.
@@ -67,7 +69,7 @@ def image_size(content: bytes, name: str) -> ImageSize:
         stated = f"{found.width} × {found.height} pixels"
         raise BadInputError(f"{name} cannot be decoded: it states {stated}, and textures have 1 to {ktx2.MAX_EDGE} a side; reduce it.")
     check(found.needed, name)
-    if len(content) * MAX_DEFLATE < found.stored:
+    if len(content) * MAX_DEFLATE < found.stored or (form == "jpeg" and found.width * found.height > len(content) * MAX_JPEG_PIXELS):
         stated = f"{found.width} × {found.height} pixels in {len(content)} bytes"
         raise BadInputError(f"{name} cannot be decoded: its data is cut off ({stated}); export it again.")
     return found

@@ -119,6 +119,11 @@ def test_a_png_that_is_cut_off_is_not_decoded() -> None:
         image_size(png_header(2000, 2000), "a.png")
     black = cv2.imencode(".png", np.zeros((2048, 2048, 3), np.uint8))[1].tobytes()  # compresses as well as any can
     assert image_size(black, "a.png").width == 2048
+    options = [cv2.IMWRITE_JPEG_OPTIMIZE, 1, cv2.IMWRITE_JPEG_PROGRESSIVE, 1]
+    photo = cv2.imencode(".jpg", np.zeros((2048, 2048, 3), np.uint8), options)[1].tobytes()
+    assert image_size(photo, "a.jpg").width == 2048
+    with pytest.raises(BadInputError, match="its data is cut off"):
+        image_size(photo[:2000], "a.jpg")
 
 
 @pytest.mark.parametrize("suffix", [".png", ".jpg", ".webp"])
