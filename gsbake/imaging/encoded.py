@@ -8,6 +8,7 @@ PNG: W3C *Portable Network Graphics*, 11.2.1. JPEG: ITU-T T.81, B.2.2. WebP: RFC
 
 from __future__ import annotations
 
+import math
 import struct
 from dataclasses import dataclass
 from typing import Any
@@ -32,14 +33,14 @@ PIXEL_BYTES = 24
 
 @dataclass(frozen=True)
 class ImageSize:
-    """What an image's header states: `format` ("png", "jpeg", "webp", "ktx2"), `width`, `height`, `bits` per channel, and of PNG the bytes
-    of pixels that are `stored` before compression."""
+    """What an image's header states: `format` ("png", "jpeg", "webp", "ktx2"), `width`, `height`, `bits` per channel, and the `least` bytes
+    that a file of PNG or JPEG with so many pixels has."""
 
     format: str
     width: int
     height: int
     bits: int = 8
-    stored: int = 0
+    least: int = 0
 
     @property
     def needed(self) -> int:
@@ -69,7 +70,7 @@ def image_size(content: bytes, name: str) -> ImageSize:
         stated = f"{found.width} × {found.height} pixels"
         raise BadInputError(f"{name} cannot be decoded: it states {stated}, and textures have 1 to {ktx2.MAX_EDGE} a side; reduce it.")
     check(found.needed, name)
-    if len(content) * MAX_DEFLATE < found.stored or (form == "jpeg" and found.width * found.height > len(content) * MAX_JPEG_PIXELS):
+    if len(content) < found.least:
         stated = f"{found.width} × {found.height} pixels in {len(content)} bytes"
         raise BadInputError(f"{name} cannot be decoded: its data is cut off ({stated}); export it again.")
     return found
@@ -124,10 +125,10 @@ def _png(content: bytes) -> tuple[int, int, int, int]:
     width, height, bits, colours = struct.unpack_from(">IIBB", content, 16)
     if content[12:16] != b"IHDR":
         raise ValueError
-    return width, height, bits, height * (width * bits * _PNG_CHANNELS[colours] // 8)
+    return width, height, bits, math.ceil(height * (width * bits * _PNG_CHANNELS[colours] // 8) / MAX_DEFLATE)
 
 
-def _jpeg(content: bytes) -> tuple[int, int, int]:
+def _jpeg(content: bytes) -> tuple[int, int, int, int]:
     """The size in the first frame header: segments before it are skipped."""
     at = 2
     while True:
@@ -140,7 +141,7 @@ def _jpeg(content: bytes) -> tuple[int, int, int]:
             at += 2
         elif 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
             bits, height, width = struct.unpack_from(">BHH", content, at + 4)
-            return width, height, bits
+            return width, height, bits, math.ceil(width * height / MAX_JPEG_PIXELS)
         else:
             at += 2 + max(2, struct.unpack_from(">H", content, at + 2)[0])
 
