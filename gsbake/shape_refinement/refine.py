@@ -1,0 +1,129 @@
+"""The whole refinement: coarse light and blurred photos first, then finer ones, a few Gauss–Newton steps each."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gsbake.capture.posed_photos import PosedPhotos
+from gsbake.geometry.raycast import RayCaster
+from gsbake.meshing.refinement.silhouette import find_contour_points
+from gsbake.monitor import SILENT, Monitor
+from gsbake.shape_refinement.appearance import Appearance, Geometry, choose_light_vertices, fit_appearance, fit_light
+from gsbake.shape_refinement.reflection_map import ReflectionMap
+from gsbake.shape_refinement.samples import Doubles, Photo, load_photos, sample_photos
+from gsbake.shape_refinement.step import Contour, StepOptions, contour_rows, solve_step
+from gsbake.shape_refinement.surface import Surface
+
+Faces = NDArray[np.int32]
+
+
+@dataclass(frozen=True)
+class Level:
+    """One level: edge of the light's map in texels, steps, blur of the photos in pixels."""
+
+    light: int
+    steps: int
+    blur: float
+
+
+@dataclass(frozen=True)
+class RefinementOptions:
+    """Settings of the refinement."""
+
+    levels: tuple[Level, ...] = (Level(16, 3, 2.0), Level(24, 4, 1.4), Level(32, 4, 0.8))
+    step: StepOptions = field(default_factory=StepOptions)
+    #: Alternations of light and appearance at a level's first step, and at the others.
+    first_alternations: int = 6
+    alternations: int = 2
+    #: Steps between searches for contour points.
+    contour_every: int = 3
+
+
+@dataclass(frozen=True)
+class Refined:
+    """The refined `vertices` (v, 3), and what was found with them."""
+
+    vertices: Doubles
+    appearance: Appearance
+    light: ReflectionMap
+    figures: dict[str, float]
+
+
+def refine_shape(
+    vertices: Doubles,
+    faces: Faces,
+    posed: PosedPhotos,
+    options: RefinementOptions | None = None,
+    *,
+    max_size: int | None = None,
+    seed: int = 0,
+    threads: int = 2,
+    on_step: Callable[[str, Doubles], None] = lambda text, vertices: None,
+    monitor: Monitor = SILENT,
+) -> Refined:
+    """Refine the vertices (v, 3) of a mesh with outward `faces` (f, 3) in the frame of the posed photos."""
+    options = options or RefinementOptions()
+    surface = Surface(len(vertices), faces)
+    current = np.array(vertices, np.float64)
+    centres = np.stack([camera.centre for camera in posed.cameras.cameras])
+    pixel = _pixel(current, posed)
+    total, since_contour = np.zeros(len(current)), np.zeros(len(current))
+    robust = np.ones((len(current), len(posed)), np.float32)
+    appearance = Appearance.initial(len(current))
+    light = ReflectionMap.constant(options.levels[0].light, 0.5)
+    variance = np.zeros(len(current), np.float32)
+    contour: Contour | None = None
+    figures: dict[str, float] = {}
+    for level in options.levels:
+        photos = load_photos(posed, max_size, level.blur)
+        light = light.resampled(level.light) if light.size != level.light else light
+        for index in range(level.steps):
+            monitor.check_stop()
+            normals = surface.normals(current)
+            geometry = Geometry(current, normals, centres)
+            samples = sample_photos(current, normals, faces, photos)
+            chosen = choose_light_vertices(samples, seed)
+            for _ in range(options.alternations if index else options.first_alternations):
+                light = fit_light(geometry, samples, robust, appearance, light, chosen)
+                appearance = fit_appearance(surface, geometry, samples, robust, light)
+            appearance = appearance.at_least(variance)
+            if posed.has_masks and index % options.contour_every == 0:
+                contour, since_contour = _find_contour(surface, geometry, photos, posed, threads), np.zeros(len(current))
+            step = solve_step(
+                surface, geometry, samples, robust, light, appearance, total, pixel, contour, since_contour, options.step
+            )
+            variance = step.variance
+            total, since_contour = total + step.displacement, since_contour + step.displacement
+            current = current + normals * step.displacement[:, None]
+            figures = {
+                "explained": appearance.explained, "residual": step.relative_residual,
+                "step_pixels": float(np.abs(step.displacement).mean() / pixel),
+            }  # fmt: skip
+            on_step(f"light {level.light} step {index}: " + ", ".join(f"{k} {v:.3f}" for k, v in figures.items()), current)
+    figures["total_pixels"] = float(np.abs(total).mean() / pixel)
+    return Refined(current, appearance, light, figures)
+
+
+def _find_contour(surface: Surface, geometry: Geometry, photos: Iterable[Photo], posed: PosedPhotos, threads: int) -> Contour:
+    """Contour points of the mesh in all photos, at the masks' own size."""
+    caster = RayCaster(geometry.vertices, surface.faces, threads)
+    parts = []
+    for index in range(len(posed)):
+        camera, mask = posed.mask(index)
+        if mask is not None:
+            parts.append(find_contour_points(caster, geometry.normals, surface.edges, camera, mask))
+    start, end, fraction, offset, pixel = (
+        np.concatenate([getattr(part, name) for part in parts]) for name in ("start", "end", "fraction", "offset", "pixel")
+    )
+    return Contour(contour_rows(start, end, fraction, surface.count), offset * pixel, pixel)
+
+
+def _pixel(vertices: Doubles, posed: PosedPhotos) -> float:
+    """Mean size of a pixel at the middle of the mesh."""
+    middle = vertices.mean(0)
+    sizes = [np.linalg.norm(middle - camera.centre) * 2 / (camera.fx + camera.fy) for camera in posed.cameras.cameras]
+    return float(np.mean(sizes))
