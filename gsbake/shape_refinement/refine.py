@@ -2,23 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gsbake.capture.posed_photos import PosedPhotos
+from gsbake.geometry.cameras import Camera
 from gsbake.geometry.raycast import RayCaster
 from gsbake.meshing.refinement.silhouette import find_contour_points
 from gsbake.monitor import SILENT, Monitor
 from gsbake.shape_refinement.appearance import Appearance, Geometry, choose_light_vertices, fit_appearance, fit_light
 from gsbake.shape_refinement.reflection_map import ReflectionMap
-from gsbake.shape_refinement.samples import Doubles, Photo, load_photos, sample_photos
+from gsbake.shape_refinement.samples import Doubles, Floats, Photo, sample_photos
 from gsbake.shape_refinement.step import Contour, StepOptions, contour_rows, solve_step
 from gsbake.shape_refinement.surface import Surface
 
 Faces = NDArray[np.int32]
+#: A camera and its mask (h, w), 0..255.
+Mask = tuple[Camera, NDArray[np.uint8]]
 
 
 @dataclass(frozen=True)
@@ -56,30 +58,35 @@ class Refined:
 def refine_shape(
     vertices: Doubles,
     faces: Faces,
-    posed: PosedPhotos,
+    load_photos: Callable[[float], Sequence[Photo]],
+    masks: Callable[[], Iterable[Mask]] | None,
     options: RefinementOptions | None = None,
     *,
-    max_size: int | None = None,
     seed: int = 0,
     threads: int = 2,
     on_step: Callable[[str, Doubles], None] = lambda text, vertices: None,
     monitor: Monitor = SILENT,
 ) -> Refined:
-    """Refine the vertices (v, 3) of a mesh with outward `faces` (f, 3) in the frame of the posed photos."""
+    """Refine the vertices (v, 3) of a mesh with outward `faces` (f, 3), in the frame of the cameras.
+
+    `load_photos` returns the photos blurred by a number of pixels, the same cameras each time; `masks` yields the masks at their own size, None
+    where not every photo has one.
+    """
     options = options or RefinementOptions()
     surface = Surface(len(vertices), faces)
     current = np.array(vertices, np.float64)
-    centres = np.stack([camera.centre for camera in posed.cameras.cameras])
-    pixel = _pixel(current, posed)
     total, since_contour = np.zeros(len(current)), np.zeros(len(current))
-    robust = np.ones((len(current), len(posed)), np.float32)
+    robust: Floats | None = None
     appearance = Appearance.initial(len(current))
     light = ReflectionMap.constant(options.levels[0].light, 0.5)
     variance = np.zeros(len(current), np.float32)
     contour: Contour | None = None
     figures: dict[str, float] = {}
     for level in options.levels:
-        photos = load_photos(posed, max_size, level.blur)
+        photos = load_photos(level.blur)
+        centres = np.stack([photo.camera.centre for photo in photos])
+        pixel = _pixel(current, photos)
+        robust = np.ones((len(current), len(photos)), np.float32) if robust is None else robust
         light = light.resampled(level.light) if light.size != level.light else light
         for index in range(level.steps):
             monitor.check_stop()
@@ -91,8 +98,8 @@ def refine_shape(
                 light = fit_light(geometry, samples, robust, appearance, light, chosen)
                 appearance = fit_appearance(surface, geometry, samples, robust, light)
             appearance = appearance.at_least(variance)
-            if posed.has_masks and index % options.contour_every == 0:
-                contour, since_contour = _find_contour(surface, geometry, photos, posed, threads), np.zeros(len(current))
+            if masks is not None and index % options.contour_every == 0:
+                contour, since_contour = _find_contour(surface, geometry, masks(), threads), np.zeros(len(current))
             step = solve_step(
                 surface, geometry, samples, robust, light, appearance, total, pixel, contour, since_contour, options.step
             )
@@ -108,22 +115,18 @@ def refine_shape(
     return Refined(current, appearance, light, figures)
 
 
-def _find_contour(surface: Surface, geometry: Geometry, photos: Iterable[Photo], posed: PosedPhotos, threads: int) -> Contour:
-    """Contour points of the mesh in all photos, at the masks' own size."""
+def _find_contour(surface: Surface, geometry: Geometry, masks: Iterable[Mask], threads: int) -> Contour:
+    """Contour points of the mesh in all masks."""
     caster = RayCaster(geometry.vertices, surface.faces, threads)
-    parts = []
-    for index in range(len(posed)):
-        camera, mask = posed.mask(index)
-        if mask is not None:
-            parts.append(find_contour_points(caster, geometry.normals, surface.edges, camera, mask))
+    parts = [find_contour_points(caster, geometry.normals, surface.edges, camera, mask) for camera, mask in masks]
     start, end, fraction, offset, pixel = (
         np.concatenate([getattr(part, name) for part in parts]) for name in ("start", "end", "fraction", "offset", "pixel")
     )
     return Contour(contour_rows(start, end, fraction, surface.count), offset * pixel, pixel)
 
 
-def _pixel(vertices: Doubles, posed: PosedPhotos) -> float:
+def _pixel(vertices: Doubles, photos: Sequence[Photo]) -> float:
     """Mean size of a pixel at the middle of the mesh."""
     middle = vertices.mean(0)
-    sizes = [np.linalg.norm(middle - camera.centre) * 2 / (camera.fx + camera.fy) for camera in posed.cameras.cameras]
+    sizes = [np.linalg.norm(middle - p.camera.centre) * 2 / (p.camera.fx + p.camera.fy) for p in photos]
     return float(np.mean(sizes))
