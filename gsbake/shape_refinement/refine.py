@@ -25,11 +25,13 @@ Mask = tuple[Camera, NDArray[np.uint8]]
 
 @dataclass(frozen=True)
 class Level:
-    """One level: edge of the light's map in texels, steps, blur of the photos in pixels."""
+    """One level: edge of the light's map in texels, steps, blur of the photos in pixels; `held` = False lets the surface go where it will,
+    because the start's error is the same everywhere."""
 
     light: int
     steps: int
     blur: float
+    held: bool = True
 
 
 @dataclass(frozen=True)
@@ -101,10 +103,12 @@ def refine_shape(
             if masks is not None and index % options.contour_every == 0:
                 contour, since_contour = _find_contour(surface, geometry, masks(), threads), np.zeros(len(current))
             step = solve_step(
-                surface, geometry, samples, robust, light, appearance, total, pixel, contour, since_contour, options.step
-            )
+                surface, geometry, samples, robust, light, appearance, total if level.held else None, pixel, contour, since_contour,
+                options.step,
+            )  # fmt: skip
             variance = step.variance
-            total, since_contour = total + step.displacement, since_contour + step.displacement
+            total = total + step.displacement if level.held else total
+            since_contour = since_contour + step.displacement
             current = current + normals * step.displacement[:, None]
             figures = {
                 "explained": appearance.explained, "residual": step.relative_residual,

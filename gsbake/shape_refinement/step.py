@@ -68,11 +68,12 @@ class Step:
 
 def solve_step(
     surface: Surface, geometry: Geometry, samples: VertexSamples, robust: Floats, light: ReflectionMap, appearance: Appearance,
-    total: Doubles, pixel: float, contour: Contour | None, since_contour: Doubles, options: StepOptions,
+    total: Doubles | None, pixel: float, contour: Contour | None, since_contour: Doubles, options: StepOptions,
 ) -> Step:  # fmt: skip
     """The next displacements.
 
-    `robust` (v, photos) gets the weights of the samples' residuals; `total` (v,) is the move so far, `since_contour` (v,) the part since the
+    `robust` (v, photos) gets the weights of the samples' residuals; `total` (v,) is the move so far, None for a step that
+    nothing holds, `since_contour` (v,) the part since the
     contour points were found, `pixel` the size of a pixel at the object, all in the mesh's unit.
     """
     count, faces = surface.count, surface.faces
@@ -102,11 +103,12 @@ def solve_step(
 
     edge = surface.mean_edge(geometry.vertices)
     worth = _worth(surface, samples, residual, appearance.importance, pixel)
-    keep_move, keep_bend = _total_weights(surface, total, worth, pixel, edge, options)
     umbrella, bend = surface.umbrella, edge * np.radians(options.bend)
-    matrix = matrix + surface.bending * (1 / bend**2) + umbrella.T @ sparse.diags(keep_bend) @ umbrella
-    matrix = matrix + sparse.diags(hessian[:, 0] + keep_move + 1 / (options.move * pixel) ** 2)
-    right -= keep_move * total + umbrella.T @ (keep_bend * (umbrella @ total))
+    matrix = matrix + surface.bending * (1 / bend**2) + sparse.diags(hessian[:, 0] + 1 / (options.move * pixel) ** 2)
+    if total is not None:
+        keep_move, keep_bend = _total_weights(surface, total, worth, pixel, edge, options)
+        matrix = matrix + umbrella.T @ sparse.diags(keep_bend) @ umbrella + sparse.diags(keep_move)
+        right -= keep_move * total + umbrella.T @ (keep_bend * (umbrella @ total))
     if contour is not None and len(contour.target):
         distance = (contour.target - contour.rows @ since_contour) / contour.pixel
         weight = np.minimum(1, options.contour_outlier / np.maximum(np.abs(distance), 1e-9)) / (options.contour * contour.pixel) ** 2
