@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -13,19 +12,19 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from gsbake.capture.photos.roles import test_photos
 from gsbake.capture.posed_photos import PosedPhotos
 from gsbake.config.schema import Mesh
 from gsbake.errors import BadInputError
-from gsbake.geometry.cameras import Camera
 from gsbake.geometry.ply import write_mesh
 from gsbake.meshing import cleanup
 from gsbake.meshing.decimation import decimate_to_error_bound
 from gsbake.meshing.decimator_choice import resolve_decimator
+from gsbake.meshing.decimators import remesh
 from gsbake.meshing.depth_cache import DepthViewCache
 from gsbake.meshing.depth_views import DepthView, depth_noise
 from gsbake.meshing.refinement.normal_filter import denoise
 from gsbake.meshing.refinement.normals import NormalAccumulator, integrate_normals
-from gsbake.meshing.refinement.silhouette import refine_silhouettes
 from gsbake.meshing.repair import close_holes, repair
 from gsbake.meshing.resolution import Resolution, choose_resolution, pixel_footprint
 from gsbake.meshing.stereo_depth import merge_stereo_depth
@@ -33,6 +32,10 @@ from gsbake.meshing.support_plane import SupportPlane, find_support_plane, remov
 from gsbake.meshing.tsdf import SparseTsdf
 from gsbake.monitor import SILENT, Monitor, Rule, decide_skip, skips
 from gsbake.mvs.depth_maps import read_depth
+from gsbake.shape_refinement.refine import pixel_size, proxy_edge, refine_shape
+from gsbake.shape_refinement.samples import load_photos
+from gsbake.shape_refinement.surface import Surface
+from gsbake.shape_refinement.transfer import transfer_displacements
 from gsbake.surfels.field import Field
 from gsbake.surfels.fields.continuous import ContinuousField
 from gsbake.surfels.fields.registry import load_field
@@ -48,8 +51,8 @@ Faces = NDArray[np.int32]
 TRUNCATION_CELLS = (4.0, 10.0)
 #: Maximum difference in voxels at which a stereo depth replaces a rendered one.
 STEREO_TOLERANCE = 3.0
-#: Memory for photos in photometric refinement, in bytes.
-PHOTO_CACHE_BYTES = 1 << 29
+#: Most photos that the shape is refined with.
+MAX_REFINEMENT_PHOTOS = 96
 #: Minimum extent of the surfels in the unit frame.
 MIN_EXTENT = 1e-9
 #: Maximum boundary edges of a hole that is filled after meshing; larger ones are openings.
@@ -59,7 +62,8 @@ MAX_HOLE_EDGES = 400
 @dataclass(frozen=True)
 class MeshOptions:
     """Settings of mesh extraction; `train_size` and `stereo_size` are the longer sides in pixels of the photos in training and stereo,
-    `empty_cells` is the rule of [skip], `projected_depth` that of [surfels], `max_triangles` the limit of the exported asset."""
+    `empty_cells` is the rule of [skip], `projected_depth` that of [surfels], `max_triangles` the limit of the exported asset; every
+    `holdout`-th photo is kept out."""
 
     mesh: Mesh = Mesh()
     train_size: int = 512
@@ -67,6 +71,7 @@ class MeshOptions:
     empty_cells: Rule = "auto"
     projected_depth: bool = False
     max_triangles: int = 100_000
+    holdout: int = 8
 
     @property
     def max_faces(self) -> int:
@@ -143,12 +148,10 @@ class _Extraction:
             )
         with self.monitor.part("clean"):
             vertices, faces, dropped = self._clean(vertices, faces, cache, resolution.cell, support)
-        with self.monitor.part("silhouettes"):
-            vertices = self._refine_silhouettes(vertices, faces)
+        with self.monitor.part("shape"):
+            vertices, refinement = self._refine_shape(vertices, faces)
         with self.monitor.part("denoising"):
             vertices = denoise(vertices, faces, self.options.mesh.denoising_iterations)
-        with self.monitor.part("photos"):
-            vertices, photometric = self._refine_photometric(vertices, faces, resolution.cell)
         write_mesh(self.out / "dense.ply", vertices, faces)
         self.monitor.check_stop()
         with self.monitor.part("decimate"):
@@ -160,7 +163,7 @@ class _Extraction:
             "cells": resolution.cells,
             "depth_noise_cells": noise / resolution.cell,
             "dropped_components": dropped,
-            **photometric,
+            **refinement,
         }
 
     def _samples(self) -> OrientedPoints:
@@ -276,65 +279,32 @@ class _Extraction:
         wavelength = self.options.mesh.normal_wavelength * cell
         return integrate_normals(vertices, faces, normals, confidence, wavelength, max_displacement=1.5 * cell)
 
-    def _refine_silhouettes(self, vertices: Doubles, faces: Faces) -> Doubles:
-        """Refine the vertices against the masks, where every photo has one."""
-        iterations, monitor = self.options.mesh.silhouette_iterations, self.monitor
-        if not iterations or not self.posed.has_masks:
-            reason = "not every photo has a mask" if iterations else "set by the profile"
-            monitor.decide("silhouette refinement", "skipped", reason)
-            return vertices
-
-        def views() -> Iterator[tuple[Camera, NDArray[np.uint8]]]:
-            for index in range(len(self.posed)):
-                monitor.check_stop()
-                view = self.posed.view(index)
-                if view.mask is not None:
-                    yield view.camera, view.mask
-
-        result = refine_silhouettes(vertices, faces, views, iterations, self.threads)
-        if result.contour_points == 0:
-            monitor.decide("silhouette refinement", "no change", "fewer than 100 contour points lie near mask boundaries")
-        else:
-            evidence = f"{result.contour_points} contour points, median distance to mask boundaries {result.offset_before:+.2f} px"
-            monitor.decide("silhouette refinement", f"now {result.offset_after:+.2f} px", evidence)
-        return result.vertices
-
-    def _refine_photometric(self, vertices: Doubles, faces: Faces, cell: float) -> tuple[Doubles, dict[str, float]]:
-        """Refine the vertices by photometric consistency, where stereo confirmed depths; also results for the manifest."""
-        from functools import lru_cache
-
-        from gsbake.meshing.refinement.photometric import refine_photometric
-        from gsbake.meshing.refinement.photometric_measure import PhotometricViews
-        from gsbake.mvs.pyramids import Photo, load_photo
-
-        iterations, size = self.options.mesh.photometric_iterations, self.options.stereo_size
-        files = [] if self.stereo is None else [self.stereo / "depth" / f"{camera.name}.npz" for camera in self.posed.cameras.cameras]
-        if not iterations or not any(file.exists() for file in files):
-            self.monitor.decide("photometric refinement", "skipped", "stereo confirmed no depths" if iterations else "set by the profile")
+    def _refine_shape(self, vertices: Doubles, faces: Faces) -> tuple[Doubles, dict[str, float]]:
+        """Refine the vertices by parallax, reflections and silhouettes, on a coarser mesh; also results for the manifest."""
+        settings, monitor, posed = self.options.mesh, self.monitor, self.posed
+        if not settings.refinement_vertices:
+            monitor.decide("shape refinement", "skipped", "set by the profile")
             return vertices, {}
-        cameras = [camera.downscaled_to(size) for camera in self.posed.cameras.cameras]
-
-        @lru_cache(maxsize=max(8, PHOTO_CACHE_BYTES // (2 * max(c.width * c.height for c in cameras))))
-        def photo(index: int) -> Photo:
-            self.monitor.check_stop()
-            return load_photo(self.posed, index, size)
-
-        views = PhotometricViews(
-            cameras, photo, lambda index: read_depth(files[index]) if files[index].exists() else None, STEREO_TOLERANCE * cell
+        chosen = [index for index in range(len(posed)) if index not in set(test_photos(len(posed), self.options.holdout))]
+        chosen = chosen[:: -(-len(chosen) // MAX_REFINEMENT_PHOTOS)]
+        size, decimator = self.options.stereo_size, resolve_decimator(settings.decimator)
+        cameras = [posed.cameras.cameras[index].downscaled_to(size) for index in chosen]
+        edge = proxy_edge(vertices, faces, pixel_size(vertices, cameras), settings.refinement_vertices)
+        coarse, coarse_faces = remesh(vertices, faces, edge, decimator)
+        if len(coarse_faces) == 0:
+            return vertices, {}
+        masks = (lambda: (posed.mask(index) for index in chosen)) if posed.has_masks else None
+        result = refine_shape(
+            coarse, coarse_faces, lambda blur: load_photos(posed, chosen, size, blur), masks, threads=self.threads, monitor=monitor
         )
-        photometric = refine_photometric(vertices, faces, views, iterations, self.threads)
-        evidence = f"{100 * photometric.consistent_share:.0f} % of the surface points are consistent in most photos"
-        if photometric.rounds:
-            evidence += f"; NCC {photometric.ncc_before:.3f} → {photometric.ncc_after:.3f}"
-            self.monitor.decide("photometric refinement", f"median displacement {photometric.median_displacement:.2f} px", evidence)
-        else:
-            self.monitor.decide("photometric refinement", "no change", f"{evidence}; NCC does not increase")
-        return photometric.vertices, {
-            "photometric_share": photometric.consistent_share,
-            "photometric_move_pixels": photometric.median_displacement,
-            "photometric_ncc_before": photometric.ncc_before,
-            "photometric_ncc_after": photometric.ncc_after,
-        }
+        before, fine = Surface(len(coarse), coarse_faces), Surface(len(vertices), faces)
+        move = transfer_displacements(vertices, fine.normals(vertices), coarse, before.normals(coarse), result.vertices)
+        figures = result.figures
+        evidence = f"{len(coarse)} vertices in {len(chosen)} photos; reflections explain {100 * figures['explained']:.0f} % of what changes"
+        if masks is not None:
+            evidence += f"; contours {figures['contour_before']:+.2f} px from the masks before, {figures['contour_after']:+.2f} px after"
+        monitor.decide("shape refinement", f"mean displacement {figures['moved_pixels']:.2f} px", evidence)
+        return vertices + move, {f"refinement_{name}": value for name, value in figures.items()}
 
     def _decimate(self, vertices: Doubles, faces: Faces, cell: float) -> dict[str, Any]:
         """Decimate and write the low-poly mesh; its results for the manifest."""

@@ -31,16 +31,16 @@ LIGHT_VIEWS, LIGHT_VERTICES = 4, 25_000
 LIGHT_SMOOTHNESS, LIGHT_PULL = 0.02, 1e-3
 #: Iterations of conjugate gradients, and the reduction of the squared residual that ends them.
 LIGHT_ITERATIONS, LIGHT_TOLERANCE = 25, 1e-4
-#: Reflectance and level of the light at the start.
-FIRST_REFLECTANCE, FIRST_LEVEL = 0.3, 0.5
+#: Reflectance at the start.
+FIRST_REFLECTANCE = 0.3
 #: Chunks of vertices whose sums are added in order: they do not depend on the number of threads.
 _CHUNKS = 32
 
 
 @dataclass(frozen=True)
 class Appearance:
-    """Per vertex: `diffuse` and `reflectance` (v, 3), `kind` (v,) int64 (see `reflection_kernel`), `variance` (v,) of a sample, `brightness`
-    (v,) mean of its photos; `explained` is the share of the photos' variance that reflections explain."""
+    """Per vertex: `diffuse` and `reflectance` (v, 3), `kind` (v,) int64 (see `reflection_kernel`), `variance` (v,) of a sample,
+    `brightness` (v,) mean of its photos; `explained` is the share of the photos' variance that reflections explain."""
 
     diffuse: Floats
     reflectance: Floats

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from gsbake.geometry.cameras import Camera
 from gsbake.geometry.raycast import RayCaster
-from gsbake.meshing.refinement.silhouette import find_contour_points
 from gsbake.monitor import SILENT, Monitor
 from gsbake.shape_refinement.appearance import Appearance, Geometry, choose_light_vertices, fit_appearance, fit_light
+from gsbake.shape_refinement.contour import find_contour_points
 from gsbake.shape_refinement.reflection_map import ReflectionMap
 from gsbake.shape_refinement.samples import Doubles, Floats, Photo, sample_photos
 from gsbake.shape_refinement.step import Contour, StepOptions, contour_rows, solve_step
@@ -20,7 +20,11 @@ from gsbake.shape_refinement.surface import Surface
 
 Faces = NDArray[np.int32]
 #: A camera and its mask (h, w), 0..255.
-Mask = tuple[Camera, NDArray[np.uint8]]
+Mask = tuple[Camera, NDArray[np.uint8] | None]
+#: Length in pixels of a refined mesh's edges: the photos say nothing between.
+EDGE_PIXELS = 2.0
+#: Level of the light at the start.
+FIRST_LEVEL = 0.5
 
 
 @dataclass(frozen=True)
@@ -38,7 +42,7 @@ class Level:
 class RefinementOptions:
     """Settings of the refinement."""
 
-    levels: tuple[Level, ...] = (Level(16, 3, 2.0), Level(24, 4, 1.4), Level(32, 4, 0.8))
+    levels: tuple[Level, ...] = (Level(16, 2, 2.0, False), Level(16, 2, 2.0), Level(24, 4, 1.4), Level(32, 4, 0.8))
     step: StepOptions = field(default_factory=StepOptions)
     #: Alternations of light and appearance at a level's first step, and at the others.
     first_alternations: int = 6
@@ -71,8 +75,8 @@ def refine_shape(
 ) -> Refined:
     """Refine the vertices (v, 3) of a mesh with outward `faces` (f, 3), in the frame of the cameras.
 
-    `load_photos` returns the photos blurred by a number of pixels, the same cameras each time; `masks` yields the masks at their own size, None
-    where not every photo has one.
+    `load_photos` returns the photos blurred by a number of pixels, the same cameras each time; `masks` yields the masks at their own size,
+    None where not every photo has one.
     """
     options = options or RefinementOptions()
     surface = Surface(len(vertices), faces)
@@ -80,14 +84,15 @@ def refine_shape(
     total, since_contour = np.zeros(len(current)), np.zeros(len(current))
     robust: Floats | None = None
     appearance = Appearance.initial(len(current))
-    light = ReflectionMap.constant(options.levels[0].light, 0.5)
+    light = ReflectionMap.constant(options.levels[0].light, FIRST_LEVEL)
     variance = np.zeros(len(current), np.float32)
     contour: Contour | None = None
     figures: dict[str, float] = {}
+    offsets: list[float] = []
     for level in options.levels:
         photos = load_photos(level.blur)
         centres = np.stack([photo.camera.centre for photo in photos])
-        pixel = _pixel(current, photos)
+        pixel = pixel_size(current, [photo.camera for photo in photos])
         robust = np.ones((len(current), len(photos)), np.float32) if robust is None else robust
         light = light.resampled(level.light) if light.size != level.light else light
         for index in range(level.steps):
@@ -102,6 +107,7 @@ def refine_shape(
             appearance = appearance.at_least(variance)
             if masks is not None and index % options.contour_every == 0:
                 contour, since_contour = _find_contour(surface, geometry, masks(), threads), np.zeros(len(current))
+                offsets.append(contour.offset)
             step = solve_step(
                 surface, geometry, samples, robust, light, appearance, total if level.held else None, pixel, contour, since_contour,
                 options.step,
@@ -115,22 +121,32 @@ def refine_shape(
                 "step_pixels": float(np.abs(step.displacement).mean() / pixel),
             }  # fmt: skip
             on_step(f"light {level.light} step {index}: " + ", ".join(f"{k} {v:.3f}" for k, v in figures.items()), current)
-    figures["total_pixels"] = float(np.abs(total).mean() / pixel)
+    figures["moved_pixels"] = float(np.linalg.norm(current - vertices, axis=1).mean() / pixel)
+    if offsets:
+        figures |= {"contour_before": offsets[0], "contour_after": offsets[-1]}
     return Refined(current, appearance, light, figures)
 
 
 def _find_contour(surface: Surface, geometry: Geometry, masks: Iterable[Mask], threads: int) -> Contour:
     """Contour points of the mesh in all masks."""
     caster = RayCaster(geometry.vertices, surface.faces, threads)
-    parts = [find_contour_points(caster, geometry.normals, surface.edges, camera, mask) for camera, mask in masks]
+    given = [(camera, mask) for camera, mask in masks if mask is not None]
+    parts = [find_contour_points(caster, geometry.normals, surface.edges, camera, mask) for camera, mask in given]
     start, end, fraction, offset, pixel = (
         np.concatenate([getattr(part, name) for part in parts]) for name in ("start", "end", "fraction", "offset", "pixel")
     )
-    return Contour(contour_rows(start, end, fraction, surface.count), offset * pixel, pixel)
+    median = float(np.median(offset)) if len(offset) else 0.0
+    return Contour(contour_rows(start, end, fraction, surface.count), offset * pixel, pixel, median)
 
 
-def _pixel(vertices: Doubles, photos: Sequence[Photo]) -> float:
+def pixel_size(vertices: Doubles, cameras: Sequence[Camera]) -> float:
     """Mean size of a pixel at the middle of the mesh."""
     middle = vertices.mean(0)
-    sizes = [np.linalg.norm(middle - p.camera.centre) * 2 / (p.camera.fx + p.camera.fy) for p in photos]
-    return float(np.mean(sizes))
+    return float(np.mean([np.linalg.norm(middle - camera.centre) * 2 / (camera.fx + camera.fy) for camera in cameras]))
+
+
+def proxy_edge(vertices: Doubles, faces: Faces, pixel: float, most: int) -> float:
+    """Length of the edges of a mesh for refinement: EDGE_PIXELS, longer where that makes more than about `most` vertices."""
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    area = float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()) / 2
+    return max(EDGE_PIXELS * pixel, (2 * area / (np.sqrt(3) * most)) ** 0.5)  # a vertex has two triangles of √3/4 edge²

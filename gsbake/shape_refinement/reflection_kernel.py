@@ -141,9 +141,9 @@ def apply_light(
     start: int, stop: int, rows: Any, first: Any, place: Any, factors: Any, kind: Any, scale: Any, importance: Any, tables: Any,
     colour: Any, out: Any,
 ) -> None:  # fmt: skip
-    """Add AᵀCWC(A·light + colour) to `out` (lobes, (size + 2)², 3) of the vertices rows[start..stop]: A takes light to reflections, C centres
-    over a vertex's photos, W are the weights times the vertex's `importance` (v,). `tables` (lobes, (size + 2)², 3) the light, `colour`
-    (v, photos, 3) values added to its reflections (the photos' for the right side of the equations), or (0, 0, 3) for none."""
+    """Add AᵀCWC(A·light + colour) to `out` (lobes, (size + 2)², 3) of the vertices rows[start..stop]: A takes light to reflections, C
+    centres over a vertex's photos, W are the weights times the vertex's `importance` (v,). `tables` (lobes, (size + 2)², 3) the light,
+    `colour` (v, photos, 3) values added to its reflections (the photos' for the right side of the equations), or (0, 0, 3) for none."""
     longest = 0
     for r in range(start, stop):
         longest = max(longest, first[r + 1] - first[r])
@@ -254,7 +254,8 @@ def gauss_newton_rows(
                 continue
             for c in range(3):
                 e = error[j, c] - mean_error[c] / total
-                r0, r1, r2 = row[j, 0, c] - mean_row[0, c] / total, row[j, 1, c] - mean_row[1, c] / total, row[j, 2, c] - mean_row[2, c] / total
+                r0, r1 = row[j, 0, c] - mean_row[0, c] / total, row[j, 1, c] - mean_row[1, c] / total
+                r2 = row[j, 2, c] - mean_row[2, c] / total
                 hessian[v, 0] += w * r0 * r0
                 hessian[v, 1] += w * r1 * r1
                 hessian[v, 2] += w * r1 * r2

@@ -41,13 +41,13 @@ class VertexSamples:
     weight: Floats
 
 
-def load_photos(posed: PosedPhotos, max_size: int | None, blur: float) -> list[Photo]:
-    """The photos, the longer side at most `max_size` pixels, blurred by a Gaussian of `blur` pixels that does not cross the masks."""
+def load_photos(posed: PosedPhotos, indices: Sequence[int], max_size: int, blur: float) -> list[Photo]:
+    """These photos, the longer side at most `max_size` pixels, blurred by a Gaussian of `blur` pixels that does not cross the masks."""
     photos = []
-    for index in range(len(posed)):
+    for index in indices:
         view = posed.view(index, max_size)
         rgb = decode_bytes(view.rgb).astype(np.float32)
-        mask = np.ones(rgb.shape[:2], np.float32) if view.mask is None else view.mask.astype(np.float32) / 255
+        mask = np.ones(rgb.shape[:2], np.float32) if view.mask is None else np.asarray(view.mask / np.float32(255), np.float32)
         if blur > 0:
             share = cv2.GaussianBlur(mask, (0, 0), blur)
             inside = cv2.GaussianBlur(rgb * mask[..., None], (0, 0), blur)
@@ -75,5 +75,5 @@ def sample_photos(vertices: Doubles, normals: Doubles, faces: NDArray[np.int32],
 
 
 def camera_row(camera: Camera) -> Doubles:
-    """The camera as a row of CAMERA_COLUMNS."""
+    """The camera as `sample_photo` reads it."""
     return np.concatenate([camera.R.ravel(), camera.t, [camera.fx, camera.fy, camera.cx, camera.cy], camera.centre])

@@ -21,8 +21,6 @@ MIN_COSINE = 0.15
 _MAX_TANGENT = 4.0
 #: Least coverage of a sample by the mask.
 _MIN_MASK = 0.5
-#: Columns of a row of cameras: rotation 0–8, translation 9–11, fx, fy, cx, cy 12–15, centre 16–18.
-CAMERA_COLUMNS = 19
 
 
 @numba.njit(cache=True, error_model="numpy", fastmath=False)
@@ -65,10 +63,12 @@ def _rasterise(pixel: Any, faces: Any, depth: Any) -> None:
 def sample_photo(
     vertices: Any, normals: Any, faces: Any, camera: Any, photo: Any, mask: Any, view: int, colour: Any, slope: Any, weight: Any
 ) -> None:  # fmt: skip
-    """Fill column `view` of `colour`, `slope` (v, views, 3) and `weight` (v, views) for the vertices that the photo sees; weight 0 elsewhere.
+    """Fill column `view` of `colour`, `slope` (v, views, 3) and `weight` (v, views) for the vertices that the photo sees; elsewhere the
+    weight is 0.
 
-    `vertices`, `normals` (v, 3); `faces` (f, 3) outward; `camera` a row of CAMERA_COLUMNS; `photo` (h, w, 3) linear RGB; `mask` (h, w) 0..1.
-    `weight` is the cosine of incidence.
+    `vertices`, `normals` (v, 3); `faces` (f, 3) outward; `camera` its rotation (9), translation (3), fx, fy,
+    cx, cy and centre (3); `photo` (h, w, 3) linear RGB; `mask` (h, w)
+    0..1. `weight` is the cosine of incidence.
     """
     height, width = mask.shape
     count = len(vertices)

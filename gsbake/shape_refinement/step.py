@@ -49,11 +49,12 @@ class StepOptions:
 @dataclass(frozen=True)
 class Contour:
     """Contour points of all photos: `rows` (points, v) interpolate displacements, `target` (points,) what moves them to the masks, and
-    `pixel` (points,) the size of a pixel there."""
+    `pixel` (points,) the size of a pixel there; `offset` is their median distance in pixels outward to the masks."""
 
     rows: sparse.csr_matrix
     target: Doubles
     pixel: Doubles
+    offset: float
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -105,9 +105,8 @@ class Surface:
         current = np.ascontiguousarray(values.reshape(self.count, -1), np.float32)
         other = np.empty_like(current)
         for _ in range(steps):
-            source, target = current, other
-            run_chunks(lambda start, stop, s=source, t=target: average(start, stop, matrix.indptr, matrix.indices, s, t), self.count)
-            current, other = target, source
+            run_chunks(partial(_average_rows, matrix.indptr, matrix.indices, current, other), self.count)
+            current, other = other, current
         return current.reshape(values.shape)
 
 
@@ -131,6 +130,10 @@ def average(start: int, stop: int, starts: Any, neighbours: Any, values: Any, ou
         factor = half / np.float32(last - first)
         for c in range(columns):
             out[v, c] = half * values[v, c] + factor * out[v, c]
+
+
+def _average_rows(starts: Any, neighbours: Any, values: Any, out: Any, start: int, stop: int) -> None:
+    average(start, stop, starts, neighbours, values, out)
 
 
 def tangents(normals: Doubles) -> Doubles:

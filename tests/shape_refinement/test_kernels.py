@@ -12,7 +12,14 @@ from gsbake.shape_refinement.reference import (
     rows_reference,
     sample_reference,
 )
-from gsbake.shape_refinement.reflection_kernel import KIND_COUNT, LOBE_COUNT, apply_light, gauss_newton_rows, locate_reflections, measure_moments
+from gsbake.shape_refinement.reflection_kernel import (
+    KIND_COUNT,
+    LOBE_COUNT,
+    apply_light,
+    gauss_newton_rows,
+    locate_reflections,
+    measure_moments,
+)
 from gsbake.shape_refinement.reflection_map import LOBES, ReflectionMap, laplacian, lobes
 from gsbake.shape_refinement.samples import VertexSamples, sample_photos
 from gsbake.shape_refinement.surface import tangents
