@@ -31,9 +31,9 @@ class StepOptions:
     #: Share of the information of the samples that counts: errors of neighbouring vertices and photos are correlated.
     independent: float = 0.2
     #: Standard deviations of a step: bend per edge, slope, move.
-    bend: float = 1.5
-    slope: float = 10.0
-    move: float = 1.5
+    bend: float = 6.0
+    slope: float = 40.0
+    move: float = 5.0
     #: Standard deviations of the total move: distance, and bend per edge.
     total_move: float = 0.5
     total_bend: float = 2.0
