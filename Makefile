@@ -18,6 +18,14 @@ unexport PYTHONDONTWRITEBYTECODE
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile
 DEMO_OUT ?= out/demo
 
+# Make a virtual environment $(1) with the Python $(2), unless it is there. A folder that holds anything else is refused, and what was there stays.
+define make_environment
+test -x "$(1)/bin/python" || { \
+	test -f "$(1)/pyvenv.cfg" || test -z "`ls -A "$(1)" 2>/dev/null`" || { echo "$(1) is no virtual environment, and not empty; name another folder" >&2; exit 1; }; \
+	new=; test -e "$(1)" || test -L "$(1)" || new="$(1)"; \
+	"$(2)" -m venv "$(1)" || { test -z "$$new" || rm -rf "$$new"; echo "$(2) cannot make a virtual environment; on Debian: sudo apt-get install python3-venv" >&2; exit 1; }; }
+endef
+
 LOCK := --config-file packaging/uv.toml --universal --python-version 3.11.5 --generate-hashes --constraint constraints.txt \
 	--no-emit-package torch --no-header --no-annotate
 
@@ -49,7 +57,7 @@ setup: $(DEV) ## Make .venv with everything for developers, exactly the versions
 $(RUNTIME): pyproject.toml constraints.txt packaging/runtime.lock
 	@test -n "$(PYTHON)" || { echo "gsbake needs Python 3.11, 3.12 or 3.13, and none is on the PATH; name one: make PYTHON=/path/to/python3.12" >&2; exit 1; }
 	@"$(PYTHON)" -c '$(IN_RANGE)' || { echo "gsbake needs Python 3.11, 3.12 or 3.13 (xatlas has no wheel for newer ones); $(PYTHON) is `"$(PYTHON)" --version 2>&1`" >&2; exit 1; }
-	@test -x $(BIN)/python || "$(PYTHON)" -m venv $(VENV) || { rm -rf $(VENV); echo "$(PYTHON) cannot make a virtual environment; on Debian: sudo apt-get install python3-venv" >&2; exit 1; }
+	@$(call make_environment,$(VENV),$(PYTHON))
 	$(PIP) --no-deps --require-hashes --requirement packaging/runtime.lock
 	@echo "Installing PyTorch from $(TORCH_INDEX)"
 	@$(PIP) --index-url $(TORCH_INDEX) --retries 1 $(TORCH) || { echo "PyTorch is not to be had from $(TORCH_INDEX); name a mirror of it: make TORCH_INDEX=https://… (https://pypi.org/simple brings gigabytes of CUDA libraries on Linux)" >&2; exit 1; }
@@ -112,7 +120,7 @@ score: .score/.stamp ## Score an asset against its truth: SCORE_GT=capture/gt SC
 
 .score/.stamp: $(SCORE_DIR)/requirements.txt
 	@command -v python3.11 >/dev/null || { echo "the scorer needs Python 3.11, because Blender's module does" >&2; exit 1; }
-	python3.11 -m venv .score
+	@$(call make_environment,.score,python3.11)
 	.score/bin/python -m pip install --quiet --disable-pip-version-check -r $(SCORE_DIR)/requirements.txt
 	@touch $@
 
@@ -133,10 +141,13 @@ sbom: setup .audit/.stamp ## Write out/sbom.json, the list of all installed pack
 	.audit/bin/cyclonedx-py environment $(BIN)/python --of JSON -o out/sbom.json
 
 .audit/.stamp: packaging/audit-requirements.txt
-	@test -x .audit/bin/python || "$(PYTHON)" -m venv .audit
+	@$(call make_environment,.audit,$(PYTHON))
 	.audit/bin/python -m pip install --quiet --disable-pip-version-check -r packaging/audit-requirements.txt
 	@touch $@
 
 clean: ## Delete the environments and caches (results in out/ stay)
-	rm -rf $(VENV) .score .audit .mypy_cache .ruff_cache .pytest_cache .hypothesis dist site
+	@for folder in "$(VENV)" .score .audit; do \
+		if test -f "$$folder/pyvenv.cfg"; then rm -rf "$$folder"; \
+		elif test -e "$$folder"; then echo "$$folder is no virtual environment and stays" >&2; fi; done
+	rm -rf .mypy_cache .ruff_cache .pytest_cache .hypothesis dist site
 	find gsbake stages profiles tests benchmarks -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -22,6 +22,7 @@ from gsbake.config.schema import Profile
 from gsbake.config.targets import parse_target, require_packages
 from gsbake.errors import BadInputError, GsbakeError, UsageError
 from gsbake.meshing.decimator_choice import resolve_decimator
+from gsbake.output_folder import check_output_folder, check_same_photos
 from gsbake.pipeline.engine import Engine, Observer, artifacts_by_stage
 from gsbake.pipeline.files import disk_error
 from gsbake.pipeline.machine import default_threads, resolve_device
@@ -30,6 +31,7 @@ from gsbake.pipeline.project import Project
 from gsbake.pipeline.registry import Registry
 from gsbake.pipeline.shared_store import open_shared_store
 from gsbake.pipeline.store import Store
+from gsbake.pipeline.store_url import VARIABLE as STORE_VARIABLE
 from gsbake.publish import RESULTS, publish_results
 from gsbake.stages import REGISTRY
 from gsbake.system.names import portable_name
@@ -48,7 +50,8 @@ class RunOptions:
     """Options of a run, those of `run`; None stands for the value stored in the output folder, else the default.
 
     `overrides` are settings as "section.key=value", added to the stored ones; `threads` = 0 uses the physical cores.
-    `store` names a shared store, a folder or URL, which is not stored; None takes the variable GSBAKE_STORE.
+    `store` names a shared store, a folder or URL, which is not stored; None takes the variable GSBAKE_STORE. `overwrite` lets results take
+    the place of files that were edited, which are set aside; `moved` says that the photos of an earlier run lie at another path now.
     """
 
     photos: Path | None = None
@@ -61,6 +64,8 @@ class RunOptions:
     threads: int = 0
     seed: int | None = None
     store: str | None = None
+    overwrite: bool = False
+    moved: bool = False
 
 
 @dataclass(frozen=True)
@@ -75,6 +80,7 @@ class Session:
     profile: LoadedProfile
     out: Path
     store: str | None = None  # shared store, a folder or URL
+    overwrite: bool = False  # files of the user's in the place of results are set aside
 
     def run(self, until: str | None = None) -> Result:
         """Bring the stages up to `until` (None: all) up to date and publish the results in the output folder, those of finished stages
@@ -89,37 +95,42 @@ class Session:
             raise UsageError("No target is set: name them, as in --target web,ar:usdz (settings: targets.files).")
         self.engine.shared = open_shared_store(self.store)
         try:
-            states = self.engine.run(until, on_accepted=lambda: self.project.save(self.out))
-            files = self._publish(states)
+            with self.engine.uses:  # until the results are copied
+                states = self.engine.run(until, on_accepted=lambda: self.project.save(self.out))
+                files, notes = self._publish(states)
         except GsbakeError:
-            with suppress(OSError):  # the first error is the one to report
+            with suppress(OSError, GsbakeError):  # the first error is the one to report
                 self._publish(self.engine.finished)
             raise
         except OSError as error:
             raise disk_error(error, self.out) or BadInputError(
                 f"The output folder '{self.out}' cannot be written ({error.strerror}); choose another with --out."
             ) from error
-        return Result(self.out, files, tuple(states))
+        return Result(self.out, files, tuple(states), notes)
 
-    def _publish(self, states: Sequence[StageState]) -> dict[str, Path]:
-        """Copy the results of these stages to the output folder; returns {file: path}."""
+    def _publish(self, states: Sequence[StageState]) -> tuple[dict[str, Path], tuple[str, ...]]:
+        """Copy the results of these stages to the output folder; returns {file: path} and what needs a word."""
         artifacts = artifacts_by_stage(states)
         if not RESULTS.keys() & artifacts.keys():
-            return {}
-        digests = self.engine.store.digests
-        files, project = publish_results(self.out, artifacts, self.project, digests)
-        project.save(self.out)
-        digests.save()
-        return files
+            return {}, ()
+        store = self.engine.store
+        done = publish_results(self.out, artifacts, self.project, store, overwrite=self.overwrite)
+        done.project.save(self.out)
+        store.digests.save()
+        for stage, text in done.notes:
+            self.engine.warn(stage, text)
+        return done.files, tuple(text for _, text in done.notes)
 
 
 @dataclass(frozen=True)
 class Result:
-    """A finished run: output folder, published `files` by name ("asset.glb", …) and the state of every stage."""
+    """A finished run: output folder, published `files` by name ("asset.glb", …), the state of every stage, and sentences on files that lie
+    elsewhere than usual, because others are in their places."""
 
     out: Path
     files: Mapping[str, Path]
     stages: tuple[StageState, ...]
+    notes: tuple[str, ...] = ()
 
     def results(self, stage: str) -> Mapping[str, Any]:
         """Figures that a stage reported, for example `results("poses")["registered"]`.
@@ -153,6 +164,8 @@ def run(
     threads: int = 0,
     seed: int | None = None,
     store: str | Path | None = None,
+    overwrite: bool = False,
+    moved: bool = False,
     observer: Observer | None = None,
 ) -> Result:
     """Bake an asset from a folder of photos, or bring an earlier run in `out` up to date.
@@ -171,18 +184,23 @@ def run(
         threads: Number of threads, at most 512; 0 uses the physical cores.
         seed: Seed of all random numbers, 0 to 2**31 − 1; default 0.
         store: Shared store, a folder or URL (file, s3, sftp); default: the environment variable GSBAKE_STORE, else none.
+        overwrite: Files of yours in the place of results, such as an edited `asset.glb`, are moved to `out/set-aside/`; without it they
+            stay and the new ones are published beside them (`asset.new.glb`).
+        moved: The photos of the run in `out` lie at another path now; without it, other photos than its own are refused.
         observer: Receives progress, decisions and warnings.
 
     Returns:
         The published files and the state of every stage.
 
     Raises:
-        UsageError: Arguments, settings or profile are wrong.
+        UsageError: Arguments, settings or profile are wrong, or `out` is not gsbake's own or holds the run of other photos.
         BadInputError: The photos cannot be used; trying again will not help.
         InterruptedRun: Stopped on request or by a fault that may pass; the same call resumes.
     """
     overrides = [f"{key}={value if isinstance(value, str) else json.dumps(value)}" for key, value in (settings or {}).items()]
-    options = RunOptions(_path(photos), _path(out), profile, overrides, _path(masks), _path(poses), device, threads, seed, _store(store))
+    options = RunOptions(
+        _path(photos), _path(out), profile, overrides, _path(masks), _path(poses), device, threads, seed, _store(store), overwrite, moved
+    )
     return open_session(options, observer).run(until)
 
 
@@ -197,7 +215,8 @@ def open_session(options: RunOptions, observer: Observer | None = None, registry
         registry: Other stages than gsbake's own.
 
     Raises:
-        UsageError: Photos are neither given nor stored, a profile or setting is wrong, a seed or number of threads is out of range.
+        UsageError: Photos are neither given nor stored, a profile or setting is wrong, a seed or number of threads is out of range, or the
+            output folder is not gsbake's own, lies inside the photos or holds the run of other photos.
         BadInputError: The photos' folder has none.
     """
     out = options.out or _default_out(options.photos)
@@ -213,6 +232,7 @@ def open_session(options: RunOptions, observer: Observer | None = None, registry
         if options.masks is not None or options.poses is not None:
             found = discover(Path(stored.photos), options.masks or _path(stored.masks), options.poses or _path(stored.poses))
             project = replace(project, masks=_text(found.masks), poses=_text(found.poses))
+    check_output_folder(out, stored, project)
     last = {text.partition("=")[0].strip(): text for text in [*project.overrides, *options.overrides]}
     name = next(name for name in (options.profile, project.profile, DEFAULT) if name is not None)
     profile = load_profile(name, list(last.values()))
@@ -236,13 +256,22 @@ def open_session(options: RunOptions, observer: Observer | None = None, registry
         threads=options.threads or default_threads(),
         source_names=_source_names(sources),
     )
-    store = options.store or os.environ.get("GSBAKE_STORE") or None
+    store = options.store or os.environ.get(STORE_VARIABLE) or None
     stages = registry or REGISTRY
     wanted = profile.profile.targets
     require_packages(parse_target(text) for text in wanted.files)
     if not wanted.files:  # no run shall list a stage that has nothing to do
         stages = stages.without(TARGETS)
-    return Session(Engine(stages, request, observer), project, profile, out, store)
+    engine = Engine(stages, request, observer)
+    other = None if options.moved else check_same_photos(out, stored, project)
+    if other is not None and not (stored and stored.photos and _merely_moved(engine, Path(stored.photos))):
+        raise other
+    return Session(engine, project, profile, out, store, options.overwrite)
+
+
+def _merely_moved(engine: Engine, before: Path) -> bool:
+    """Whether the photos of an earlier run are gone from where they were and the given ones are the same."""
+    return not before.exists() and engine.planner.plan(engine.registry.up_to(None)[:1])[0].status == "cached"
 
 
 def open_store(out: Path | None) -> tuple[Store, tuple[str, ...]]:

@@ -17,7 +17,8 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from typing import Any, BinaryIO
 
-from gsbake.errors import InterruptedRun
+from gsbake.errors import BadInputError, InterruptedRun
+from gsbake.memory_budget import budget, too_large
 from gsbake.python_process import python_command, python_environment
 from gsbake.system.exit_codes import ExitCode
 from gsbake.system.limits import limit_address_space, write_no_core
@@ -128,6 +129,29 @@ class ParserProcess:
         return ParserKilledError(f"was ended by {found}" if found.signal else f"ended with {found}")
 
 
+def read_in_child(child: ParserProcess, request: Mapping[str, Any], seconds: float, name: str) -> dict[str, Any]:
+    """The child's answer about the file `name`.
+
+    Raises BadInputError, which names it, for {"error": sentence}, for {"needs": bytes} that are too many, and for a child that crashes,
+    takes more memory than it may, or more time; InterruptedRun for one that is killed from outside.
+    """
+    try:
+        found = child.ask(request, seconds)
+    except ParserKilledError as error:
+        if not error.timed_out:
+            raise InterruptedRun(f"The process that read {name} {error}; run the same command again.") from error
+        raise BadInputError(f"{name} cannot be read (its reader {error}).") from error
+    except ParserFailedError as error:
+        raise BadInputError(f"{name} cannot be read (its reader {error}).") from error
+    if "needs" in found:
+        raise too_large(int(found["needs"]), budget(), name)
+    if "exhausted" in found:
+        raise BadInputError(f"{name} takes more memory than its header explains; export it again.")
+    if "error" in found:
+        raise BadInputError(found["error"])
+    return found
+
+
 def child() -> None:
     """Entry point of a `ParserProcess` (`python -c … MODULE PARENT`): `main()` of the module, whose imports may print what they like."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle; it ends its children
@@ -141,7 +165,11 @@ def serve(answer: Callable[[dict[str, Any]], dict[str, Any]]) -> None:
     """Answer the parent's requests until it closes the pipe."""
     requests, _ = _streams
     for line in requests:
-        _send(json.dumps(answer(json.loads(line))).encode())
+        try:
+            found = answer(json.loads(line))
+        except MemoryError:  # its limit, which the parent set: the file is at fault
+            found = {"exhausted": True}
+        _send(json.dumps(found).encode())
 
 
 def limit_memory(memory: int) -> None:

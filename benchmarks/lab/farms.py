@@ -47,14 +47,4 @@ def size(results: Path) -> Table:
     return Table(COMMAND, headings, rows, lines)
 
 
-def store(results: Path) -> Table:
-    """A shared store of less bandwidth."""
-    lines = [line for line in read(results, "farm") if line["part"] == "store"]
-    rows = []
-    for line in lines:
-        shares = number(line["transfer"], 1, 100), number(line["store_use"], 0, 100)
-        rows.append([f"{8e-9 * float(line['store_rate']):.3g}", number(line["hours"], 2), number(line["efficiency"], 3), *shares])
-    return Table(COMMAND, ("store, Gbit/s", "hours", "efficiency", "transfers %", "store in use %"), rows, lines)
-
-
-TABLES: Mapping[str, Maker] = {"batch": batch, "packing": packing, "farm size": size, "farm store": store}
+TABLES: Mapping[str, Maker] = {"batch": batch, "packing": packing, "farm size": size}

@@ -6,14 +6,15 @@ import re
 from collections.abc import Mapping
 from pathlib import Path
 
-from benchmarks.lab import assets, captures, farms, fits, headline, kernels, systems
+from benchmarks.lab import assets, captures, farms, fits, headline, kernels, safety, systems
 from benchmarks.lab.tables import Maker
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES, README, RESULTS = ROOT / "docs" / "lab", ROOT / "README.md", ROOT / "benchmarks" / "results"
 #: Every table by the name that stands in its marker.
 TABLES: Mapping[str, Maker] = {
-    **assets.TABLES, **captures.TABLES, **farms.TABLES, **fits.TABLES, **headline.TABLES, **kernels.TABLES, **systems.TABLES,
+    **assets.TABLES, **captures.TABLES, **farms.TABLES, **fits.TABLES, **headline.TABLES, **kernels.TABLES, **safety.TABLES,
+    **systems.TABLES,
 }  # fmt: skip
 BLOCK = re.compile(r"<!-- table: (.*?) -->\n(.*?)<!-- end -->\n", re.S)
 

@@ -1,4 +1,4 @@
-"""Tables of the systems with a distance: their shape by capture, few photos, other starts, settings of `dsdf`, what the distance does."""
+"""Tables of the systems with a distance: their shape by capture, few photos, other starts, what the distance does."""
 
 from __future__ import annotations
 
@@ -41,21 +41,6 @@ def few_photos(results: Path) -> Table:
     return Table(command, headings, rows, [line for line in lines if line["system"] in systems])
 
 
-def settings(results: Path) -> Table:
-    """Chamfer distance of `dsdf` with one setting changed: mean over seeds, with the deviation where there are several."""
-    captures = ("built-in", "boombox", "brass_vase", "avocado", "stool", "helmet")
-    lines = [x for x in _rows(results) if x["system"] == "dsdf" and x["capture"] in captures and "init" not in x["settings"]]
-    rows = []
-    for given in dict.fromkeys(["", *sorted(line["settings"] for line in lines)]):
-        cells = []
-        for capture in captures:
-            found = [float(x["chamfer_pct"]) for x in lines if x["settings"] == given and x["capture"] == capture and x["chamfer_pct"]]
-            deviation = f" ± {statistics.stdev(found):.3f}" if len(found) > 1 else ""
-            cells.append(f"{statistics.mean(found):.3f}{deviation}" if found else "–")
-        rows.append([given.replace(" ", ", ") or "as it is", *cells])
-    return Table(f"{COMMAND} --set SETTING --seeds 0,1,2", ("setting", *map(spaced, captures)), rows, lines)
-
-
 def starts(results: Path) -> Table:
     """`dsdf` from stereo, hull and sphere."""
     known = {(x["capture"], x["settings"]): x for x in _rows(results) if x["system"] == "dsdf" and x["seed"] == "0"}
@@ -83,5 +68,5 @@ def distance(results: Path) -> Table:
 
 
 TABLES: Mapping[str, Maker] = {
-    "systems, Chamfer": chamfer, "few photos": few_photos, "dsdf settings": settings, "dsdf starts": starts, "distance": distance,
+    "systems, Chamfer": chamfer, "few photos": few_photos, "dsdf starts": starts, "distance": distance,
 }  # fmt: skip

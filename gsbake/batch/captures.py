@@ -6,23 +6,26 @@ A capture that cannot be planned (no photos, an unreadable file) becomes a failu
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from gsbake.api import RunOptions, Session, open_session
 from gsbake.capture.sources import PHOTO_FOLDERS
 from gsbake.errors import BadInputError, GsbakeError, UsageError
+from gsbake.pipeline.engine import artifacts_by_stage
 from gsbake.pipeline.plan import StageState
-from gsbake.publish import RESULTS
+from gsbake.pipeline.store_url import has_credentials
+from gsbake.publish import published_results
 from gsbake.system.names import portable_name, same_file_key
 from gsbake.timing.photos import USUAL_MEGAPIXELS, PhotoSet, photos_of_request
 
 
 @dataclass(frozen=True)
 class BatchOptions:
-    """Options that all captures of a batch share; `root` holds one output folder per capture, `store` is the shared store."""
+    """Options that all captures of a batch share; `root` holds one output folder per capture, `store` is the shared store, `moved` says
+    that photos of earlier runs lie at other paths now."""
 
     root: Path
     profile: str
@@ -30,12 +33,18 @@ class BatchOptions:
     threads: int = 0
     seed: int = 0
     store: str | None = None
+    moved: bool = False
 
     def absolute(self) -> BatchOptions:
         """The options with absolute paths, which jobs in other folders need."""
         profile = str(Path(self.profile).absolute()) if Path(self.profile).is_file() else self.profile
         store = self.store if self.store is None or "://" in self.store else str(Path(self.store).absolute())
         return replace(self, root=self.root.absolute(), profile=profile, store=store)
+
+    @property
+    def named_store(self) -> str | None:
+        """The store as files and commands may name it; None where its address has credentials and jobs take it from GSBAKE_STORE."""
+        return None if has_credentials(self.store) else self.store
 
 
 @dataclass(frozen=True)
@@ -47,7 +56,7 @@ class CapturePlan:
     out: Path
     states: tuple[StageState, ...] = ()
     photo_set: PhotoSet = PhotoSet(0, USUAL_MEGAPIXELS)
-    published: bool = False  # the results lie in the output folder
+    files: Mapping[str, Path | None] = field(default_factory=dict)  # {result: where it lies in the output folder, None where it does not}
     error: str = ""
     exit_code: int = 0
 
@@ -59,7 +68,7 @@ class CapturePlan:
     @property
     def done(self) -> bool:
         """Whether nothing is left to run or to publish."""
-        return not self.error and not self.to_run and self.published
+        return not self.error and not self.to_run and None not in self.files.values()
 
 
 def plan_captures(captures: Sequence[Path], options: BatchOptions) -> list[CapturePlan]:
@@ -74,22 +83,23 @@ def plan_captures(captures: Sequence[Path], options: BatchOptions) -> list[Captu
 
 
 def plan_capture(photos: Path, options: BatchOptions) -> CapturePlan:
-    """The plan of one capture. Raises UsageError for a wrong profile or setting, which concerns all captures."""
+    """The plan of one capture. Raises UsageError for a wrong profile or setting, which concerns all captures, and for an output folder that
+    is not gsbake's own or holds the run of other photos."""
     out = (options.root / _name(photos)).absolute()
     plan = CapturePlan(_name(photos), photos.absolute(), out)
     try:
         if not photos.is_dir():
             raise BadInputError(f"'{photos}' is not a folder; name the folder of a capture.")
         session = open_session(
-            RunOptions(photos, out, options.profile, options.overrides, threads=options.threads, seed=options.seed),
+            RunOptions(photos, out, options.profile, options.overrides, threads=options.threads, seed=options.seed, moved=options.moved),
         )
         states = _states(session)
     except UsageError:
         raise
     except GsbakeError as error:
         return CapturePlan(plan.name, plan.photos, out, error=str(error), exit_code=error.exit_code)
-    photo_set, published = photos_of_request(session.engine.request), _results_are_published(session, states)
-    return CapturePlan(plan.name, plan.photos, out, tuple(states), photo_set, published)
+    files = published_results(session.out, artifacts_by_stage(states), session.project)
+    return CapturePlan(plan.name, plan.photos, out, tuple(states), photos_of_request(session.engine.request), files)
 
 
 def _states(session: Session) -> list[StageState]:
@@ -98,12 +108,6 @@ def _states(session: Session) -> list[StageState]:
     if engine.store.stage_folder("").exists():
         return engine.plan()
     return engine.planner.plan_empty(engine.registry.up_to(None))
-
-
-def _results_are_published(session: Session, states: Sequence[StageState]) -> bool:
-    """Whether the results of the artifacts lie in the output folder."""
-    files = [name for s in states if s.artifact is not None for name in RESULTS.get(s.name, ()) if name in s.artifact.files]
-    return all((session.out / name).is_file() for name in files)
 
 
 def _name(photos: Path) -> str:

@@ -18,13 +18,23 @@ from filelock import FileLock, Timeout
 from gsbake import api
 from gsbake.batch.captures import BatchOptions, CapturePlan, plan_captures
 from gsbake.batch.jobs import make_jobs
-from gsbake.batch.records import FOLDER, Record, RecordReader, all_records, earlier_failures, forget_records, save_batch
+from gsbake.batch.records import (
+    FOLDER,
+    Record,
+    RecordReader,
+    all_records,
+    earlier_failures,
+    forget_records,
+    require_own_records,
+    save_batch,
+)
 from gsbake.batch.slurm import SlurmOptions, ask_cluster
 from gsbake.batch.workflow import Execution, end_orphan, require_snakemake, run_workflow
-from gsbake.errors import InterruptedRun
+from gsbake.errors import InterruptedRun, UsageError
 from gsbake.pipeline.files import ensure_output_folder
 from gsbake.pipeline.lease import HEARTBEAT_TIMEOUT, LeaseHolder
 from gsbake.pipeline.machine import default_threads
+from gsbake.pipeline.shared_store import refuse_other_folders
 from gsbake.pipeline.supervise import StopSignals
 from gsbake.timing.estimate import History
 
@@ -60,17 +70,25 @@ def run_batch(
     """Bring all captures up to date; returns how each one ended, in order.
 
     `workers` is the number of jobs in Slurm's queue at a time (0: two for each core); `on_record` is called at the end of each job.
-    Raises UsageError when an executor is unknown or not installed, InterruptedRun when another batch works in the same folder, or on a
-    stop request.
+    Raises UsageError when an executor is unknown or not installed, or a folder is not gsbake's own, InterruptedRun when
+    another batch works in the same folder, or on a stop request.
     """
     require_snakemake(executor)
     if executor == "slurm":
+        if "%" in str(options.root.absolute()):
+            raise UsageError(
+                f"'{options.root}' holds '%', which Slurm takes for a variable in the paths of its logs; choose another --out."
+            )
         cluster = ask_cluster(slurm)
         execution = Execution(cluster.cores, cluster, slurm, workers or max(_LEAST_QUEUE, _QUEUE_FACTOR * cluster.cores))
     else:
         execution = Execution(options.threads or default_threads())
     options = options.absolute()
     root = options.root
+    require_own_records(root)
+    if not (root / FOLDER).exists():
+        plan_captures(captures, options)  # refuses wrong folders before anything is written
+    refuse_other_folders(options.store)
     ensure_output_folder(root)
     (root / FOLDER).mkdir(exist_ok=True)
     lock = FileLock(root / FOLDER / "lock")
@@ -161,5 +179,6 @@ def _outcomes(plans: Sequence[CapturePlan], failures: dict[str, Record], ran: se
         elif record is not None and record.final and plan.name in ran:
             found.append(Outcome(plan, "failed", record.message, record.exit_code))
         else:
-            found.append(Outcome(plan, "unfinished", record.message if record is not None else "", InterruptedRun.exit_code))
+            message = record.message if record is not None and record.exit_code else ""
+            found.append(Outcome(plan, "unfinished", message, InterruptedRun.exit_code))
     return found

@@ -2,12 +2,16 @@
 
 OpenCue's `cuecmd` runs the lines of a list in any order, so a line is a whole capture. OpenJD allows 100 steps in a template: where there
 are more jobs, one step bakes whole captures, one task per capture (at most 1024).
+
+A name of a file may hold anything but "/" and a zero byte. Each format quotes what it can and refuses the rest, so that no name becomes
+another one, or a command.
 """
 
 from __future__ import annotations
 
 import json
 import shlex
+import unicodedata
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -73,14 +77,18 @@ def as_slurm(jobs: Sequence[Job]) -> str:
 
 
 def as_opencue(jobs: Sequence[Job]) -> str:
-    """A list for `cuecmd`: one line per capture, which runs its jobs one after another."""
-    return "".join(" && ".join(shlex.join(job.command) for job in own) + "\n" for _, own in _by_capture(jobs))
+    """A list for `cuecmd`: one line per capture, which runs its jobs one after another. Raises UsageError for names with line breaks, and
+    for those that are no text."""
+    lines = [" && ".join(shlex.join(job.command) for job in own) for _, own in _by_capture(jobs)]
+    _refuse(jobs, "OpenCue", lambda word: len(f"{word}x".splitlines()) > 1 or not _is_text(word), "a line break or is no text")
+    return "".join(f"{line}\n" for line in lines)
 
 
 def as_openjd(jobs: Sequence[Job]) -> str:
-    """An OpenJD job template as JSON. Raises UsageError for more captures than it can hold, and for paths with "{{"."""
-    if any("{{" in word for job in jobs for word in job.command):
-        raise UsageError("A path or a setting holds '{{', which OpenJD takes for a variable; rename it.")
+    """An OpenJD job template as JSON. Raises UsageError for more captures than it can hold, and for paths with "{{", with control
+    characters, or that are no text."""
+    _refuse(jobs, "OpenJD", lambda word: "{{" in word, "'{{', which starts a variable")
+    _refuse(jobs, "OpenJD", lambda word: not _is_text(word) or _has_control(word), "a control character or is no text")
     if not jobs:
         raise UsageError("Nothing is left to run, and an OpenJD template needs a step.")
     steps = [_step(job) for job in jobs] if len(jobs) <= _MAX_STEPS else [_step_of_captures(jobs)]
@@ -125,6 +133,22 @@ def _action(command: Sequence[str], minutes: int) -> dict[str, Any]:
 
 def _requirements(threads: int, memory_mb: int) -> dict[str, Any]:
     return {"amounts": [{"name": "amount.worker.vcpu", "min": threads}, {"name": "amount.worker.memory", "min": memory_mb}]}
+
+
+def _refuse(jobs: Sequence[Job], form: str, wrong: Callable[[str], bool], what: str) -> None:
+    """Raise UsageError for the first word of a command that a format cannot hold."""
+    for word in (word for job in jobs for word in job.command):
+        if wrong(word):
+            raise UsageError(f"'{word}' holds {what}, which {form} cannot quote; rename it or choose another format.")
+
+
+def _is_text(word: str) -> bool:
+    """Whether a word is text, not bytes that Python carries in surrogates."""
+    return not any("\ud800" <= character <= "\udfff" for character in word)
+
+
+def _has_control(word: str) -> bool:
+    return any(unicodedata.category(character) == "Cc" for character in word)
 
 
 def _by_capture(jobs: Sequence[Job]) -> list[tuple[str, list[Job]]]:

@@ -34,11 +34,11 @@ def run_job(document: dict[str, Any], job_id: str) -> Record:
     try:
         options = RunOptions(
             Path(job["photos"]), Path(job["out"]), document["profile"], document["overrides"], threads=job["threads"],
-            seed=document["seed"], store=document["store"],
+            seed=document["seed"], store=document["store"], moved=document["moved"],
         )  # fmt: skip
         session = open_session(options, registry=Registry(document["stages"]))
         try:
-            session.run(job["stages"][-1])
+            message = " ".join(session.run(job["stages"][-1]).notes)
         except GsbakeError:
             key = plan_state_key(session)
             raise

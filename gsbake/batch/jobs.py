@@ -94,12 +94,13 @@ def start_levels(jobs: Sequence[Job]) -> dict[str, int]:
 
 
 def stage_command(until: str, plan: CapturePlan, options: BatchOptions, threads: int) -> tuple[str, ...]:
-    """The command that brings a capture's stages up to `until` up to date; every job names all options, so none depends on another."""
+    """The command that brings a capture's stages up to `until` up to date; every job names all options, so none depends on another. Only
+    a store whose address has credentials is left to GSBAKE_STORE."""
     words = ["gsbake", until, str(plan.photos), "--out", str(plan.out), "--profile", options.profile, "--seed", str(options.seed)]
     for override in options.overrides:
         words += ["--set", override]
-    words += ["--threads", str(threads), "--quiet"]
-    return tuple(words + (["--store", options.store] if options.store else []))
+    words += ["--threads", str(threads), "--quiet", *(["--moved"] if options.moved else [])]
+    return tuple(words + (["--store", options.named_store] if options.named_store else []))
 
 
 def group_stages(seconds: Sequence[float], pack_seconds: float) -> list[range]:

@@ -14,11 +14,13 @@ from typing import Any
 from urllib.parse import quote
 
 import jinja2
+from blake3 import blake3
 from markupsafe import Markup
 from PIL import Image
 
 from gsbake.atomic import write_atomic
 from gsbake.batch.coordinator import Outcome
+from gsbake.own_files import own_place
 from gsbake.text import duration, number, printable, size
 
 INDEX = "index.html"
@@ -51,10 +53,22 @@ COLUMNS = ("photos", "triangles", "asset", "PSNR", "SSIM", "time", "memory")
 
 
 def write_index(outcomes: Sequence[Outcome], root: Path) -> Path:
-    """Write ROOT/index.html; returns its path."""
-    path = root / INDEX
-    write_atomic(path, render([_row(outcome, root) for outcome in outcomes]))
+    """Write ROOT/index.html; returns its path, which is `index.new.html` where that is not as gsbake wrote it."""
+    path = own_place(root / INDEX, _is_sealed)
+    write_atomic(path, _sealed(render([_row(outcome, root) for outcome in outcomes])))
     return path
+
+
+def _sealed(page: str) -> str:
+    """The page with a last line by which gsbake knows a page that nobody has edited."""
+    return f"{page.rstrip()}\n<!-- gsbake {blake3(page.rstrip().encode()).hexdigest()} -->\n"
+
+
+def _is_sealed(path: Path) -> bool:
+    with suppress(OSError, ValueError):
+        text = path.read_bytes().decode()
+        return text == _sealed(text.rpartition("<!-- gsbake ")[0])
+    return False
 
 
 def render(rows: Sequence[Row]) -> str:
@@ -75,7 +89,7 @@ def _row(outcome: Outcome, root: Path) -> Row:
     artifacts = {state.name: state.artifact for state in plan.states if state.artifact is not None}
     manifests = {name: artifact.manifest for name, artifact in artifacts.items()}
     results: dict[str, Mapping[str, Any]] = {name: manifest.get("results", {}) for name, manifest in manifests.items()}
-    asset, report = plan.out / "asset.glb", plan.out / "report.html"
+    asset, report = (plan.files.get(name) or plan.out / name for name in ("asset.glb", "report.html"))
     seconds = sum(float(manifest.get("seconds", 0)) for manifest in manifests.values())
     peak = max((int(manifest.get("peak_bytes", 0)) for manifest in manifests.values()), default=0)
     quality, export = results.get("report", {}), results.get("export", {})

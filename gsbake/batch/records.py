@@ -18,14 +18,25 @@ from pydantic import TypeAdapter, ValidationError
 from gsbake.atomic import write_atomic
 from gsbake.batch.captures import BatchOptions, CapturePlan
 from gsbake.errors import BadInputError, InterruptedRun, UsageError
+from gsbake.own_files import entries, require_own_folder
 
 FOLDER = ".batch"
+#: What a batch makes in that folder; the first is its mark.
+_MADE = frozenset({"batch.json", "records", "lock", "snakemake", "snakemake.log", "snakemake.json"})
+
+
+def require_own_records(root: Path) -> None:
+    """Raise UsageError where ROOT/.batch is somebody else's."""
+    folder = root / FOLDER
+    found = set(entries(folder))
+    own = found == {"lock"} or ("batch.json" in found and found <= _MADE)
+    require_own_folder(folder, own and not folder.is_symlink(), "the record of the batch")
 
 
 @dataclass(frozen=True)
 class Record:
-    """End of a job: exit code and sentence, seconds, host, `key`, the cache key of the first stage that it had to run, and the nodes of a
-    farm on which it was interrupted."""
+    """End of a job: exit code and sentence (of a job that is done: on files of the user's in the places of results), seconds, host, `key`,
+    the cache key of the first stage that it had to run, and the nodes of a farm on which it was interrupted."""
 
     capture: str
     job: str
@@ -112,7 +123,7 @@ def save_batch(captures: Sequence[Path], options: BatchOptions) -> None:
     """Write the captures and options, for `gsbake batch status`."""
     folder = options.root / FOLDER
     folder.mkdir(parents=True, exist_ok=True)
-    body = {**asdict(options), "root": None, "captures": [str(path.absolute()) for path in captures]}
+    body = {**asdict(options), "root": None, "store": options.named_store, "captures": [str(path.absolute()) for path in captures]}
     write_atomic(folder / "batch.json", json.dumps(body, indent=1))
 
 
@@ -125,6 +136,7 @@ class _Stored:
     seed: int
     store: str | None
     root: None = None
+    moved: bool = False
 
 
 def load_batch(root: Path) -> tuple[list[Path], BatchOptions]:
@@ -136,4 +148,6 @@ def load_batch(root: Path) -> tuple[list[Path], BatchOptions]:
         raise UsageError(f"'{root}' holds no batch; name its folder with --out.") from error
     except (OSError, ValidationError) as error:
         raise BadInputError(f"'{path}' cannot be read; run the batch again, which writes it anew.") from error
-    return [Path(name) for name in body.captures], BatchOptions(root, body.profile, body.overrides, body.threads, body.seed, body.store)
+    return [Path(name) for name in body.captures], BatchOptions(
+        root, body.profile, body.overrides, body.threads, body.seed, body.store, body.moved
+    )

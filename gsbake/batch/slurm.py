@@ -20,6 +20,8 @@ _ANSWER_TIMEOUT, _CANCEL_TIMEOUT = 60.0, 60.0
 FIRST_LOOK = 10
 #: More than the jobs that a batch usually has in the queue at a time.
 _BASIC_NICE = 200
+#: Names of partitions (several with commas), accounts and nodes, which end in commands of a shell.
+_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.,-]*")
 
 
 @dataclass(frozen=True)
@@ -43,7 +45,11 @@ class Cluster:
 
 
 def ask_cluster(options: SlurmOptions) -> Cluster:
-    """The properties of the cluster. Raises UsageError without Slurm's commands, or when slurmctld does not answer."""
+    """The properties of the cluster. Raises UsageError for a name that Slurm has not, without its commands, or when slurmctld does not
+    answer."""
+    for option, name in (("--partition", options.partition), ("--account", options.account)):
+        if name is not None and not _NAME.fullmatch(name):
+            raise UsageError(f"{option} takes a name of Slurm's (letters, digits, '_', '-', '.', ','), not '{name}'.")
     if shutil.which("sbatch") is None:
         raise UsageError(
             "--executor slurm needs Slurm's command sbatch on the PATH; install Slurm's client tools, or use --executor local."
@@ -98,9 +104,18 @@ def snakemake_arguments(cluster: Cluster, prefix: str) -> Sequence[str]:
     )  # fmt: skip
 
 
+def submit_options(nice: int, failed_on: object, nodes: int) -> str:
+    """Options of `sbatch` for a job: its order in the queue, and the nodes on which it was interrupted, unless all `nodes` are among them.
+    `failed_on` is from a record on disk: what is no name of Slurm's is left out, because Snakemake's plugin hands it to a shell."""
+    names = failed_on if isinstance(failed_on, list) else []
+    failed = [name for name in names if isinstance(name, str) and _NAME.fullmatch(name)]
+    return f"--nice={nice} --exclude={','.join(failed)}" if failed and len(failed) < nodes else f"--nice={nice}"
+
+
 def node_name() -> str:
     """Slurm's name of the node that this process runs on; empty outside of Slurm."""
-    return os.environ.get("SLURMD_NODENAME", "")
+    name = os.environ.get("SLURMD_NODENAME", "")
+    return name if _NAME.fullmatch(name) else ""
 
 
 def _number(text: str) -> int:

@@ -27,11 +27,14 @@ from gsbake.batch.captures import BatchOptions
 from gsbake.batch.jobs import LEVELS, Job, start_levels
 from gsbake.batch.records import FOLDER, Record, RecordReader
 from gsbake.errors import UsageError
+from gsbake.pipeline.store_url import VARIABLE
 from gsbake.pipeline.supervise import StopSignals
 from gsbake.python_process import python_command, python_environment
 from gsbake.system.processes import leads_group, shell_line, start_apart, stop_group
 
 EXECUTORS = ("local", "slurm")
+#: The document of the jobs, in the folder that Snakemake and its jobs run in; workflow.smk reads it.
+DOCUMENT = "jobs.json"
 #: Times that a job is started again which was interrupted or killed.
 RETRIES = 3
 #: Share of the free memory that jobs on this machine may reserve.
@@ -95,7 +98,7 @@ def run_workflow(
     with (options.root / FOLDER / "snakemake.log").open("wb") as log:
         process = start_apart(
             python_command("-m", "snakemake", *arguments),
-            cwd=work, stdin=subprocess.DEVNULL, stdout=log, stderr=log, env=python_environment(),
+            cwd=work, stdin=subprocess.DEVNULL, stdout=log, stderr=log, env=job_environment(options),
         )  # fmt: skip
         started = psutil.Process(process.pid).create_time()
         _process_file(options.root).write_bytes(
@@ -122,6 +125,11 @@ def run_workflow(
             f"Snakemake could not start the jobs (exit code {process.returncode}); see '{options.root / FOLDER / 'snakemake.log'}'."
         )
     return progress.settled or not stalled
+
+
+def job_environment(options: BatchOptions) -> dict[str, str]:
+    """Environment of Snakemake, which its jobs inherit, with Slurm too: the store's address with its credentials is in no file."""
+    return python_environment({VARIABLE: options.store} if options.store is not None and options.named_store is None else None)
 
 
 def end_orphan(root: Path) -> None:
@@ -182,8 +190,10 @@ class _Queue:
 
 
 def _prepare(jobs: Sequence[Job], options: BatchOptions, execution: Execution, work: Path, prefix: str) -> list[str]:
-    """Write the document of the jobs; returns Snakemake's arguments."""
-    path = work / "jobs.json"
+    """Write the document of the jobs into `work`, in which Snakemake runs; returns its arguments.
+
+    No path is among them: Snakemake reads values of `--config` as YAML, and its plugin writes arguments between double quotes.
+    """
     memory, nodes, chosen = max(512, int(_MEMORY_SHARE * psutil.virtual_memory().available / 1e6)), 1, {}
     extra = ["--cores", str(execution.cores), "--resources", f"mem_mb={memory}"]
     cluster = execution.cluster
@@ -198,19 +208,19 @@ def _prepare(jobs: Sequence[Job], options: BatchOptions, execution: Execution, w
             "id": job.id, "photos": job.photos, "out": job.out, "capture": job.capture, "stages": job.stages, "needs": job.needs,
             "threads": job.threads, "memory_mb": min(job.memory_mb, memory), "minutes": job.minutes,
             "level": levels[job.id],
-            "shell": shell_line(python_command("-m", "gsbake.batch.job", str(path), job.id)),
+            "shell": shell_line(python_command("-m", "gsbake.batch.job", DOCUMENT, job.id)),
         }
         for job in jobs
     ]  # fmt: skip
     document = {
         "root": str(options.root), "profile": options.profile, "overrides": list(options.overrides), "seed": options.seed,
-        "store": options.store, "stages": api.REGISTRY.references, "grow": cluster is not None, "most_memory_mb": memory, "nodes": nodes,
-        "records": str(options.root / FOLDER / "records"), "resources": chosen, "levels": LEVELS,
+        "store": options.named_store, "moved": options.moved, "stages": api.REGISTRY.references, "grow": cluster is not None,
+        "most_memory_mb": memory, "nodes": nodes, "records": str(options.root / FOLDER / "records"), "resources": chosen, "levels": LEVELS,
         "nice": 0 if cluster is None else cluster.nice, "jobs": rows,
     }  # fmt: skip
-    write_atomic(path, json.dumps(document))
+    write_atomic(work / DOCUMENT, json.dumps(document))
     return [
-        "--snakefile", str(Path(__file__).with_name("workflow.smk")), "--directory", str(work), "--config", f"jobs={path}",
+        "--snakefile", str(Path(__file__).with_name("workflow.smk")),
         "--executor", execution.executor, "--retries", str(RETRIES), "--keep-going", "--nolock", "--scheduler", "greedy",
         "--rerun-triggers", "mtime", *extra,
     ]  # fmt: skip

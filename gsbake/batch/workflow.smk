@@ -5,7 +5,9 @@
 import json
 from pathlib import Path
 
-with open(config["jobs"], encoding="utf-8") as file:
+from gsbake.batch.slurm import submit_options
+
+with open("jobs.json", encoding="utf-8") as file:
     BATCH = json.load(file)
 JOBS = {job["id"]: job for job in BATCH["jobs"]}
 
@@ -19,12 +21,11 @@ def memory_mb(wildcards, attempt):
 def slurm_options(wildcards, attempt):
     """The order of the batch's jobs in Slurm's queue, and the nodes on which this one was interrupted: a node with a full disk would take,
     and fail, every job of the batch."""
-    nice = f"--nice={BATCH['nice'] * JOBS[wildcards.job]['level']}"
     try:
         failed = json.loads((Path(BATCH["records"]) / f"{wildcards.job}.json").read_text(encoding="utf-8"))["failed_on"]
-    except (OSError, ValueError, KeyError):
-        return nice
-    return f"{nice} --exclude={','.join(failed)}" if failed and len(failed) < BATCH["nodes"] else nice
+    except (OSError, ValueError, KeyError, TypeError):
+        failed = []
+    return submit_options(BATCH["nice"] * JOBS[wildcards.job]["level"], failed, BATCH["nodes"])
 
 
 def marker(name):

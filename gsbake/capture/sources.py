@@ -54,6 +54,11 @@ def source_files(source: Path) -> list[str]:
     return [source.name] if is_video(source) else [path.relative_to(source).as_posix() for path in list_photos(source)]
 
 
+def reads_subfolders(folder: Path) -> bool:
+    """Whether photos in the subfolders of a folder of photos count: those of a capture's folder `images` or `photos`."""
+    return folder.is_dir() and folder.name in PHOTO_FOLDERS
+
+
 def list_photos(folder: Path) -> list[Path]:
     """Photos of a folder, sorted by path; including sub-folders when the folder is called `images` or `photos`.
 
@@ -63,7 +68,7 @@ def list_photos(folder: Path) -> list[Path]:
     if not folder.is_dir():
         kind = "is a file, not a folder" if folder.exists() else "does not exist"
         raise BadInputError(f"The photo folder {folder} {kind}; give the folder that holds the photos, or a video (mp4, mov, …).")
-    pattern = "**/*" if folder.name in PHOTO_FOLDERS else "*"
+    pattern = "**/*" if reads_subfolders(folder) else "*"
     found = [
         path
         for path in folder.glob(pattern)

@@ -22,8 +22,10 @@ from gsbake.cli.options import (
     LevelsOption,
     MarkerSizeOption,
     MasksOption,
+    MovedOption,
     Options,
     OutOption,
+    OverwriteOption,
     PhotosArgument,
     PosesOption,
     ProfileOption,
@@ -97,11 +99,13 @@ def _pipeline_command(until: str | None) -> Callable[..., None]:
         targets: TargetOption = None,
         levels: LevelsOption = None,
         overrides: SetOption = None,
+        overwrite: OverwriteOption = False,
         dry_run: DryRunOption = False,
         view: ViewOption = False,
         masks: MasksOption = None,
         invert_masks: InvertOption = False,
         poses: PosesOption = None,
+        moved: MovedOption = False,
         known_distances: KnownDistanceOption = None,
         marker_size: MarkerSizeOption = None,
         device: DeviceOption = Device.auto,
@@ -120,6 +124,7 @@ def _pipeline_command(until: str | None) -> Callable[..., None]:
             photos=photos, out=out, profile=profile, overrides=settings,
             masks=masks.folder if masks else None, poses=poses, device=device.value, threads=threads, seed=seed,
             dry_run=dry_run, quiet=quiet, verbose=verbose, as_json=as_json, store=store, view=view,
+            overwrite=overwrite, moved=moved,
         )  # fmt: skip
         run_pipeline(options, until)
 
@@ -137,6 +142,7 @@ def status_command(
     out: OutOption = None,
     profile: ProfileOption = None,
     overrides: SetOption = None,
+    moved: MovedOption = False,
     device: DeviceOption = Device.auto,
     seed: SeedOption = None,
     quiet: QuietOption = False,
@@ -147,9 +153,10 @@ def status_command(
 
     status(
         Options(
-            photos=photos, out=out, profile=profile, overrides=overrides or [], device=device.value, seed=seed, quiet=quiet, as_json=as_json
+            photos=photos, out=out, profile=profile, overrides=overrides or [], device=device.value, seed=seed, quiet=quiet,
+            as_json=as_json, moved=moved,
         )
-    )
+    )  # fmt: skip
 
 
 @command(app, "explain", Panel.INSPECT)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -14,12 +15,14 @@ from gsbake.batch.captures import BatchOptions, plan_captures
 from gsbake.batch.coordinator import Outcome, outcomes_now, run_batch
 from gsbake.batch.emit import FORMATS, emit
 from gsbake.batch.jobs import Job, make_jobs
-from gsbake.batch.page import write_index
+from gsbake.batch.page import INDEX, write_index
 from gsbake.batch.records import Record, load_batch
 from gsbake.batch.slurm import SlurmOptions
 from gsbake.cli.output import cell, print_json, print_table, print_text
 from gsbake.errors import BadInputError, InterruptedRun, UsageError
 from gsbake.pipeline.machine import default_threads
+from gsbake.pipeline.shared_store import refuse_other_folders
+from gsbake.pipeline.store_url import VARIABLE
 from gsbake.text import duration, size
 from gsbake.timing.estimate import History
 
@@ -31,11 +34,14 @@ def plan(captures: Sequence[Path], options: BatchOptions, form: str | None) -> N
     if form is not None and form not in FORMATS:
         raise UsageError(f"--emit is one of {', '.join(FORMATS)}, not '{form}'.")
     options = options.absolute()
+    refuse_other_folders(options.store)
     plans = plan_captures(captures, options)
     outs = sorted(path.parent for path in options.root.glob("*/project.json"))
     jobs = make_jobs(plans, options, History.of_runs(outs, api.REGISTRY.names), options.threads or default_threads())
     if form is not None:
-        typer.echo(emit(form, jobs), nl=False)
+        typer.echo(os.fsencode(emit(form, jobs)), nl=False)  # names that are no text keep their bytes
+        if jobs and options.store is not None and options.named_store is None:
+            print_text(f"The store's address has credentials and is not in the jobs; set {VARIABLE} where they run.", error=True)
     else:
         _print_jobs(jobs, sum(plan.done for plan in plans))
     failed = [plan for plan in plans if plan.error]
@@ -75,7 +81,7 @@ def batch(
             print_text(f"{record.capture}: {record.message or f'{record.job} done in {duration(record.seconds)}'}")
 
     outcomes = run_batch(captures, options, executor, retry_failed=retry_failed, workers=workers, slurm=slurm, on_record=on_record)
-    index = write_index(outcomes, options.root.absolute())
+    index = _write_index(outcomes, options.root)
     if as_json:
         print_json({**_document(outcomes), "index": str(index), "seconds": round(time.perf_counter() - start, 3)})
     elif not quiet:
@@ -89,7 +95,7 @@ def status(root: Path, as_json: bool) -> None:
     """Print how far each capture of the batch in `root` is, and write the index."""
     captures, options = load_batch(root)
     outcomes = outcomes_now(captures, options)
-    write_index(outcomes, root.absolute())
+    _write_index(outcomes, root)
     if as_json:
         print_json(_document(outcomes))
         return
@@ -98,6 +104,18 @@ def status(root: Path, as_json: bool) -> None:
         for o in outcomes
     ]
     print_table(("capture", "state", "stages", "message"), rows)
+
+
+def _write_index(outcomes: Sequence[Outcome], root: Path) -> Path:
+    """Write the index; where another page has its name, say so and where the index is."""
+    path = write_index(outcomes, root.absolute())
+    if path.name != INDEX:
+        print_text(
+            f"gsbake: warning: '{path.with_name(INDEX)}' is not as gsbake wrote it and stays; the index is '{path}'. "
+            "Move yours away to have it there.",
+            error=True,
+        )
+    return path
 
 
 def _document(outcomes: Sequence[Outcome]) -> dict[str, Any]:

@@ -8,7 +8,9 @@ import time
 from gsbake.cli.options import Options
 from gsbake.cli.output import print_json, print_table, print_text
 from gsbake.errors import BadInputError, UsageError
-from gsbake.text import size
+from gsbake.own_files import SET_ASIDE
+from gsbake.pipeline.store import Store
+from gsbake.text import shortlist, size
 
 _SIZE_UNITS = {"": 1, "B": 1, "KB": 10**3, "MB": 10**6, "GB": 10**9, "TB": 10**12}
 _AGE_UNITS = {"h": 3600.0, "d": 86_400.0, "w": 604_800.0}
@@ -32,10 +34,9 @@ def parse_age(text: str) -> float:
 
 def list_outputs(options: Options) -> None:
     """Print everything that the garbage collection may delete."""
-    from gsbake.api import open_store
     from gsbake.pipeline.garbage import list_entries
 
-    store, stages = open_store(options.out)
+    store, stages = _open(options)
     entries = sorted(list_entries(store, stages), key=lambda e: e.used)
     if options.as_json:
         rows = [{"path": str(e.path), "stage": e.stage, "kind": e.kind, "bytes": e.size, "used": e.used} for e in entries]
@@ -49,9 +50,7 @@ def list_outputs(options: Options) -> None:
 
 def verify(options: Options) -> None:
     """Compare every file of every artifact with its digest. Raises BadInputError when one is damaged; the next run computes it again."""
-    from gsbake.api import open_store
-
-    store, stages = open_store(options.out)
+    store, stages = _open(options)
     checked = [(stage, folder, faults) for stage in stages for folder, faults in store.verify(stage)]
     damaged = [(stage, folder, faults) for stage, folder, faults in checked if faults]
     if damaged:
@@ -69,14 +68,17 @@ def verify(options: Options) -> None:
 
 def collect_garbage(options: Options, keep: str | None, older: str | None) -> None:
     """Delete artifacts of old keys, checkpoints and files of killed runs."""
-    from gsbake.api import open_store
     from gsbake.pipeline.garbage import choose, delete, list_entries
 
     limits = (None if keep is None else parse_size(keep), None if older is None else parse_age(older))
-    store, stages = open_store(options.out)
+    store, stages = _open(options)
     entries = list_entries(store, stages)
     chosen = choose(entries, *limits)
-    done = chosen if options.dry_run else delete(chosen)
+    done = chosen if options.dry_run else delete(store, chosen)
+    moved = store.take_moved()
+    if moved and not options.quiet:
+        names = shortlist([path.name for path in moved])
+        print_text(f"{names}: not what a stage wrote; moved to '{store.out / SET_ASIDE}'.", error=True)
     freed, left = sum(e.size for e in done), sum(e.size for e in entries) - sum(e.size for e in done)
     if options.as_json:
         rows = [{"path": str(e.path), "kind": e.kind, "bytes": e.size} for e in done]
@@ -84,3 +86,18 @@ def collect_garbage(options: Options, keep: str | None, older: str | None) -> No
     elif not options.quiet:
         verb = "would be deleted" if options.dry_run else "deleted"
         print_text(f"{len(done)} of {len(entries)} entries {verb}: {size(freed)} freed, {size(left)} left in '{store.out}'.")
+
+
+def _open(options: Options) -> tuple[Store, tuple[str, ...]]:
+    """The artifacts of an output folder, and the names of the stages; links are named on stderr, because nothing behind them is looked at.
+
+    Raises UsageError for a folder that is not gsbake's.
+    """
+    from gsbake.api import open_store
+    from gsbake.pipeline.garbage import require_run
+
+    store, stages = open_store(options.out)
+    require_run(store.out)
+    for link in sorted({link for stage in stages if (link := store.behind_link(stage)) is not None}):
+        print_text(f"'{link}' is a link; what is behind it is left alone.", error=True)
+    return store, stages

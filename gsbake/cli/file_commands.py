@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from gsbake.cli.options import JsonOption, QuietOption, given_path
+from gsbake.cli.options import JsonOption, QuietOption, ReplaceFileOption, given_path
 from gsbake.cli.panels import Panel, command
 
 file_app = typer.Typer()
@@ -44,12 +44,13 @@ def compare_command(
     light: LightOption = "studio",
     views: Annotated[int, typer.Option("--views", min=1, max=64, help="Number of cameras.")] = 4,
     size: Annotated[int, typer.Option("--size", min=16, max=2048, help="Edge of the renders in pixels.")] = 384,
+    overwrite: ReplaceFileOption = False,
     as_json: JsonOption = False,
 ) -> None:
     """Compare two glTF files: surfaces, normals, textures and renders."""
     from gsbake.cli.file_tools import compare
 
-    compare(first, second, truth, sheet, light, views, size, as_json)
+    compare(first, second, truth, sheet, light, views, size, as_json, overwrite)
 
 
 @command(file_app, "render", Panel.FILES)
@@ -62,10 +63,11 @@ def render_command(
     views: Annotated[int, typer.Option("--views", min=1, max=2000, help="Number of views around the object.")] = 72,
     size: Annotated[int, typer.Option("--size", min=16, max=2048, help="Edge of the renders in pixels.")] = 512,
     samples: Annotated[int, typer.Option("--samples", min=1, max=8, help="Rays along each edge of a pixel.")] = 2,
+    overwrite: ReplaceFileOption = False,
     quiet: QuietOption = False,
     as_json: JsonOption = False,
 ) -> None:
     """Render a turntable of any glTF file, without a GPU."""
     from gsbake.cli.file_tools import render
 
-    render(file, light, turntable, views, size, samples, as_json, quiet)
+    render(file, light, turntable, views, size, samples, as_json, quiet, overwrite)

@@ -5,8 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+from gsbake.atomic import write_atomic
 from gsbake.cli.output import cell, print_json, print_table, print_text
-from gsbake.errors import BadInputError, UsageError
+from gsbake.errors import BadInputError
 from gsbake.text import number, size
 
 
@@ -41,18 +42,30 @@ def inspect(path: Path, as_json: bool) -> None:
         print_table(("rule", "severity", "found"), [(f["rule"], cell(f["severity"], colours[f["severity"]]), f["detail"]) for f in wrong])
 
 
-def compare(first: Path, second: Path, truth: Path | None, sheet: Path | None, light: str, views: int, pixels: int, as_json: bool) -> None:
+def compare(
+    first: Path,
+    second: Path,
+    truth: Path | None,
+    sheet: Path | None,
+    light: str,
+    views: int,
+    pixels: int,
+    as_json: bool,
+    overwrite: bool,
+) -> None:
     """Print figures of two files; write the sheet of their renders and differences."""
     from gsbake.imaging.png import encode_png
     from gsbake.viewing.compare import compare_files
-    from gsbake.viewing.lights import load_light
+    from gsbake.viewing.lights import light_files, load_light
+    from gsbake.viewing.turntable import check_output
 
-    if sheet is not None and not sheet.parent.is_dir():
-        raise UsageError(f"The folder '{sheet.parent}' does not exist.")
+    if sheet is not None:
+        inputs = [first, second, *([truth] if truth else []), *light_files(light, first.parent)]
+        check_output(sheet, inputs, overwrite=overwrite, what="The sheet", suffixes=(".png",))
     figures, image = compare_files(first, second, truth, load_light(light, first.parent), views, pixels)
     if sheet is not None:
         try:
-            sheet.write_bytes(encode_png(image, 6))
+            write_atomic(sheet, encode_png(image, 6))
         except OSError as error:
             raise BadInputError(f"'{sheet}' cannot be written: {error.strerror}.") from error
         figures["sheet"] = str(sheet)
@@ -69,19 +82,21 @@ def compare(first: Path, second: Path, truth: Path | None, sheet: Path | None, l
         print_text(f"{sheet}: first, second, and their difference")
 
 
-def render(path: Path, light: str, turntable: Path, views: int, pixels: int, samples: int, as_json: bool, quiet: bool) -> None:
+def render(
+    path: Path, light: str, turntable: Path, views: int, pixels: int, samples: int, as_json: bool, quiet: bool, overwrite: bool
+) -> None:
     """Render a file from around and write the images."""
     from gsbake.gltf.scene import open_scene
-    from gsbake.viewing.lights import load_light
+    from gsbake.viewing.lights import light_files, load_light
     from gsbake.viewing.render import SceneRenderer
     from gsbake.viewing.turntable import check_output, frames, orbit, write_turntable
 
-    check_output(turntable)
+    check_output(turntable, [path, *light_files(light, path.parent)], overwrite=overwrite)
     scene = open_scene(path)
     shader = load_light(light, path.parent)
     renderer = SceneRenderer(scene)
     cameras = orbit(renderer.centre, renderer.radius, views, pixels)
-    count = write_turntable(turntable, frames(renderer, cameras, shader, samples))
+    count = write_turntable(turntable, frames(renderer, cameras, shader, samples), overwrite=overwrite)
     if as_json:
         done = {"file": str(path), "turntable": str(turntable), "views": count, "size": pixels, "light": light}
         print_json(done | {"notes": list(scene.notes)})

@@ -10,6 +10,7 @@ import typer
 from gsbake.cli.options import (
     DryRunOption,
     JsonOption,
+    MovedOption,
     Options,
     OutOption,
     QuietOption,
@@ -44,6 +45,7 @@ def plan_command(
     threads: ThreadsOption = 0,
     seed: BatchSeedOption = 0,
     store: StoreOption = None,
+    moved: MovedOption = False,
     form: Annotated[
         str | None,
         typer.Option(
@@ -56,7 +58,7 @@ def plan_command(
     from gsbake.batch.captures import BatchOptions
     from gsbake.cli.batch import plan
 
-    plan(captures, BatchOptions(out, profile, tuple(overrides or ()), threads, seed, store), form)
+    plan(captures, BatchOptions(out, profile, tuple(overrides or ()), threads, seed, store, moved), form)
 
 
 @command(many_app, "batch", Panel.MANY)
@@ -75,6 +77,7 @@ def batch_command(
     threads: ThreadsOption = 0,
     seed: BatchSeedOption = 0,
     store: StoreOption = None,
+    moved: MovedOption = False,
     jobs: Annotated[
         int,
         typer.Option(
@@ -93,7 +96,7 @@ def batch_command(
     from gsbake.batch.slurm import SlurmOptions
     from gsbake.cli import batch
 
-    options = BatchOptions(out, profile, tuple(overrides or ()), threads, seed, store)
+    options = BatchOptions(out, profile, tuple(overrides or ()), threads, seed, store, moved)
     if captures == [Path("status")]:
         batch.status(out, as_json)
     else:
@@ -114,7 +117,7 @@ def cache_ls_command(out: OutOption = None, store: StoreOption = None, as_json: 
     from gsbake.cli import cache, shared_cache
 
     options = Options(out=out, store=store, as_json=as_json)
-    (cache if store is None else shared_cache).list_outputs(options)
+    (cache if out is not None or store is None else shared_cache).list_outputs(options)
 
 
 @command(cache_app, "verify")
@@ -125,7 +128,7 @@ def cache_verify_command(
     from gsbake.cli import cache, shared_cache
 
     options = Options(out=out, store=store, quiet=quiet, as_json=as_json)
-    (cache if store is None else shared_cache).verify(options)
+    (cache if out is not None or store is None else shared_cache).verify(options)
 
 
 @command(cache_app, "gc")
@@ -146,7 +149,7 @@ def cache_gc_command(
     from gsbake.cli import cache, shared_cache
 
     options = Options(out=out, store=store, dry_run=dry_run, quiet=quiet, as_json=as_json)
-    (cache if store is None else shared_cache).collect_garbage(options, keep, older)
+    (cache if out is not None or store is None else shared_cache).collect_garbage(options, keep, older)
 
 
 @command(cache_app, "quota")

@@ -9,12 +9,14 @@ from gsbake.cli.options import Options
 from gsbake.cli.output import print_json, print_text
 from gsbake.cli.replace import current_output
 from gsbake.errors import UsageError
+from gsbake.output_folder import require_outside_sources
 from gsbake.pipeline.files import disk_error, path_error
 
 
 def masks(options: Options, folder: Path, doubtful: bool) -> None:
     """Write the masks into `folder`, with `doubtful` only those that a person should look at. Raises UsageError before the first run."""
     session = options.session()
+    require_outside_sources(folder, session.project)
     ingest, poses = (current_output(session, stage) for stage in ("ingest", "poses"))
     if ingest is None or poses is None:
         raise UsageError(f"'{session.out}' has no camera poses yet, from which masks are corrected; run `gsbake poses` first.")

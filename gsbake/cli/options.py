@@ -226,6 +226,17 @@ StoreOption = Annotated[
         show_default=False, show_envvar=True, rich_help_panel=COMMON_OPTIONS,
     ),
 ]  # fmt: skip
+OverwriteOption = Annotated[
+    bool,
+    typer.Option(
+        "--overwrite", help="Publish results in the place of files there that you edited, which are moved to DIR/set-aside. "
+        "Else they stay, and the new ones get names such as asset.new.glb.",
+    ),
+]  # fmt: skip
+MovedOption = Annotated[
+    bool, typer.Option("--moved", help="The photos of the run in DIR lie at another path now.", rich_help_panel=PHOTO_OPTIONS)
+]
+ReplaceFileOption = Annotated[bool, typer.Option("--overwrite", help="Replace the output file where it exists.")]
 DryRunOption = Annotated[bool, typer.Option("--dry-run", "-n", help="Print what would run, and why; run nothing.")]
 QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="Print warnings and errors only.", rich_help_panel=COMMON_OPTIONS)]
 VerboseOption = Annotated[
@@ -253,6 +264,8 @@ class Options:
     as_json: bool = False
     store: str | None = None
     view: bool = False
+    overwrite: bool = False
+    moved: bool = False
 
     def session(self, observer: Observer | None = None) -> Session:
         """Session of the run that the options describe; nothing is written."""
@@ -260,6 +273,6 @@ class Options:
 
         run = RunOptions(
             self.photos, self.out, self.profile, self.overrides, self.masks, self.poses, self.device, self.threads, self.seed,
-            self.store,
+            self.store, self.overwrite, self.moved,
         )  # fmt: skip
         return open_session(run, observer)

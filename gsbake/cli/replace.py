@@ -8,9 +8,10 @@ from gsbake.api import Session
 from gsbake.cli.options import Options
 from gsbake.cli.output import print_json, print_text
 from gsbake.errors import BadInputError, UsageError
+from gsbake.own_files import SET_ASIDE
 from gsbake.pipeline.files import disk_error, path_error
 from gsbake.pipeline.replace import folder_files, replace_output, undo_replacement
-from gsbake.pipeline.store import Artifact
+from gsbake.pipeline.store import Artifact, Store
 
 #: {(stage, suffix): files that a single file with this suffix replaces}: an edited mesh is both the low-poly and the dense mesh.
 REPLACED_FILES = {("mesh", ".ply"): ("mesh.ply", "dense.ply")}
@@ -37,16 +38,18 @@ def _replace(options: Options, session: Session, stage: str, paths: list[Path], 
     if undo:
         if not options.dry_run:
             undo_replacement(store, stage)
-        _print_result(options, {"stage": stage, "undone": True}, f"{stage}: its own output is used again")
+        _print_result(options, store, {"stage": stage, "undone": True}, f"{stage}: its own output is used again")
         return
     base = current_output(session, stage)
     files = _replacement_files(stage, paths, base)
     if options.dry_run:
-        _print_result(options, {"stage": stage, "would_replace": sorted(files)}, f"{stage}: would replace {', '.join(sorted(files))}")
+        names = sorted(files)
+        _print_result(options, store, {"stage": stage, "would_replace": names}, f"{stage}: would replace {', '.join(names)}")
         return
     artifact = replace_output(store, stage, files, base)
     _print_result(
         options,
+        store,
         {"stage": stage, "replaced": sorted(files), "folder": str(artifact.folder)},
         f"{stage}: {', '.join(sorted(files))} replaced; `gsbake run` continues from there",
     )
@@ -98,8 +101,10 @@ def _check_ply(path: Path) -> None:
             raise BadInputError(f"'{path}' is not a PLY file; export the mesh as PLY.")
 
 
-def _print_result(options: Options, document: dict[str, object], text: str) -> None:
+def _print_result(options: Options, store: Store, document: dict[str, object], text: str) -> None:
+    moved = store.take_moved()
     if options.as_json:
-        print_json(document, indent=None)
+        print_json({**document, **({"set_aside": [str(path) for path in moved]} if moved else {})}, indent=None)
     elif not options.quiet:
-        print_text(text)
+        aside = store.out / SET_ASIDE / str(document["stage"])
+        print_text(text + (f"; the files that were there before are in '{aside}'" if moved else ""))

@@ -8,6 +8,7 @@ from pathlib import Path
 from gsbake.cli.output import print_json, print_text
 from gsbake.errors import BadInputError
 from gsbake.pipeline.files import disk_error
+from gsbake.synth.folder import require_capture_folder
 from gsbake.text import duration
 
 
@@ -17,6 +18,7 @@ def synth(
 ) -> None:  # fmt: skip
     """Write the capture and print its folder."""
     start = time.perf_counter()
+    require_capture_folder(folder)
     if not dry_run:
         from gsbake.synth.capture import write_capture
 

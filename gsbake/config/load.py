@@ -30,6 +30,8 @@ from gsbake.text import number
 
 #: Profile without `--profile`.
 DEFAULT = "relight"
+#: Largest profile in bytes: one with every setting has about 10 kB.
+MAX_SIZE = 1_000_000
 #: Characters of an invalid value that a message shows.
 MAX_VALUE_LENGTH = 60
 #: Pydantic's types of errors for values that are no number at all.
@@ -134,6 +136,8 @@ def _chain(path: Path) -> list[Path]:
 
 def _toml(path: Path) -> dict[str, Any]:
     try:
+        if path.stat().st_size > MAX_SIZE:
+            raise BadInputError(f"{path} has {path.stat().st_size / 1e6:.0f} MB; a profile has at most {MAX_SIZE / 1e6:.0f} MB.")
         return tomllib.loads(path.read_text(encoding="utf-8"))
     except (ValueError, RecursionError) as error:  # not TOML, not UTF-8, an integer too long to convert, or nested too deeply
         raise BadInputError(f"{path} is not valid TOML: {error}.") from error

@@ -7,6 +7,7 @@ object on the screen, from which the error bound of the decimation follows.
 from __future__ import annotations
 
 import importlib.util
+import re
 from collections.abc import Iterable
 from dataclasses import dataclass
 
@@ -44,6 +45,19 @@ PACKAGES = {
     "usdz": ("pxr", "usd-core", "usd"),
     "usdc": ("pxr", "usd-core", "usd"),
 }
+#: Names of the files that targets make: GLB with its forms and levels, USD and OBJ with their images, the masters of a film, the surfels.
+_PLACE = "|".join(name for name in BUDGETS if name != "default")
+_CODECS = rf"(_({'|'.join(TEXTURE_FORMS)}))?(_({'|'.join(GEOMETRY_FORMS)}))?"
+_ROLE = r"_(base_color|orm|roughness|metallic|normal|emissive)\.(png|jpg)"
+_FILE = re.compile(
+    rf"asset(_({_PLACE}))?{_CODECS}(_lod[1-9]|_lods)?\.glb|asset(_({_PLACE}))?(_lod[1-9])?(\.(usdz|usdc|obj|mtl)|{_ROLE})"
+    rf"|asset_film{_CODECS}/(base_color|orm|normal|emissive)\.exr|{SURFELS}\.ply"
+)
+
+
+def is_target_file(name: str) -> bool:
+    """Whether `name` is one that a target's file may have in the output folder; `asset.glb` is the export's."""
+    return name != "asset.glb" and _FILE.fullmatch(name) is not None
 
 
 @dataclass(frozen=True)

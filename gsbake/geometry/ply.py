@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
 from typing import Any
 
@@ -73,12 +74,14 @@ def write_mesh(path: Path, vertices: ArrayLike, faces: ArrayLike) -> None:
 def read_mesh(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Read vertices (v, 3) and triangles (f, 3) of any PLY mesh.
 
-    Raises ValueError for an unreadable file, no triangles, corners that are no vertices, or non-finite positions.
+    It is read in this process: its counts are checked against its length by the reader, and a stage that a person has replaced a file of is
+    a process of its own. Raises ValueError for an unreadable file, no triangles, corners that are no vertices, or non-finite positions.
     """
     import trimesh
 
     try:
-        mesh: Any = trimesh.load(path, process=False)
+        content = io.BytesIO(path.read_bytes())  # without a name, from which the reader would open textures
+        mesh: Any = trimesh.load(content, file_type="ply", process=False)
         vertices = np.asarray(mesh.vertices, np.float64).reshape(-1, 3)
         faces = np.asarray(mesh.faces, np.int64).reshape(-1, 3)
     except MemoryError:

@@ -15,8 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsbake.errors import BadInputError
-from gsbake.gltf.document import decode_image, image_format
+from gsbake.gltf.document import FAULTS
 from gsbake.gltf.read import GltfAsset, parse_glb
+from gsbake.imaging.encoded import image_format, image_size
 from gsbake.texturing.texels import overlapping
 
 Severity = Literal["error", "warning", "info"]
@@ -29,6 +30,10 @@ PLAUSIBLE_COLOUR = (30, 243)
 OVERLAP_SIZE = 2048
 #: Largest share of overlapping texels, for rounding at shared edges.
 MAX_OVERLAP_SHARE = 1e-5
+#: Area of the triangles, in unit squares, above which they overlap without a look at the texels.
+MAX_COVERED = 10.0
+#: Area of the triangles' boxes, in unit squares, up to which the texels are looked at: seconds.
+MAX_BOXES = 200.0
 #: Share of texels of a normal map whose vectors may be off unit length.
 MAX_NON_UNIT = 0.02
 #: PNG chunks that viewers interpret differently.
@@ -46,14 +51,20 @@ class Finding:
 
 
 def audit(
-    data: bytes, name: str, max_megabytes: float, max_triangles: int, extensions: frozenset[str] = frozenset(), budget: Severity = "warning"
+    data: bytes,
+    name: str,
+    max_megabytes: float,
+    max_triangles: int,
+    extensions: frozenset[str] = frozenset(),
+    budget: Severity = "warning",
+    foreign: bool = False,
 ) -> list[Finding]:
     """Audit the bytes of a GLB; `name` identifies it in errors. An unreadable file gives one failed finding.
 
-    `extensions` may be required by the file; `budget` is the severity of a file that is too large.
+    `extensions` may be required by the file; `budget` is the severity of a file that is too large; `foreign` as for `parse_glb`.
     """
     try:
-        asset = parse_glb(data, name)
+        asset = parse_glb(data, name, foreign)
     except BadInputError as error:
         return [Finding("readable GLB", False, str(error), "error")]
     found: list[Finding] = []
@@ -70,7 +81,7 @@ def audit(
             _images(asset, check)
     except BadInputError as error:
         check("readable images", False, str(error))
-    except (KeyError, IndexError, ValueError, TypeError, AttributeError, OverflowError, struct.error) as error:
+    except (*FAULTS, struct.error) as error:
         check("well-formed document", False, " ".join(repr(error).split())[:200])
     megabytes = len(data) / 1e6
     check("file size", megabytes <= max_megabytes, f"{megabytes:.2f} MB of {max_megabytes:g} MB", budget)
@@ -162,9 +173,18 @@ def _uv_layout(asset: GltfAsset, check: Any) -> None:
     area = 0.5 * ((b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (c[:, 0] - a[:, 0]) * (b[:, 1] - a[:, 1]))
     flipped = int((area > 1e-12).sum())
     check("no mirrored UVs", flipped == 0, f"{flipped} of {len(faces)} triangles")
+    covered = float(np.abs(area).sum())
+    if covered > MAX_COVERED:  # filling the texels of so many could take hours
+        check("no overlapping UVs", False, f"the triangles cover {covered:.0f} times the square")
+        return
+    corners = np.stack([a, b, c])
+    boxes = float(np.prod(corners.max(0) - corners.min(0), axis=1).sum())
+    if boxes > MAX_BOXES:  # long oblique triangles, each of which is looked for in its whole box
+        check("no overlapping UVs", True, "not looked at: many long oblique triangles", "info")
+        return
     shared = overlapping(uv, faces, OVERLAP_SIZE)
     check("no overlapping UVs", shared <= MAX_OVERLAP_SHARE * OVERLAP_SIZE**2, f"{shared} of {OVERLAP_SIZE}² texels")
-    check("UV space used", True, f"{np.abs(area).sum():.0%} of the square", "info")
+    check("UV space used", True, f"{covered:.0%} of the square", "info")
 
 
 def _images(asset: GltfAsset, check: Any) -> None:
@@ -183,7 +203,8 @@ def _images(asset: GltfAsset, check: Any) -> None:
         if form == "png":
             width, height = _png_header(role, content, occlusion_only, check)
         elif form == "jpeg" or (form != "unknown" and _extension_of(form) in asset.document.get("extensionsRequired", [])):
-            height, width = decode_image(content, role).shape[:2]
+            size = image_size(content, role)
+            width, height = size.width, size.height
             check(f"{role}: image format", True, f"{width}x{height}, {form}")
         else:
             check(f"{role}: PNG", False, f"{form}: neither PNG, JPEG nor of an extension that the file requires")

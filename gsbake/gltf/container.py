@@ -10,6 +10,7 @@ import struct
 from typing import Any
 
 from gsbake.errors import BadInputError
+from gsbake.memory_budget import check, json_bytes
 
 MAGIC, VERSION = 0x46546C67, 2
 JSON_CHUNK, BINARY_CHUNK = 0x4E4F534A, 0x004E4942
@@ -40,6 +41,7 @@ def unpack_glb(data: bytes, name: str) -> tuple[dict[str, Any], bytes]:
         if len(chunk) != size:
             raise BadInputError(f"{name} is damaged: a chunk exceeds the file; export it again.")
         if kind == JSON_CHUNK and document is None:
+            check(json_bytes(chunk), name)
             try:
                 document = json.loads(chunk)
             except (ValueError, RecursionError) as error:

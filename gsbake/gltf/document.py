@@ -2,6 +2,9 @@
 
 A file that needs an extension that cannot be honoured, such as Draco, is refused in one sentence. glTF 2.0 specification, sections 3.6
 (binary data) and 3.6.2.3 (sparse accessors); EXT_meshopt_compression and KHR_texture_basisu by the packages of the extra `web`.
+
+Whatever is read or made of a document counts against one budget (`memory_budget`), before it is. Decompression of meshes stays in this
+process: the decoder writes exactly the rows that the header states, which are counted, and checks its input.
 """
 
 from __future__ import annotations
@@ -15,18 +18,21 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from gsbake.errors import BadInputError
 from gsbake.gltf.container import unpack_glb
 from gsbake.imaging import ktx2
+from gsbake.memory_budget import budget, check, json_bytes, read_bytes, too_large
 
 COMPONENT_TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 COMPONENT_COUNTS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
-#: Largest number of values that an accessor without data may state.
-MAX_EMPTY = 50_000_000
+#: Lists of objects at the top of a document.
+LISTS = (
+    "accessors", "animations", "buffers", "bufferViews", "cameras", "images", "materials", "meshes", "nodes", "samplers", "scenes", "skins",
+    "textures",
+)  # fmt: skip
 #: Required extensions that are read; materials beyond metallic-roughness are named in `Document.ignored`.
 READ = {
     "KHR_mesh_quantization", "KHR_texture_transform", "EXT_texture_webp", "KHR_materials_unlit", "KHR_materials_emissive_strength",
@@ -37,6 +43,8 @@ IGNORED = ("KHR_materials_", "KHR_lights_", "KHR_xmp", "KHR_node_visibility", "K
 MESHOPT, BASISU = "EXT_meshopt_compression", "KHR_texture_basisu"
 #: {extension: package of the extra `web` that reads it}.
 OPTIONAL = {MESHOPT: "meshopt", BASISU: "alktx2"}
+#: What reading a malformed document raises.
+FAULTS = (KeyError, IndexError, ValueError, TypeError, AttributeError, OverflowError, RuntimeError, MemoryError)
 #: Filters of EXT_meshopt_compression.
 FILTERS = ("NONE", "OCTAHEDRAL", "QUATERNION", "EXPONENTIAL")
 
@@ -51,12 +59,14 @@ class Document:
     folder: Path | None
     size: int
     _views: dict[int, bytes] = field(default_factory=dict)
+    _files: dict[str, bytes] = field(default_factory=dict)
+    _left: int = field(default_factory=budget)
 
     @classmethod
     def open(cls, path: Path) -> Document:
         """Read a .glb or .gltf file. Raises BadInputError for what is not one or cannot be honoured."""
         try:
-            data = path.read_bytes()
+            data = read_bytes(path)
         except OSError as error:
             raise BadInputError(f"'{path}' cannot be read: {error.strerror}.") from error
         return cls.parse(data, str(path), path.parent)
@@ -68,6 +78,7 @@ class Document:
             document, binary = unpack_glb(data, name)
         else:
             binary = b""
+            check(json_bytes(data), f"'{name}'")
             try:
                 document = json.loads(data)
             except (ValueError, RecursionError) as error:
@@ -78,6 +89,7 @@ class Document:
             raise BadInputError(f"'{name}' is glTF {document['asset'].get('version')}; gsbake reads glTF 2.0: convert it first.")
         out = cls(document, [], name, folder, len(data))
         with out.readable():
+            check_structure(document)
             required = [e for e in document.get("extensionsRequired", []) if e not in READ and not str(e).startswith(IGNORED)]
             missing = [e for e in required if e in OPTIONAL and importlib.util.find_spec(OPTIONAL[e]) is None]
             required = [e for e in required if e not in OPTIONAL]
@@ -90,6 +102,18 @@ class Document:
             for index, entry in enumerate(document.get("buffers", [])):
                 out.buffers.append(out._buffer(index, entry, binary))
         return out
+
+    def spend(self, size: int) -> None:
+        """Count `size` bytes that are about to be read or made. Raises BadInputError when the document needs more than there is."""
+        if size < 0:
+            raise ValueError(f"it states {size} bytes")
+        if size > self._left:
+            raise too_large(size, self._left, f"'{self.name}'")
+        self._left -= size
+
+    def entry(self, kind: str, index: Any) -> dict[str, Any]:
+        """An entry of a list of the document ("meshes", "accessors", …). Raises ValueError for an index that has none."""
+        return entry_of(self.json, kind, index)
 
     def readable(self) -> _Readable:
         """Context in which a malformed document raises BadInputError with the file's name instead of KeyError and the like."""
@@ -113,7 +137,13 @@ class Document:
 
     def load(self, uri: str) -> bytes:
         """Content of a data URI, or of a file beside the document."""
+        if uri not in self._files:
+            self._files[uri] = self._loaded(uri)
+        return self._files[uri]
+
+    def _loaded(self, uri: str) -> bytes:
         if uri.startswith("data:"):
+            self.spend(len(uri))
             try:
                 return base64.b64decode(uri.partition(",")[2], validate=True)
             except (ValueError, binascii.Error) as error:
@@ -124,6 +154,7 @@ class Document:
             path = (self.folder / unquote(uri)).resolve()
             if not path.is_relative_to(self.folder.resolve()) or not path.is_file():  # neither files elsewhere nor devices
                 raise BadInputError(f"'{self.name}' needs the file '{uri[:100]}', which is not in its folder; pack it into one GLB.")
+            self.spend(path.stat().st_size)
             content = path.read_bytes()
         except (OSError, ValueError) as error:
             raise BadInputError(f"'{self.name}' needs the file '{uri[:100]}' beside it, which cannot be read.") from error
@@ -133,54 +164,85 @@ class Document:
     def view(self, index: int) -> bytes:
         """Bytes of a buffer view."""
         if index not in self._views:
-            self._views[index] = self._slice(index, self.json["bufferViews"][index])
+            self._views[index] = self._slice(index, self.entry("bufferViews", index))
         return self._views[index]
 
     def _slice(self, index: int, view: dict[str, Any]) -> bytes:
         packed = view.get("extensions", {}).get(MESHOPT)
+        self.spend(int(view["byteLength"]))
         if packed is not None and importlib.util.find_spec("meshopt") is not None:
             return _decoded(self._slice(index, {k: v for k, v in packed.items() if k != "extensions"}), packed, view["byteLength"])
         start, length = view.get("byteOffset", 0), view["byteLength"]
+        if not 0 <= view["buffer"] < len(self.buffers):
+            raise ValueError(f"buffer view {index} names a buffer that does not exist")
         content = self.buffers[view["buffer"]][start : start + length]
-        if start < 0 or len(content) != length:
+        if start < 0 or length < 0 or len(content) != length:
             raise ValueError(f"buffer view {index} exceeds its buffer")
         return content
 
     def accessor(self, index: int) -> NDArray[Any]:
         """Values of an accessor (count, width) as float32 if normalised, else in their own type; (count,) for scalars."""
         values = self.stored(index)
-        if self.json["accessors"][index].get("normalized") and values.dtype.kind != "f":
+        if self.entry("accessors", index).get("normalized") and values.dtype.kind != "f":
             limit = np.float32(np.iinfo(values.dtype).max)
             values = np.maximum(values.astype(np.float32) / limit, np.float32(-1))
         return values[:, 0] if values.shape[1] == 1 else values
 
     def stored(self, index: int) -> NDArray[Any]:
         """Values of an accessor (count, width) in the type in which they are stored."""
-        accessor = self.json["accessors"][index]
-        kind, width, count = np.dtype(COMPONENT_TYPES[accessor["componentType"]]), COMPONENT_COUNTS[accessor["type"]], accessor["count"]
+        accessor = self.entry("accessors", index)
+        kind, width, count = np.dtype(COMPONENT_TYPES[accessor["componentType"]]), COMPONENT_COUNTS[accessor["type"]], self.count(index)
         if "bufferView" in accessor:
             stride = self.stride(accessor["bufferView"]) or kind.itemsize * width
             values = _strided(self.view(accessor["bufferView"]), kind, count, width, accessor.get("byteOffset", 0), stride)
         else:
-            if not 0 <= count * width <= MAX_EMPTY:
-                raise ValueError(f"accessor {index} states {count} values")
+            self.spend(count * width * kind.itemsize)
             values = np.zeros((count, width), kind)
         if "sparse" in accessor:
             sparse = accessor["sparse"]
             at, to, n = sparse["indices"], sparse["values"], sparse["count"]
             rows = _strided(self.view(at["bufferView"]), np.dtype(COMPONENT_TYPES[at["componentType"]]), n, 1, at.get("byteOffset", 0), 0)
+            if not rows[:, 0].max() < count:
+                raise ValueError(f"accessor {index} has sparse values of rows that it does not have")
             values[rows[:, 0]] = _strided(self.view(to["bufferView"]), kind, n, width, to.get("byteOffset", 0), 0)
         return values
 
+    def count(self, index: int) -> int:
+        """Number of rows that an accessor states. Raises ValueError for a number that is none."""
+        count = self.entry("accessors", index)["count"]
+        if type(count) is not int or not 1 <= count < 1 << 48:
+            raise ValueError(f"accessor {index} states {str(count)[:50]} rows")
+        return count
+
     def stride(self, view: int) -> int | None:
         """Stride of a buffer view in bytes, or None where it has none."""
-        found = self.json["bufferViews"][view].get("byteStride")
+        found = self.entry("bufferViews", view).get("byteStride")
         return None if found is None else int(found)
 
     def image(self, index: int) -> bytes:
         """Encoded bytes of an image."""
-        entry = self.json["images"][index]
+        entry = self.entry("images", index)
         return self.load(entry["uri"]) if "uri" in entry else self.view(entry["bufferView"])
+
+
+def check_structure(document: dict[str, Any]) -> None:
+    """Raise ValueError unless the lists of a document are lists of objects, as the specification has them."""
+    for kind in LISTS:
+        found = document.get(kind, [])
+        if not isinstance(found, list) or not all(isinstance(entry, dict) for entry in found):
+            raise ValueError(f"{kind} is no list of objects")
+    for kind in ("extensionsUsed", "extensionsRequired"):
+        if not isinstance(document.get(kind, []), list):
+            raise ValueError(f"{kind} is no list")
+
+
+def entry_of(document: dict[str, Any], kind: str, index: Any) -> dict[str, Any]:
+    """Entry `index` of a list of the document. Raises ValueError where there is none: a negative index is none either."""
+    found = document.get(kind, [])
+    if type(index) is not int or not 0 <= index < len(found):
+        raise ValueError(f"{kind} has no entry {str(index)[:50]!r}")
+    entry: dict[str, Any] = found[index]
+    return entry
 
 
 def texture_infos(material: dict[str, Any]) -> dict[str, Any]:
@@ -198,7 +260,7 @@ def texture_infos(material: dict[str, Any]) -> dict[str, Any]:
 
 def texture_source(document: dict[str, Any], texture: int) -> int | None:
     """Index of a texture's image, of its extension where it has one; None without."""
-    entry = document["textures"][texture]
+    entry = entry_of(document, "textures", texture)
     extensions, source = entry.get("extensions", {}), entry.get("source")
     if "EXT_texture_webp" in extensions:
         return int(extensions["EXT_texture_webp"]["source"])
@@ -217,9 +279,13 @@ class _Readable:
         return None
 
     def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
-        if isinstance(error, (KeyError, IndexError, ValueError, TypeError, AttributeError, OverflowError, RuntimeError)):
-            reason = " ".join(repr(error).split())[:200]
-            raise BadInputError(f"'{self.name}' is not a valid glTF file ({reason}); export it again.") from error
+        if isinstance(error, FAULTS):
+            raise BadInputError(f"'{self.name}' is not a valid glTF file ({reason_of(error)}); export it again.") from error
+
+
+def reason_of(error: BaseException) -> str:
+    """What is wrong with a document, from the error that reading it raised."""
+    return " ".join((str(error) if type(error) is ValueError else repr(error)).split())[:200]
 
 
 def _strided(content: bytes, kind: np.dtype[Any], count: int, width: int, start: int, stride: int) -> NDArray[Any]:
@@ -236,51 +302,6 @@ def _decoded(content: bytes, packed: dict[str, Any], length: int) -> bytes:
 
     count, stride, mode = int(packed["count"]), int(packed["byteStride"]), packed["mode"]
     kind = packed.get("filter", "NONE")
-    if kind not in FILTERS or not 0 < count * stride <= 4 * MAX_EMPTY or count * stride > length:
+    if kind not in FILTERS or not 0 < count * stride <= length:
         raise ValueError(f"a compressed buffer view states {count} rows of {stride} bytes with the filter {kind}")
     return bytes(meshopt.decode_gltf_buffer(content, count, stride, mode, kind).tobytes())
-
-
-def decode_image(content: bytes, name: str) -> NDArray[np.uint8]:
-    """Pixels (h, w, 4) 8-bit RGBA of a PNG, JPEG, WebP or KTX2 file. Raises BadInputError, which names `name`."""
-    if content[:12] == ktx2.MAGIC:
-        if not ktx2.available():
-            raise BadInputError(f"{name} is a KTX2 image, which the package alktx2 reads: pip install 'gsbake[web]', or export it without.")
-        try:
-            return ktx2.decode_ktx2(content)
-        except ValueError as error:
-            raise BadInputError(f"{name} is a KTX2 image that cannot be decoded: {error}.") from error
-    try:
-        pixels = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
-    except cv2.error:  # more pixels than OpenCV decodes, or no bytes
-        pixels = None
-    if pixels is None:
-        raise BadInputError(f"{name} cannot be decoded; it must be PNG, JPEG or WebP.")
-    if pixels.dtype == np.uint16:
-        pixels = (pixels.astype(np.uint32) * 255 // 65535).astype(np.uint8)
-    if pixels.ndim == 2:
-        pixels = pixels[..., None]
-    if pixels.dtype != np.uint8:
-        raise BadInputError(f"{name} has {pixels.dtype} pixels; glTF images have 8 or 16 bits.")
-    opaque = np.full(pixels.shape[:2], 255, np.uint8)
-    match pixels.shape[2]:
-        case 1:
-            planes = (pixels[..., 0], pixels[..., 0], pixels[..., 0], opaque)
-        case 2:
-            planes = (pixels[..., 0], pixels[..., 0], pixels[..., 0], pixels[..., 1])
-        case 3:
-            planes = (pixels[..., 2], pixels[..., 1], pixels[..., 0], opaque)
-        case _:
-            planes = (pixels[..., 2], pixels[..., 1], pixels[..., 0], pixels[..., 3])
-    return np.ascontiguousarray(np.stack(planes, -1), np.uint8)
-
-
-def image_format(content: bytes) -> str:
-    """The format of an encoded image: "png", "jpeg", "webp", "ktx2" or "unknown"."""
-    if content[:8] == b"\x89PNG\r\n\x1a\n":
-        return "png"
-    if content[:3] == b"\xff\xd8\xff":
-        return "jpeg"
-    if content[:4] == b"RIFF" and content[8:12] == b"WEBP":
-        return "webp"
-    return "ktx2" if content[:12] == ktx2.MAGIC else "unknown"

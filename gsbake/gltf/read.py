@@ -5,6 +5,7 @@ Reads any GLB with float attributes and embedded images; it is not a general glT
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,8 +15,13 @@ from numpy.typing import NDArray
 
 from gsbake.errors import BadInputError
 from gsbake.gltf.container import unpack_glb
-from gsbake.gltf.document import Document, decode_image, texture_infos, texture_source
+from gsbake.gltf.document import COMPONENT_COUNTS, FAULTS, Document, check_structure, entry_of, reason_of, texture_infos, texture_source
+from gsbake.imaging.encoded import decode_image
+from gsbake.imaging.image_process import read_image
+from gsbake.memory_budget import read_bytes
 
+#: Bytes that a value of an attribute or a corner of a triangle takes, once it is read and while it is audited.
+VALUE_BYTES = 32
 WIDTHS = {"POSITION": 3, "NORMAL": 3, "TANGENT": 4, "TEXCOORD_0": 2}
 
 
@@ -25,7 +31,7 @@ class GltfAsset:
 
     `document` is the JSON document; `attributes` maps names ("POSITION", …) to arrays (v, k); `faces` (f, 3) int64; `images` holds the
     encoded bytes of each image and `roles` the image index of each texture role that the material has ("base_color", "orm", "occlusion",
-    "normal", "emissive"); `size` is the file size in bytes.
+    "normal", "emissive"); `size` is the file size in bytes, `decode` what makes pixels of an image and its name.
     """
 
     document: dict[str, Any]
@@ -34,26 +40,37 @@ class GltfAsset:
     images: tuple[bytes, ...]
     roles: dict[str, int]
     size: int
+    decode: Callable[[bytes, str], NDArray[np.uint8]]
 
     def image(self, role: str) -> NDArray[np.uint8] | None:
         """Pixels (h, w, 3) 8-bit RGB of a role's image as stored, or None when the material has none."""
         if role not in self.roles:
             return None
-        return np.ascontiguousarray(decode_image(self.images[self.roles[role]], f"The {role} image of the asset")[..., :3])
+        return np.ascontiguousarray(self.decode(self.images[self.roles[role]], f"The {role} image of the asset")[..., :3])
 
 
 def read_glb(path: Path) -> GltfAsset:
     """Read a GLB file. Raises BadInputError when it is damaged or holds no triangle mesh."""
-    return parse_glb(path.read_bytes(), str(path))
+    try:
+        data = read_bytes(path)
+    except OSError as error:
+        raise BadInputError(f"'{path}' cannot be read: {error.strerror}.") from error
+    return parse_glb(data, str(path), foreign=True)
 
 
-def parse_glb(data: bytes, name: str) -> GltfAsset:
-    """Parse the bytes of a GLB; `name` identifies it in errors. Raises BadInputError as `read_glb`."""
+def parse_glb(data: bytes, name: str, foreign: bool = False) -> GltfAsset:
+    """Parse the bytes of a GLB; `name` identifies it in errors. The images of a `foreign` one are decoded in a child process.
+
+    Raises BadInputError as `read_glb`.
+    """
     document, binary = unpack_glb(data, name)
     fallback = [b""] * (len(document.get("buffers", [])) - 1) if isinstance(document.get("buffers"), list) else []
     file = Document(document, [binary, *fallback], name, None, len(data))
     try:
+        check_structure(document)
         primitive = document["meshes"][0]["primitives"][0]
+        read = [*primitive["attributes"].values(), *([primitive["indices"]] if "indices" in primitive else [])]
+        file.spend(sum(VALUE_BYTES * file.count(index) * COMPONENT_COUNTS[file.entry("accessors", index)["type"]] for index in read))
         attributes = {key: file.accessor(index) for key, index in primitive["attributes"].items()}
         if "indices" in primitive:
             corners = file.accessor(primitive["indices"])
@@ -63,13 +80,12 @@ def parse_glb(data: bytes, name: str) -> GltfAsset:
         else:
             faces = np.arange(len(attributes["POSITION"])).reshape(-1, 3)
         images = tuple(file.view(image["bufferView"]) for image in document.get("images", []))
-        material = document.get("materials", [{}])[primitive.get("material", 0)]
+        material = entry_of(document, "materials", primitive.get("material", 0)) if document.get("materials") else {}
         roles = _roles(document, material)
         _check_shapes(attributes, roles, len(images))
-    except (KeyError, IndexError, ValueError, TypeError, AttributeError, OverflowError) as error:
-        reason = " ".join(repr(error).split())[:200]
-        raise BadInputError(f"{name} holds no readable triangle mesh ({reason}); export it again.") from error
-    return GltfAsset(document, attributes, faces, images, roles, len(data))
+    except FAULTS as error:
+        raise BadInputError(f"{name} holds no readable triangle mesh ({reason_of(error)}); export it again.") from error
+    return GltfAsset(document, attributes, faces, images, roles, len(data), read_image if foreign else decode_image)
 
 
 def _check_shapes(attributes: dict[str, NDArray[Any]], roles: dict[str, int], images: int) -> None:

@@ -8,6 +8,7 @@ KHR_materials_emissive_strength.
 from __future__ import annotations
 
 import math
+from collections import Counter
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -21,10 +22,18 @@ from gsbake.geometry.vectors import unit
 from gsbake.gltf.document import Document, texture_infos, texture_source
 
 TRIANGLES, STRIP, FAN = 4, 5, 6
+#: Numbers in a row of the attributes that are read; there may be several of TEXCOORD_.
+WIDTHS = {"POSITION": (3,), "NORMAL": (3,), "TANGENT": (4,), "TEXCOORD_": (2,), "COLOR_0": (3, 4)}
 #: Deepest chain of nodes.
 MAX_DEPTH = 256
-#: Most triangles after instancing.
-MAX_TRIANGLES = 50_000_000
+#: Most triangles and most parts after instancing.
+MAX_TRIANGLES, MAX_PARTS = 50_000_000, 100_000
+#: Bytes that a vertex, a triangle and a part take in a scene and what is made of it: its arrays twice, ray tracing, sampled surfaces.
+VERTEX_BYTES, TRIANGLE_BYTES, PART_BYTES = 200, 350, 4000
+#: UV sets that the bytes of a vertex include, and bytes of each further one.
+USUAL_UV_SETS, UV_SET_BYTES = 2, 24
+#: Largest coordinate, texture coordinate, and factor of a material: beyond, single precision overflows.
+MAX_COORDINATE, MAX_UV, MAX_FACTOR = 1e15, 1e6, 1e9
 
 
 @dataclass(frozen=True)
@@ -112,38 +121,62 @@ def read_scene(document: Document) -> Scene:
         notes = [f"{name} is left out" for name in document.ignored]
         if document.json.get("skins") or any("targets" in p for m in document.json.get("meshes", []) for p in m["primitives"]):
             notes.append("skins and morph targets are at rest")
+        instances = _instances(document)
+        triangles = _count(document, [mesh for mesh, _ in instances])
         parts: list[Part] = []
-        triangles = 0
-        for mesh, matrix in _instances(document):
-            entry = document.json["meshes"][mesh]
+        for mesh, matrix in instances:
+            entry = document.entry("meshes", mesh)
             for primitive in entry["primitives"]:
                 if primitive.get("mode", TRIANGLES) < TRIANGLES:
                     notes.append("points and lines are left out")
                     continue
-                part = _part(document, entry.get("name", f"mesh {mesh}"), primitive, matrix, materials)
-                triangles += len(part.faces)
-                if triangles > MAX_TRIANGLES:
-                    raise BadInputError(f"'{document.name}' has more than {MAX_TRIANGLES} triangles; simplify it first.")
-                parts.append(part)
-        if not triangles:
+                parts.append(_part(document, str(entry.get("name", f"mesh {mesh}")), primitive, matrix, materials))
+        parts = [part for part in parts if len(part.faces)]
+        if not triangles or not parts:
             raise BadInputError(f"'{document.name}' holds no triangles.")
-    return Scene(tuple(p for p in parts if len(p.faces)), tuple(materials), document, tuple(dict.fromkeys(notes)))
+    return Scene(tuple(parts), tuple(materials), document, tuple(dict.fromkeys(notes)))
+
+
+def _count(document: Document, meshes: list[int]) -> int:
+    """Triangles of the meshes, each as often as it is placed, from the counts in the document; their memory is spent.
+
+    Raises BadInputError where they are too many, or need more memory than there is.
+    """
+    triangles = parts = needed = 0
+    for mesh, placed in Counter(meshes).items():
+        for primitive in document.entry("meshes", mesh)["primitives"]:
+            mode = primitive.get("mode", TRIANGLES)
+            if mode < TRIANGLES:
+                continue
+            vertices = document.count(primitive["attributes"]["POSITION"])
+            corners = document.count(primitive["indices"]) if "indices" in primitive else vertices
+            faces = corners // 3 if mode == TRIANGLES else max(0, corners - 2)
+            triangles, parts = triangles + placed * faces, parts + placed
+            sets = sum(key.startswith("TEXCOORD_") for key in primitive["attributes"])
+            vertex = VERTEX_BYTES + UV_SET_BYTES * max(0, sets - USUAL_UV_SETS)
+            needed += placed * (PART_BYTES + max(vertices, 3 * faces) * vertex + faces * TRIANGLE_BYTES)
+    if triangles > MAX_TRIANGLES:
+        raise BadInputError(f"'{document.name}' has {triangles} triangles, more than {MAX_TRIANGLES}; simplify it first.")
+    if parts > MAX_PARTS:
+        raise BadInputError(f"'{document.name}' has {parts} parts, more than {MAX_PARTS}; join them first.")
+    document.spend(needed)
+    return triangles
 
 
 def _instances(document: Document) -> list[tuple[int, NDArray[np.float64]]]:
     """(mesh, world matrix (4, 4)) of every node with a mesh in the default scene; of every mesh where there are no scenes."""
-    nodes, scenes = document.json.get("nodes", []), document.json.get("scenes", [])
-    if not scenes:
+    if not document.json.get("scenes", []):
         return [(k, np.eye(4)) for k in range(len(document.json.get("meshes", [])))]
+    scene = document.entry("scenes", document.json.get("scene", 0))
     found: list[tuple[int, NDArray[np.float64]]] = []
-    stack = [(n, np.eye(4), 0) for n in reversed(scenes[document.json.get("scene", 0)].get("nodes", []))]
+    stack = [(n, np.eye(4), 0) for n in reversed(scene.get("nodes", []))]
     visited: set[int] = set()
     while stack:
         index, outer, depth = stack.pop()
+        node = document.entry("nodes", index)
         if index in visited or depth > MAX_DEPTH:
             raise ValueError("its nodes are no tree")
         visited.add(index)
-        node = nodes[index]
         if "EXT_mesh_gpu_instancing" in node.get("extensions", {}):
             raise BadInputError(f"'{document.name}' has instances (EXT_mesh_gpu_instancing), which gsbake does not read.")
         matrix = outer @ _local(node)
@@ -172,25 +205,33 @@ def _local(node: dict[str, Any]) -> NDArray[np.float64]:
 def _part(document: Document, name: str, primitive: dict[str, Any], matrix: NDArray[np.float64], materials: list[Material]) -> Part:
     if "KHR_draco_mesh_compression" in primitive.get("extensions", {}):
         raise BadInputError(f"'{document.name}' needs KHR_draco_mesh_compression, which gsbake does not read; export it without.")
-    attributes = {key: document.accessor(index) for key, index in primitive["attributes"].items()}
+    stated = primitive["attributes"]
+    if len({document.count(index) for index in stated.values()}) != 1:
+        raise ValueError(f"the attributes of {name} differ in number")
+    attributes = {key: _attribute(document, key, index) for key, index in stated.items() if _width_name(key) is not None}
     position = attributes["POSITION"].astype(np.float64) @ matrix[:3, :3].T + matrix[:3, 3]
     count = len(position)
-    if any(len(values) != count for values in attributes.values()) or not np.isfinite(position).all():
-        raise ValueError(f"the vertices of {name} are not finite, or their attributes differ in number")
-    corners = document.accessor(primitive["indices"]).astype(np.int64) if "indices" in primitive else np.arange(count)
+    if not (np.abs(position) <= MAX_COORDINATE).all():
+        raise ValueError(f"the vertices of {name} are not finite, or beyond {MAX_COORDINATE:g}")
+    corners = document.accessor(primitive["indices"]) if "indices" in primitive else np.arange(count)
+    if corners.ndim != 1 or corners.dtype.kind not in "ui":
+        raise ValueError(f"the indices of {name} are no integers")
+    corners = corners.astype(np.int64)
     faces = _triangles(corners, primitive.get("mode", TRIANGLES))
     if len(faces) and (faces.min() < 0 or faces.max() >= count):
         raise ValueError(f"{name} has corners that are no vertices")
     if np.linalg.det(matrix[:3, :3]) < 0:
         faces = faces[:, ::-1]
-    uv = {int(k[9:]): v.astype(np.float32) for k, v in attributes.items() if k.startswith("TEXCOORD_") and v.shape[1:] == (2,)}
-    if not all(np.isfinite(v).all() for v in uv.values()):
-        raise ValueError(f"the texture coordinates of {name} are not finite")
+    uv = {int(k[9:]): v.astype(np.float32) for k, v in attributes.items() if k.startswith("TEXCOORD_")}
+    if not all((np.abs(v) <= MAX_UV).all() for v in uv.values()):
+        raise ValueError(f"the texture coordinates of {name} are not finite, or beyond {MAX_UV:g}")
     colour = attributes.get("COLOR_0")
     if colour is not None:
-        colour = colour.astype(np.float32)
+        colour = np.nan_to_num(colour.astype(np.float32), posinf=MAX_FACTOR, neginf=0).clip(0, MAX_FACTOR)
         colour = np.concatenate([colour, np.ones((count, 1), np.float32)], 1) if colour.shape[1] == 3 else colour
     material = primitive.get("material", len(materials) - 1)
+    if "material" in primitive:
+        document.entry("materials", material)
     part = Part(name, position, np.zeros((count, 3), np.float32), None, uv, colour, np.ascontiguousarray(faces, np.int32), material)
     if "NORMAL" in attributes:
         inverse = np.linalg.pinv(matrix[:3, :3])
@@ -208,6 +249,21 @@ def _part(document: Document, name: str, primitive: dict[str, Any], matrix: NDAr
         return part
     frames = tangents(part.position, part.normal, uv[normal_map.uv], part.faces)
     return replace(_rows(part, frames.source), tangent=frames.tangent, faces=frames.faces)
+
+
+def _width_name(key: str) -> str | None:
+    """The entry of `WIDTHS` for a vertex attribute; None of those that are not read."""
+    name = "TEXCOORD_" if key.startswith("TEXCOORD_") else key
+    return name if name in WIDTHS else None
+
+
+def _attribute(document: Document, key: str, index: int) -> NDArray[Any]:
+    """Values of a vertex attribute. Raises ValueError unless it has a width that the specification gives it."""
+    values = document.accessor(index)
+    widths = WIDTHS[_width_name(key) or key]
+    if values.ndim != 2 or values.shape[1] not in widths:
+        raise ValueError(f"{key} has rows of the shape {values.shape[1:]}")
+    return values
 
 
 def _rows(part: Part, source: NDArray[Any]) -> Part:
@@ -245,17 +301,17 @@ def _material(document: Document, entry: dict[str, Any]) -> Material:
     surface = entry.get("pbrMetallicRoughness", {})
     extensions = entry.get("extensions", {})
     found = {role: _use(document, info) for role, info in texture_infos(entry).items()}
-    strength = float(extensions.get("KHR_materials_emissive_strength", {}).get("emissiveStrength", 1.0))
+    strength = _number(extensions.get("KHR_materials_emissive_strength", {}).get("emissiveStrength", 1.0))
     return Material(
         name=str(entry.get("name", "")),
         base_color=_numbers(surface.get("baseColorFactor", (1, 1, 1, 1)), 4),
-        roughness=float(surface.get("roughnessFactor", 1.0)),
-        metallic=float(surface.get("metallicFactor", 1.0)),
+        roughness=_number(surface.get("roughnessFactor", 1.0)),
+        metallic=_number(surface.get("metallicFactor", 1.0)),
         emissive=tuple(strength * x for x in _numbers(entry.get("emissiveFactor", (0, 0, 0)), 3)),
-        normal_scale=float((entry.get("normalTexture") or {}).get("scale", 1.0)),
-        occlusion_strength=float((entry.get("occlusionTexture") or {}).get("strength", 1.0)),
+        normal_scale=_number((entry.get("normalTexture") or {}).get("scale", 1.0)),
+        occlusion_strength=_number((entry.get("occlusionTexture") or {}).get("strength", 1.0)),
         alpha_mode=str(entry.get("alphaMode", "OPAQUE")),
-        alpha_cutoff=float(entry.get("alphaCutoff", 0.5)),
+        alpha_cutoff=_number(entry.get("alphaCutoff", 0.5)),
         double_sided=bool(entry.get("doubleSided", False)),
         unlit="KHR_materials_unlit" in extensions,
         textures={role: use for role, use in found.items() if use is not None},
@@ -267,22 +323,32 @@ def _use(document: Document, info: dict[str, Any]) -> TextureUse | None:
     image = texture_source(document.json, info["index"])
     if image is None:
         return None
-    if not 0 <= image < len(document.json.get("images", [])):
-        raise ValueError(f"texture {info['index']} names an image that does not exist")
+    document.entry("images", image)
     moved = info.get("extensions", {}).get("KHR_texture_transform", {})
-    (sx, sy), (ox, oy), angle = _numbers(moved.get("scale", (1, 1)), 2), _numbers(moved.get("offset", (0, 0)), 2), moved.get("rotation", 0)
+    (sx, sy), (ox, oy), angle = (
+        _numbers(moved.get("scale", (1, 1)), 2),
+        _numbers(moved.get("offset", (0, 0)), 2),
+        _number(moved.get("rotation", 0)),
+    )
     c, s = math.cos(angle), math.sin(angle)
     # translation · rotation · scale; the rotation is counter-clockwise in the image, whose v points down
     transform = np.array([[c * sx, s * sy, ox], [-s * sx, c * sy, oy]])
-    texture = document.json["textures"][info["index"]]
-    sampler = document.json["samplers"][texture["sampler"]] if "sampler" in texture else {}
+    texture = document.entry("textures", info["index"])
+    sampler = document.entry("samplers", texture["sampler"]) if "sampler" in texture else {}
     uv = moved.get("texCoord", info.get("texCoord", 0))
     return TextureUse(image, int(uv), transform, (sampler.get("wrapS", 10497), sampler.get("wrapT", 10497)))
 
 
 def _numbers(values: Any, count: int) -> tuple[float, ...]:
-    """`count` finite numbers. Raises ValueError."""
-    out = tuple(float(v) for v in values)
-    if len(out) != count or not all(math.isfinite(v) for v in out):
-        raise ValueError(f"{values} are not {count} numbers")
+    """`count` numbers. Raises ValueError."""
+    out = tuple(_number(v) for v in values)
+    if len(out) != count:
+        raise ValueError(f"{len(out)} numbers instead of {count}")
     return out
+
+
+def _number(value: Any) -> float:
+    """A number of at most `MAX_FACTOR`. Raises ValueError."""
+    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= MAX_FACTOR:
+        raise ValueError(f"{str(value)[:50]!r} is no number of at most {MAX_FACTOR:g}")
+    return float(value)

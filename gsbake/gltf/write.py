@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from gsbake.gltf.buffer import MESHOPT, Buffer
 from gsbake.gltf.container import pack_glb
-from gsbake.gltf.document import image_format
 from gsbake.gltf.quantise import QUANTIZATION, Placement, signed, unsigned, with_area
+from gsbake.imaging.encoded import image_format
 
 LINEAR, LINEAR_MIPMAP_LINEAR, CLAMP = 9729, 9987, 33071
 WEBP, BASISU, LOD = "EXT_texture_webp", "KHR_texture_basisu", "MSFT_lod"

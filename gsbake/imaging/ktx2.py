@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 MAGIC = b"\xabKTX 20\xbb\r\n\x1a\n"
-#: Largest edge that is decoded, in pixels.
+#: Largest edge that is decoded, in pixels: no graphics processor takes a larger texture.
 MAX_EDGE = 16_384
 #: Effort of the encoders, 0..10, and zstd's level for UASTC.
 EFFORT, ZSTD_LEVEL = 2, 18

@@ -17,10 +17,12 @@ from pathlib import Path
 from blake3 import blake3
 
 from gsbake.atomic import write_atomic
+from gsbake.system.names import is_digest
 
 #: Minimum time since the last modification, in seconds, for a digest to be cached. FAT has the coarsest timestamps, 2 s.
 MIN_FILE_AGE = 2.5
 
+_STAMP_LENGTH = 5
 _MMAP_MIN_SIZE = 1 << 20  # bytes; smaller files are read faster than mapped
 
 
@@ -66,6 +68,15 @@ def file_stamps(paths: Iterable[Path]) -> dict[Path, tuple[int, ...] | None]:
 
 def _stamp(status: os.stat_result) -> tuple[int, ...]:
     return status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns, status.st_ctime_ns
+
+
+def is_digest_cache(path: Path) -> bool:
+    """Whether a file is a stored digest cache: {path: [stamp…, digest]}."""
+    with suppress(OSError, ValueError, RecursionError):
+        body = json.loads(path.read_bytes())
+        rows = body.values() if isinstance(body, dict) else [None]
+        return all(isinstance(row, list) and len(row) == _STAMP_LENGTH + 1 and is_digest(row[-1]) for row in rows)
+    return False
 
 
 class DigestCache:

@@ -10,7 +10,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from gsbake.errors import GsbakeError, InterruptedRun
+from gsbake.errors import GsbakeError, InterruptedRun, UsageError
+from gsbake.own_files import SET_ASIDE
 from gsbake.pipeline.digest import file_stamps
 from gsbake.pipeline.events import EventLog, now
 from gsbake.pipeline.files import disk_error, ensure_output_folder, remove_tree
@@ -19,10 +20,12 @@ from gsbake.pipeline.lease import Lease, LeaseHolder
 from gsbake.pipeline.machine import host_info, versions
 from gsbake.pipeline.plan import Planner, Request, StageState
 from gsbake.pipeline.registry import Registry
-from gsbake.pipeline.shared_store import SharedStore, StoreUnreachableError
+from gsbake.pipeline.shared_store import SharedStore
 from gsbake.pipeline.stage import Stage
-from gsbake.pipeline.store import Artifact, Store
+from gsbake.pipeline.store import Artifact, Store, lease_path
+from gsbake.pipeline.store_files import StoreUnreachableError
 from gsbake.pipeline.supervise import Outcome, StageFailed, StopSignals, supervise
+from gsbake.pipeline.uses import Uses, forget_killed
 from gsbake.pipeline.worker import Job
 from gsbake.text import printable, shortlist, summarise
 
@@ -74,6 +77,8 @@ class Engine:
         self.store = Store(request.out)
         self.planner = Planner(request, self.store)
         self.events = EventLog(request.out / "events.jsonl")
+        #: Artifacts that are not deleted meanwhile; to be entered by who reads them after a run.
+        self.uses = Uses(request.out)
         #: Called before a stage starts to compute, with a function that raises InterruptedRun on a stop request.
         self.before_stage: Callable[[Stage, Callable[[], None]], None] = lambda stage, check: None
         #: Stages that the present or last run has finished, whether or not it went on to the end.
@@ -93,9 +98,10 @@ class Engine:
         """
         stages = self.registry.up_to(until)
         try:
-            ensure_output_folder(self.request.out)
-            with StopSignals() as stop:
-                return self._run(stages, stop, on_accepted or (lambda: None))
+            with StopSignals() as stop, self.uses:
+                fault = self._look_at_shared_store()
+                ensure_output_folder(self.request.out)
+                return self._run(stages, stop, on_accepted or (lambda: None), fault)
         except GsbakeError as error:
             self.events.write("run ended", error=type(error).__name__, message=str(error), exit_code=error.exit_code)
             raise
@@ -107,10 +113,15 @@ class Engine:
         finally:
             self.store.digests.save()
 
-    def _run(self, stages: list[Stage], stop: StopSignals, on_accepted: Callable[[], None]) -> list[StageState]:
+    def _run(
+        self, stages: list[Stage], stop: StopSignals, on_accepted: Callable[[], None], fault: StoreUnreachableError | None
+    ) -> list[StageState]:
         start = time.perf_counter()
+        forget_killed(self.request.out)
         self.events.write("run started", stages=[s.name for s in stages], seed=self.request.seed, device=self.request.device)
         self.observer.run_started(stages)
+        if fault is not None:
+            self._give_store_up(stages[0].name, fault)
         states = self.finished = []
         artifacts: dict[str, Artifact] = {}
         for stage in stages:
@@ -119,7 +130,7 @@ class Engine:
             state = self.planner.assess(stage, artifacts)
             if not states:
                 on_accepted()
-            if state.artifact is None:
+            if state.artifact is None or not (self.uses.add(state.artifact.folder) or state.artifact.replaced):
                 state = self._compute(stage, state, artifacts, stop)
             else:
                 self.store.mark_used(state.artifact)
@@ -133,19 +144,29 @@ class Engine:
         return states
 
     def _set_aside_unexpected(self, stage: Stage, artifacts: Mapping[str, Artifact]) -> None:
-        name, known = stage.name, all(need in artifacts for need in stage.needs)
-        moved = self.store.set_aside_unexpected(name, self.planner.cache_key(stage, artifacts) if known else None)
+        known = all(need in artifacts for need in stage.needs)
+        self.store.set_aside_unexpected(stage.name, self.planner.cache_key(stage, artifacts) if known else None)
+        self._report_moved(stage.name)
+
+    def _report_moved(self, name: str) -> None:
+        """Say which files were set aside, and where."""
+        moved = self.store.take_moved()
         if moved:
-            names, folder = shortlist([path.name for path in moved]), self.request.out / "unexpected"
-            text = printable(f"{names}: not part of the stage's output; moved to '{folder}'.")
-            self.events.write("warning", stage=name, text=text)
-            self.observer.warning(name, text)
+            folder = self.request.out / SET_ASIDE
+            self.warn(name, f"{shortlist([path.name for path in moved])}: not what the stage wrote; moved to '{folder}'.")
+
+    def warn(self, name: str, text: str) -> None:
+        """A warning that does not come from a stage's own work."""
+        text = printable(text)
+        self.events.write("warning", stage=name, text=text)
+        self.observer.warning(name, text)
 
     def _compute(self, stage: Stage, state: StageState, artifacts: Mapping[str, Artifact], stop: StopSignals) -> StageState:
         """Run a stage under its lease, unless another process has published its artifact meanwhile."""
         cache_key = state.cache_key
         assert cache_key is not None
-        lease = Lease(self.store.stage_folder(stage.name) / f"{cache_key.digest[:KEY_PREFIX_LENGTH]}.lease")
+        folder = self.store.folder(stage.name, cache_key.digest)
+        lease = Lease(lease_path(folder))
 
         def on_wait(holder: LeaseHolder | None) -> None:
             stop.check()
@@ -155,11 +176,12 @@ class Engine:
         with lease:
             if stale_holder is not None:
                 self.events.write("lease taken over", stage=stage.name, holder=str(stale_holder))
+            self.uses.add(folder)  # before the lease ends
             self.store.remove_leftovers(stage.name, cache_key.digest)
-            current = self.planner.assess(stage, artifacts)
-            if current.artifact is not None:
-                self.observer.stage_reused(current)
-                return current
+            state = self.planner.assess(stage, artifacts)
+            if state.artifact is not None:
+                self.observer.stage_reused(state)
+                return state
             fetched = self._fetch(stage, state, cache_key, stop)
             if fetched is not None:
                 self.observer.stage_reused(fetched)
@@ -183,15 +205,14 @@ class Engine:
             return None
         temporary = self.store.temporary(stage.name, cache_key.digest)
         try:
-            damaged = len(self.shared.damaged)
             manifest = self.shared.fetch(cache_key, temporary, stop.check)
-            for name in self.shared.damaged[damaged:]:
-                self._warn_of_store(stage.name, f"{name} was damaged and thrown away; the stage is computed again.")
+            self._report_store(stage.name, "thrown away; the stage is computed again")
             if manifest is None:
                 return None
             own = {name: value for name, value in manifest.items() if name not in ("files", "digest", "seal")}
             artifact = self.store.publish(temporary, self.store.folder(stage.name, cache_key.digest), own)
-        except StoreUnreachableError as error:
+            self._report_moved(stage.name)
+        except (StoreUnreachableError, UsageError) as error:
             self._give_store_up(stage.name, error)
             return None
         finally:
@@ -206,28 +227,41 @@ class Engine:
         if self.shared is None or state.artifact is None or state.cache_key is None:
             return None
         try:
-            damaged = len(self.shared.damaged)
             refused = self.shared.put(state.artifact, stop.check)
-            for name in self.shared.damaged[damaged:]:
-                self._warn_of_store(stage.name, f"{name} was damaged and replaced.")
+            self._report_store(stage.name, "replaced")
             if refused == "full":
                 self._warn_of_store(stage.name, "it is full; the output stays on this machine. `gsbake cache gc --store` makes room.")
             theirs = None if refused else self.shared.digest_of(state.cache_key, stop.check)
             if state.status == "run" and theirs is not None and theirs != state.artifact.digest:
                 fetched = self._fetch(stage, state, state.cache_key, stop)
                 return None if fetched is None else fetched.artifact
-        except (StoreUnreachableError, PermissionError) as error:
+        except (StoreUnreachableError, UsageError) as error:
             self._give_store_up(stage.name, error)
         return None
 
+    def _look_at_shared_store(self) -> StoreUnreachableError | None:
+        """What keeps the shared store from being used; None where nothing does. Raises UsageError for a folder that is none."""
+        try:
+            if self.shared is not None:
+                self.shared.require()
+        except StoreUnreachableError as error:
+            return error
+        return None
+
     def _give_store_up(self, name: str, error: Exception) -> None:
-        self._warn_of_store(name, f"it does not answer ({error}); the run goes on without it.")
+        self._warn_of_store(name, f"it cannot be used ({error}); the run goes on without it.")
         self.shared = None
 
+    def _report_store(self, name: str, what: str) -> None:
+        """One warning about what was damaged in the shared store, and one for each of its notices."""
+        assert self.shared is not None
+        damaged, notices = self.shared.damaged, self.shared.notices
+        self.shared.damaged, self.shared.notices = [], []
+        for text in [f"{shortlist(damaged)}: damaged and {what}."] * bool(damaged) + notices:
+            self._warn_of_store(name, text)
+
     def _warn_of_store(self, name: str, what: str) -> None:
-        text = printable(f"Shared store '{self.shared.url if self.shared is not None else ''}': {what}")
-        self.events.write("warning", stage=name, text=text)
-        self.observer.warning(name, text)
+        self.warn(name, f"Shared store '{self.shared.url if self.shared is not None else ''}': {what}")
 
     def _execute(
         self, stage: Stage, state: StageState, cache_key: CacheKey, artifacts: Mapping[str, Artifact], stop: StopSignals, lease: Lease
@@ -256,6 +290,7 @@ class Engine:
             if not lease.held():
                 raise InterruptedRun("Another process took over the lease; the same command goes on with its result.")
             artifact = store.publish(temporary, store.folder(stage.name, cache_key.digest), manifest)
+            self._report_moved(stage.name)
         except StageFailed as error:
             raise StageFailed(f"{stage.title} failed: {error}; the traceback is in '{self._save_traceback(stage.name, error)}'.") from error
         except InterruptedRun as error:
@@ -287,6 +322,7 @@ class Engine:
     def _job(self, stage: Stage, out: Path, inputs: Mapping[str, Path], checkpoint: Path) -> Job:
         """The worker's job: run `stage` on `inputs` and write into the folder `out`."""
         request, cache = self.request, self.store.cache(stage.name)
+        self.uses.add(cache)
         with suppress(OSError):
             os.utime(cache)  # for the garbage collection
         schema = type(request.profile)

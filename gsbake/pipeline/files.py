@@ -17,6 +17,8 @@ from gsbake.system.disk import sync
 DISK_FULL = frozenset({errno.ENOSPC, errno.EDQUOT})
 #: errno values of a location without write access.
 NOT_WRITABLE = frozenset({errno.EROFS, errno.EACCES, errno.EPERM})
+#: errno values of a name that is taken or cannot be, which trying again does not change.
+LASTING = frozenset({errno.EEXIST, errno.ENOTDIR, errno.EISDIR, errno.ENAMETOOLONG, errno.ELOOP})
 #: errno values of a path that cannot be used as it is.
 _UNUSABLE = NOT_WRITABLE | {errno.ENAMETOOLONG, errno.ELOOP}
 

@@ -39,9 +39,14 @@ class Project:
         except ValidationError as error:
             first = error.errors(include_url=False, include_context=False, include_input=False)[0]
             where = ".".join(map(str, first["loc"])) or "the file"
-            raise BadInputError(f"'{path}' is damaged ({where}: {first['msg']}); delete it and give the photos again.") from error
+            raise BadInputError(
+                f"'{path}' is damaged or not gsbake's ({where}: {first['msg']}); name another folder, "
+                "or move it away and give the photos again."
+            ) from error
         except (OSError, ValueError, RecursionError) as error:
-            raise BadInputError(f"'{path}' cannot be read ({error}); delete it and give the photos again.") from error
+            raise BadInputError(
+                f"'{path}' cannot be read ({error}); name another folder, or move it away and give the photos again."
+            ) from error
 
     def save(self, out: Path) -> None:
         """Write the file if its content changes."""

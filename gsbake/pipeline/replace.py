@@ -13,15 +13,20 @@ from gsbake.pipeline.digest import list_files, tree_digest
 from gsbake.pipeline.events import now
 from gsbake.pipeline.files import remove_tree
 from gsbake.pipeline.lease import Lease
-from gsbake.pipeline.store import MANIFEST, REPLACEMENT, REPLACEMENT_PREFIX, Artifact, Store
+from gsbake.pipeline.store import MANIFEST, REPLACEMENT, REPLACEMENT_PREFIX, Artifact, Store, read_manifest
+from gsbake.system.names import unusable_name
 
 
 def replace_output(store: Store, stage: str, files: Mapping[str, Path], base: Artifact | None) -> Artifact:
     """Replace a stage's output by `files` ({name in the artifact: the user's file}).
 
     Files of `base` (the current output) that are not replaced are kept. The user's files are copied, so they may be edited or deleted
-    afterwards.
+    afterwards. Those of an earlier replacement are set aside, for they may be the only copy; `store.take_moved` says where. Raises
+    UsageError for names that cannot be files on every system.
     """
+    bad = unusable_name([*files, MANIFEST])
+    if bad is not None:
+        raise UsageError(f"{bad} cannot be the name of a file in a stage's output on every system; rename it.")
     with _lease(store, stage):
         store.remove_leftovers(stage, REPLACEMENT_PREFIX)
         temporary = store.temporary(stage, REPLACEMENT_PREFIX)
@@ -50,18 +55,18 @@ def replace_output(store: Store, stage: str, files: Mapping[str, Path], base: Ar
             if temporary.exists():
                 remove_tree(temporary)
         write_atomic(store.stage_folder(stage) / REPLACEMENT, json.dumps({"folder": final.name}), durable=True)
-        _remove_other_replacements(store, stage, final.name)
+        _set_other_replacements_aside(store, stage, final.name)
     store.digests.save()
     return artifact
 
 
 def undo_replacement(store: Store, stage: str) -> None:
-    """Restore the stage's own output. Raises UsageError when it was not replaced."""
+    """Restore the stage's own output; the user's files are set aside. Raises UsageError when it was not replaced."""
     record = store.stage_folder(stage) / REPLACEMENT
     if store.replacement(stage) is None:
         raise UsageError(f"The output of stage '{stage}' in '{store.out}' was not replaced; there is nothing to undo.")
     with _lease(store, stage):
-        _remove_other_replacements(store, stage, "")  # before the record: interrupted between the two, the loss is reported
+        _set_other_replacements_aside(store, stage, "")  # before the record: interrupted between the two, the loss is reported
         record.unlink(missing_ok=True)
 
 
@@ -76,7 +81,9 @@ def _lease(store: Store, stage: str) -> Lease:
     return lease
 
 
-def _remove_other_replacements(store: Store, stage: str, keep: str) -> None:
+def _set_other_replacements_aside(store: Store, stage: str, keep: str) -> None:
     for entry in store.stage_folder(stage).glob(f"{REPLACEMENT_PREFIX}-*"):
         if entry.is_dir() and entry.name != keep:
+            manifest = read_manifest(entry) or {}
+            store.set_aside_changed(entry, given=manifest.get("replaced", ()))
             remove_tree(entry)

@@ -4,6 +4,8 @@ A stage fills a temporary folder beside the final one (same file system), which 
 a final name is complete even after a crash. The manifest lists the digests of its files; they are checked at every look-up. An artifact is
 exactly the files of its manifest: a modified, damaged, missing or added file invalidates it. The digest cache answers for files whose
 size, times and inode are unchanged; `verify` reads every byte.
+
+Files of the user's are never deleted: an edited or added file that has to make room for an output is moved to OUT/set-aside/.
 """
 
 from __future__ import annotations
@@ -12,7 +14,7 @@ import json
 import os
 import re
 import uuid
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -21,10 +23,12 @@ from typing import Any
 from blake3 import blake3
 
 from gsbake.atomic import write_atomic
+from gsbake.own_files import FILE_MANAGER_FILES, SET_ASIDE, set_aside
 from gsbake.pipeline.digest import DigestCache, tree_digest
 from gsbake.pipeline.files import remove_tree, sync_tree
 from gsbake.pipeline.key import KEY_PREFIX_LENGTH, CacheKey
 from gsbake.system import disk
+from gsbake.system.names import is_digest, unusable_name
 
 MANIFEST = "manifest.json"
 #: Name of the folder of parts of a stage's work that later runs use again.
@@ -34,9 +38,15 @@ REPLACEMENT = "replaced.json"
 REPLACEMENT_PREFIX = "by-hand"
 #: Folder name of a computed artifact, and of a replacement.
 ARTIFACT_FOLDER = re.compile(rf"[0-9a-f]{{{KEY_PREFIX_LENGTH}}}")
+#: Name of a temporary folder of an artifact or a replacement, and of an incomplete lease file.
+TEMPORARY_FOLDER = re.compile(rf"([0-9a-f]{{{KEY_PREFIX_LENGTH}}}|{REPLACEMENT_PREFIX})\.tmp-[0-9a-f]{{8}}")
+LEASE_LEFTOVER = re.compile(rf"\.([0-9a-f]{{{KEY_PREFIX_LENGTH}}}|{REPLACEMENT_PREFIX})\.lease\.[0-9a-f.]{{1,64}}\.tmp")
 _REPLACEMENT_FOLDER = re.compile(rf"{REPLACEMENT_PREFIX}-[0-9a-f]{{8}}")
-#: Files that file managers leave in folders they show; no stage reads them.
-_FILE_MANAGER_FILES = frozenset({".DS_Store", "Thumbs.db", "desktop.ini", ".directory"})
+#: Kinds of a manifest's fields that may be absent.
+_KINDS: Mapping[str, type] = {
+    "settings": dict, "inputs": dict, "results": dict, "parts": dict, "host": dict, "versions": dict, "decisions": list, "warnings": list,
+    "stage": str, "key": str,
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -72,6 +82,7 @@ class Store:
     def __init__(self, out: Path) -> None:
         self.out = out
         self.digests = DigestCache(out / "digests.json")
+        self._moved: list[Path] = []
 
     def stage_folder(self, stage: str) -> Path:
         """Folder with all artifacts of a stage."""
@@ -157,7 +168,10 @@ class Store:
         return folder
 
     def publish(self, temporary: Path, final: Path, manifest: Mapping[str, Any]) -> Artifact:
-        """Publish the folder `temporary` as the artifact `final`; digests and sizes of its files are added to the manifest."""
+        """Publish the folder `temporary` as the artifact `final`; digests and sizes of its files are added to the manifest.
+
+        What was edited or added by hand in a folder of that name is set aside; see `take_moved`.
+        """
         sync_tree(temporary)
         names = [name for name in _list_all(temporary) if name != MANIFEST]
         files = self.digests.files(temporary, names)
@@ -166,7 +180,8 @@ class Store:
         body["seal"] = _seal(body)
         write_atomic(temporary / MANIFEST, json.dumps(body, indent=1), durable=True)
         disk.sync(temporary)
-        if final.exists():  # a damaged artifact, or one of other schema defaults
+        if final.exists():  # a damaged or edited artifact, or one of other schema defaults
+            self.set_aside_changed(final)
             old = final.with_name(f"{final.name}.tmp-{uuid.uuid4().hex[:8]}")
             disk.replace(final, old)
             disk.replace(temporary, final)
@@ -178,12 +193,25 @@ class Store:
 
     def remove_leftovers(self, stage: str, key: str) -> None:
         """Delete temporary files of killed runs for this key; the caller holds its lease."""
-        with suppress(FileNotFoundError):
-            for entry in self.stage_folder(stage).iterdir():
-                if entry.name.startswith(f"{key[:KEY_PREFIX_LENGTH]}.tmp-"):
-                    remove_tree(entry)
-                elif entry.name.startswith(f".{key[:KEY_PREFIX_LENGTH]}.") and entry.suffix == ".tmp":  # an incomplete lease file
-                    entry.unlink(missing_ok=True)
+        prefix = key[:KEY_PREFIX_LENGTH]
+        for entry in self.own_entries(stage):
+            if TEMPORARY_FOLDER.fullmatch(entry.name) and entry.name.startswith(prefix) and entry.is_dir():
+                remove_tree(entry)
+            elif LEASE_LEFTOVER.fullmatch(entry.name) and entry.name.startswith(f".{prefix}.") and entry.is_file():
+                entry.unlink(missing_ok=True)
+
+    def own_entries(self, stage: str) -> list[Path]:
+        """What is in a stage's folder, without links; nothing where the folder itself is one, or `stages/`, because it may be anybody's."""
+        if self.behind_link(stage) is not None:
+            return []
+        with suppress(FileNotFoundError, NotADirectoryError):
+            return [entry for entry in sorted(self.stage_folder(stage).iterdir()) if not entry.is_symlink()]
+        return []
+
+    def behind_link(self, stage: str) -> Path | None:
+        """The link that the stage's folder is or lies behind, inside the output folder."""
+        folder = self.stage_folder(stage)
+        return next((path for path in (folder.parent, folder) if path.is_symlink()), None)
 
     def verify(self, stage: str) -> list[tuple[Path, list[str]]]:
         """(folder, faults) of every artifact and replacement of a stage, from the bytes on the disk."""
@@ -203,8 +231,8 @@ class Store:
             return [e for e in entries if e.is_dir() and (ARTIFACT_FOLDER.fullmatch(e.name) or _REPLACEMENT_FOLDER.fullmatch(e.name))]
         return []
 
-    def set_aside_unexpected(self, stage: str, cache_key: CacheKey | None) -> list[Path]:
-        """Move files that the manifest does not list from the artifact that a run uses to OUT/unexpected/; returns where they went.
+    def set_aside_unexpected(self, stage: str, cache_key: CacheKey | None) -> None:
+        """Move files that the manifest does not list from the artifact that a run uses to OUT/set-aside/; see `take_moved`.
 
         Such a file would be read by later stages although no cache key accounts for it. The artifact is the user's replacement, else that
         of the key; others are not looked at.
@@ -213,24 +241,43 @@ class Store:
         with suppress(_DamagedRecordError):  # reported at the look-up
             folder = self.replacement_folder(stage) or (self.folder(stage, cache_key.digest) if cache_key is not None else None)
         manifest = None if folder is None else read_manifest(folder)
-        if folder is None or manifest is None:
-            return []
-        moved = []
-        for name in _unexpected(folder, manifest):
-            target = self.out / "unexpected" / stage / folder.name / name
-            while target.exists() or target.is_symlink():
-                target = target.with_name(f"{target.name}~")
-            target.parent.mkdir(parents=True, exist_ok=True)
-            (folder / name).rename(target)
-            moved.append(target)
+        if folder is not None and manifest is not None:
+            self._set_aside(folder, _unexpected(folder, manifest))
+
+    def set_aside_changed(self, folder: Path, given: Iterable[str] = ()) -> None:
+        """Move the files of an artifact's folder that a stage did not write, or not as they are, to OUT/set-aside/, before the folder is
+        deleted: files edited or added by hand, those that the user has `given`, and all where the manifest is damaged."""
+        manifest = read_manifest(folder)
+        if manifest is None:
+            self._set_aside(folder, _list_all(folder))
+            return
+        changed = [name for name, entry in manifest["files"].items() if name in given or self._is_edited(folder, name, entry)]
+        self._set_aside(folder, [*_unexpected(folder, manifest), *changed])
+
+    def take_moved(self) -> list[Path]:
+        """Where the files lie that were set aside since the last call."""
+        moved, self._moved = self._moved, []
         return moved
+
+    def _set_aside(self, folder: Path, names: Iterable[str]) -> None:
+        target = self.out / SET_ASIDE / folder.parent.name / folder.name
+        self._moved += [set_aside(folder / name, target / name) for name in names if os.path.lexists(folder / name)]
+
+    def _is_edited(self, folder: Path, name: str, entry: Mapping[str, Any]) -> bool:
+        try:
+            return not self._is_intact(folder, name, entry)
+        except (OSError, ValueError):
+            return True
+
+    def _is_intact(self, folder: Path, name: str, entry: Mapping[str, Any]) -> bool:
+        """Whether a file is as its manifest says. Raises OSError where it cannot be read, ValueError for a name that no file can have."""
+        return os.path.getsize(folder / name) == entry["bytes"] and self.digests.file(folder / name) == str(entry["digest"])
 
     def _file_faults(self, folder: Path, manifest: Mapping[str, Any]) -> list[str]:
         faults = [f"{name} in '{folder}' was added" for name in _unexpected(folder, manifest)]
         for name, entry in manifest.get("files", {}).items():
-            path = folder / name
             try:
-                intact = os.path.getsize(path) == entry["bytes"] and self.digests.file(path) == entry["digest"]
+                intact = self._is_intact(folder, name, entry)
             except (OSError, ValueError):  # ValueError: a name that no file can have
                 faults.append(f"{name} is missing in '{folder}'")
                 continue
@@ -244,12 +291,18 @@ class Store:
         return Artifact(folder, files, manifest, replaced=bool(manifest.get("replaced")))
 
 
+def lease_path(folder: Path) -> Path:
+    """The lease file of an artifact, replacement, checkpoint or temporary folder."""
+    prefix = REPLACEMENT_PREFIX if folder.name.startswith(REPLACEMENT_PREFIX) else folder.name[:KEY_PREFIX_LENGTH]
+    return folder.with_name(f"{prefix}.lease")
+
+
 def _list_all(folder: Path) -> list[str]:
     """Sorted relative POSIX names of all files, hidden ones included, and of links to folders; without those of file managers."""
     found = []
     for root, folders, names in os.walk(folder):
         links = [name for name in folders if os.path.islink(os.path.join(root, name))]
-        found += [Path(root, name).relative_to(folder).as_posix() for name in [*names, *links] if name not in _FILE_MANAGER_FILES]
+        found += [Path(root, name).relative_to(folder).as_posix() for name in [*names, *links] if name not in FILE_MANAGER_FILES]
     return sorted(found)
 
 
@@ -274,16 +327,20 @@ def parse_manifest(content: bytes) -> dict[str, Any] | None:
         intact = isinstance(body, dict) and body.get("seal") == _seal(body)
     except (ValueError, RecursionError):
         return None
-    return body if intact and _well_formed(body.get("files")) and isinstance(body.get("settings", {}), dict) else None
+    return body if intact and _well_formed(body) else None
 
 
-def _well_formed(files: object) -> bool:
-    """Whether a manifest's list of files has digests and sizes, and names inside the artifact's folder only."""
-    if not isinstance(files, dict):
+def _well_formed(body: Mapping[str, Any]) -> bool:
+    """Whether a manifest's fields are of the kinds that gsbake writes, and its files have digests, sizes, and names of files that can lie
+    together in the artifact's folder. The seal does not tell: anybody can make one."""
+    files, inputs = body.get("files"), body.get("inputs", {})
+    if not isinstance(files, dict) or not all(isinstance(body.get(name, kind()), kind) for name, kind in _KINDS.items()):
         return False
-    inside = all(not name.startswith("/") and ".." not in name.split("/") and not {"\\", ":"} & set(name) for name in files)
     entries = [entry if isinstance(entry, dict) else {} for entry in files.values()]
-    return inside and all(isinstance(e.get("digest"), str) and isinstance(e.get("bytes"), int) for e in entries)
+    sized = all(is_digest(e.get("digest")) and type(e.get("bytes")) is int and e["bytes"] >= 0 for e in entries)
+    nested = [entry for known in inputs.values() for entry in (known, isinstance(known, dict) and known.get("files", {}))]
+    named = MANIFEST not in files and unusable_name([*files, MANIFEST]) is None
+    return sized and named and all(isinstance(entry, dict) for entry in nested)
 
 
 def _seal(manifest: Mapping[str, Any]) -> str:

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from gsbake.gltf.container import pack_glb, unpack_glb
-from gsbake.gltf.document import decode_image
+from gsbake.imaging.encoded import decode_image
 from gsbake.imaging.jpeg import encode_jpeg
 
 #: Halvings of the images' edges and quality of JPEG, in turn.

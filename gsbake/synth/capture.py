@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import json
 import math
+import shutil
+import uuid
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -19,6 +21,7 @@ from gsbake.errors import UsageError
 from gsbake.geometry.cameras import Camera, CameraSet
 from gsbake.imaging.srgb import encode_bytes
 from gsbake.synth import scene
+from gsbake.synth.folder import TRUTH_IMAGES, replace_capture, require_capture_folder, unfinished_folders
 from gsbake.synth.shade import LightRig, render, studio_rig
 
 Array = NDArray[np.float64]
@@ -141,23 +144,36 @@ def write_capture(
     on which with `marker` a printed ArUco marker of `scene.MARKER_SIZE` units lies; `transforms.json` when `poses`; `truth/`: `mesh.ply`,
     `points.npz` (30 000 surface points with materials), `cameras.json` (`CameraSet`), and per photo `masks/`, `albedo/` and `emission/`
     (sRGB), `normal/` (world, coded 0..1), `orm/` (1, roughness, metallic; linear).
-    Equal arguments write equal bytes. Raises UsageError for fewer than 3 views or a size below 16.
+    Equal arguments write equal bytes. `synth.json` is the mark of the folder.
+    Raises UsageError for fewer than 3 views or a size below 16, and for a folder that holds other files, or photos that were edited.
     """
     if views < 3 or size < 16:
         raise UsageError(f"The built-in capture needs at least 3 views of 16 pixels, not {views} of {size}; increase --views or --size.")
+    require_capture_folder(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    for left in unfinished_folders(folder):
+        shutil.rmtree(left, ignore_errors=True)
+    new = folder / f".synth-{uuid.uuid4().hex[:8]}"
+    try:
+        _write(new, views, size, seed, poses, background or marker, scene.marker_cells() if marker else scene.NO_MARKER)
+        replace_capture(new, folder)
+    finally:
+        shutil.rmtree(new, ignore_errors=True)
+
+
+def _write(folder: Path, views: int, size: int, seed: int, poses: bool, background: bool, marker: NDArray[np.uint8]) -> None:
+    """Write the files of a capture into a new folder."""
     import trimesh
 
-    for name in ("images", "truth/masks", "truth/albedo", "truth/normal", "truth/orm", "truth/emission"):
-        (folder / name).mkdir(parents=True, exist_ok=True)
-    background = background or marker
+    truth = folder / "truth"
+    for path in (folder / "images", *(truth / kind for kind in TRUTH_IMAGES)):
+        path.mkdir(parents=True)
     cams = cameras(views, size, seed, background)
-    cells = scene.marker_cells() if marker else scene.NO_MARKER
     rig = studio_rig()
     with ThreadPoolExecutor(2) as pool:  # the renderer releases the GIL
-        list(pool.map(lambda camera: _write_view(folder, camera, rig, background, cells), cams))
+        list(pool.map(lambda camera: _write_view(folder, camera, rig, background, marker), cams))
     if poses:
         (folder / "transforms.json").write_bytes(json.dumps(_transforms(cams), indent=1).encode())
-    truth = folder / "truth"
     CameraSet(cams, poses="given").save(truth / "cameras.json")
     vertices, faces = true_mesh()
     trimesh.Trimesh(vertices, faces, process=False).export(truth / "mesh.ply")

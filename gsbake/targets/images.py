@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from gsbake.gltf.audit import MAX_NON_UNIT, non_unit_share
-from gsbake.gltf.document import decode_image
 from gsbake.gltf.encode import Bytes, TextureMaps, reduce_precision
 from gsbake.gltf.write import GltfTextures
+from gsbake.imaging.encoded import decode_image
 from gsbake.imaging.jpeg import encode_jpeg
 from gsbake.imaging.ktx2 import encode_ktx2
 from gsbake.imaging.png import encode_png

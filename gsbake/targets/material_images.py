@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from gsbake.gltf.document import image_format
 from gsbake.gltf.write import GltfTextures
+from gsbake.imaging.encoded import image_format
 
 SUFFIXES = {"png": "png", "jpeg": "jpg"}
 

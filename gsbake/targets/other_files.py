@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from gsbake.gltf.document import decode_image
 from gsbake.gltf.write import GltfMesh, GltfTextures
+from gsbake.imaging.encoded import decode_image
 from gsbake.imaging.png import encode_png
 from gsbake.targets.material_images import Images
 from gsbake.targets.usd import write_usd

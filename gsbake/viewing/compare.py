@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from gsbake.errors import BadInputError
+from gsbake.geometry.mesh_process import read_foreign_mesh
 from gsbake.geometry.surface_distance import surface_distances
 from gsbake.geometry.vectors import unit
 from gsbake.gltf.scene import Scene, open_scene
@@ -76,18 +77,7 @@ def open_surface(path: Path) -> Surface:
     """A mesh from a glTF, PLY, OBJ or STL file. Raises BadInputError."""
     if path.suffix.lower() in (".glb", ".gltf"):
         return surface_of(open_scene(path))
-    import trimesh
-
-    try:
-        mesh: Any = trimesh.load(path, force="mesh", process=False)
-        vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces)
-    except OSError as error:
-        raise BadInputError(f"'{path}' cannot be read: {error.strerror or error}.") from error
-    except Exception as error:  # the readers of trimesh raise what they come across
-        raise BadInputError(f"'{path}' is not a readable mesh ({' '.join(repr(error).split())[:120]}).") from error
-    if len(faces) == 0 or not np.isfinite(vertices).all() or faces.min() < 0 or faces.max() >= len(vertices):
-        raise BadInputError(f"'{path}' holds no triangles, or vertices that are not finite.")
-    return Surface(vertices, faces)
+    return Surface(*read_foreign_mesh(path))
 
 
 def compare_surfaces(first: Surface, second: Surface, points: int = SURFACE_POINTS) -> dict[str, float]:

@@ -10,8 +10,9 @@ import numpy as np
 
 from gsbake.config.schema import Export
 from gsbake.gltf.audit import as_json, audit
-from gsbake.gltf.document import decode_image, image_format
 from gsbake.gltf.scene import Scene, open_scene
+from gsbake.imaging.encoded import image_format
+from gsbake.imaging.image_process import read_image
 
 
 def inspect_file(path: Path) -> dict[str, Any]:
@@ -54,7 +55,7 @@ def inspect_file(path: Path) -> dict[str, Any]:
         "texture_bytes": sum(t["bytes"] for t in textures),
         "gpu_megabytes": sum(t["width"] * t["height"] * 4 * 4 / 3 for t in textures) / 1e6,
         "notes": list(scene.notes),
-        "audit": as_json(audit(data, path.name, limits.max_megabytes, limits.max_triangles)) if data[:4] == b"glTF" else [],
+        "audit": as_json(audit(data, path.name, limits.max_megabytes, limits.max_triangles, foreign=True)) if data[:4] == b"glTF" else [],
     }
 
 
@@ -86,7 +87,7 @@ def _textures(scene: Scene) -> list[dict[str, Any]]:
     for index, names in sorted(roles.items()):
         with scene.document.readable():
             content = scene.document.image(index)
-        pixels = decode_image(content, f"image {index} of '{scene.document.name}'")
+        pixels = read_image(content, f"image {index} of '{scene.document.name}'")
         out.append(
             {
                 "image": index,

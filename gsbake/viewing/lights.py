@@ -6,7 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from gsbake.errors import BadInputError, UsageError
+from gsbake.errors import UsageError
+from gsbake.imaging.image_process import read_light
 from gsbake.report.lights import PROCEDURAL_LIGHTS, LitShader, procedural
 from gsbake.shading.environment import EnvironmentLight
 
@@ -14,6 +15,13 @@ from gsbake.shading.environment import EnvironmentLight
 FACE_SIZE = 64
 #: Name of the light beside a file, as the export writes it.
 LIGHT_FILE = "light.hdr"
+
+
+def light_files(light: str, beside: Path) -> tuple[Path, ...]:
+    """The file of a light as `load_light` takes it; none of a procedural one."""
+    if light.lower() in map(str.lower, PROCEDURAL_LIGHTS):
+        return ()
+    return (beside / LIGHT_FILE if light == "hdr" else Path(light),)
 
 
 def load_light(light: str, beside: Path) -> LitShader:
@@ -24,16 +32,10 @@ def load_light(light: str, beside: Path) -> LitShader:
     named = {name.lower(): name for name in PROCEDURAL_LIGHTS}
     if light.lower() in named:
         return procedural(named[light.lower()])
-    path = beside / LIGHT_FILE if light == "hdr" else Path(light)
+    (path,) = light_files(light, beside)
     if not path.is_file():
         if light == "hdr":
             raise UsageError(f"There is no {LIGHT_FILE} in '{beside}'; name an HDR image with --light, or use --light studio.")
         raise UsageError(f"The light '{light}' is neither {', '.join(named)} or hdr nor an image.")
-    import OpenImageIO as oiio
-
-    source = oiio.ImageInput.open(str(path))
-    pixels = None if source is None else source.read_image(oiio.FLOAT)
-    if source is None or pixels is None or pixels.ndim != 3 or pixels.shape[2] < 3 or not np.isfinite(pixels).all():
-        raise BadInputError(f"'{path}' is not a readable HDR image of three channels ({oiio.geterror().strip() or 'damaged'}).")
-    image = np.maximum(pixels[..., :3], 0).astype(np.float64)
+    image = np.maximum(read_light(path), 0).astype(np.float64)
     return LitShader(EnvironmentLight.from_equirectangular(image, FACE_SIZE, convention="gltf"))

@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 from gsbake.geometry.cameras import Camera
 from gsbake.geometry.raycast import RayCaster
 from gsbake.geometry.vectors import unit
-from gsbake.gltf.document import decode_image
 from gsbake.gltf.scene import Scene, TextureUse
+from gsbake.imaging.encoded import image_size
+from gsbake.imaging.image_process import read_image
 from gsbake.imaging.sampling import bilinear
 from gsbake.imaging.srgb import decode_bytes
 from gsbake.report.render import (
@@ -35,6 +36,8 @@ MAX_LAYERS = 8
 #: Transmittance below which a ray ends.
 OPAQUE = 1e-3
 CLAMP, MIRROR = 33071, 33648
+#: Bytes per pixel and use of an image: values in single precision, its mip levels, and a copy while they are made.
+TEXTURE_BYTES = 48
 
 
 class SceneRenderer:
@@ -42,6 +45,7 @@ class SceneRenderer:
 
     def __init__(self, scene: Scene, threads: int | None = None) -> None:
         self.scene = scene
+        self._count_textures()
         vertices, faces = scene.vertices, scene.faces
         self._caster = RayCaster(vertices, faces, threads)
         self._vertices = vertices
@@ -53,6 +57,15 @@ class SceneRenderer:
         low, high = vertices.min(0), vertices.max(0)
         self.centre: NDArray[np.float64] = (low + high) / 2
         self.radius = max(float(np.linalg.norm(vertices - self.centre, axis=1).max()), 1e-30)
+
+    def _count_textures(self) -> None:
+        """Spend the memory of all textures in use, from their headers. Raises BadInputError."""
+        document = self.scene.document
+        used = {(use.image, role) for part in self.scene.parts for role, use in self.scene.materials[part.material].textures.items()}
+        with document.readable():
+            for image in {image for image, _ in used}:
+                size = image_size(document.image(image), f"image {image} of '{document.name}'")
+                document.spend(size.width * size.height * TEXTURE_BYTES * sum(found == image for found, _ in used))
 
     def draw(self, camera: Camera, shader: Shader, samples: int = 2) -> RenderedImage:
         """Render from `camera` (the scene's frame) with samples² rays per pixel."""
@@ -167,7 +180,7 @@ class SceneRenderer:
         document = self.scene.document
         with document.readable():
             content = document.image(image)
-        pixels = decode_image(content, f"image {image} of '{document.name}'")
+        pixels = read_image(content, f"image {image} of '{document.name}'")
         if role in ("base_color", "emissive"):
             alpha = pixels[..., 3:].astype(np.float32) / np.float32(255)
             return np.concatenate([decode_bytes(pixels[..., :3]), alpha], -1)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator
+import uuid
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 
 import cv2
@@ -14,6 +15,7 @@ from PIL import Image
 from gsbake.errors import BadInputError, UsageError
 from gsbake.geometry.cameras import Camera
 from gsbake.imaging.png import encode_png
+from gsbake.own_files import require_new_file
 from gsbake.report.render import Shader
 from gsbake.viewing.render import SceneRenderer
 
@@ -50,18 +52,24 @@ def frames(renderer: SceneRenderer, cameras: Iterable[Camera], shader: Shader, s
         yield np.asarray(np.rint(255 * renderer.draw(camera, shader, samples).over(BACKGROUND)), np.uint8)
 
 
-def check_output(path: Path) -> None:
-    """Raise UsageError unless the suffix names a format of turntables and the folder exists."""
-    if path.suffix.lower() not in SUFFIXES:
-        raise UsageError(f"A turntable is written as {', '.join(SUFFIXES)}, not '{path.suffix or path}'.")
+def check_output(
+    path: Path, inputs: Iterable[Path], *, overwrite: bool, what: str = "A turntable", suffixes: Sequence[str] = SUFFIXES
+) -> None:
+    """Raise UsageError unless the suffix is one of `suffixes`, the folder exists, and the file is none of the `inputs` and either new or to
+    be replaced."""
+    if path.suffix.lower() not in suffixes:
+        raise UsageError(f"{what} is written as {', '.join(suffixes)}, not '{path.suffix or path}'.")
     if not path.parent.is_dir():
         raise UsageError(f"The folder '{path.parent}' does not exist.")
+    require_new_file(path, inputs, overwrite=overwrite)
 
 
-def write_turntable(path: Path, images: Iterator[NDArray[np.uint8]], progress: Callable[[int], None] = lambda done: None) -> int:
+def write_turntable(
+    path: Path, images: Iterator[NDArray[np.uint8]], progress: Callable[[int], None] = lambda done: None, *, overwrite: bool = False
+) -> int:
     """Write the images in the format of the suffix of `path`; returns their number. Raises BadInputError when it cannot be written."""
-    check_output(path)
-    temporary = path.with_name(f".{path.stem}.partial{path.suffix.lower()}")
+    check_output(path, (), overwrite=overwrite)
+    temporary = path.with_name(f".{path.stem}.{uuid.uuid4().hex[:8]}{path.suffix.lower()}")
     try:
         count = _write(temporary, images, progress)
         temporary.replace(path)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -20,7 +21,7 @@ def make_capture(tmp_path: Path) -> Callable[..., Path]:
         folder = tmp_path / "captures" / name / "images"
         folder.mkdir(parents=True)
         for index in range(photos):
-            (folder / f"{seed}{index}.jpg").write_text(f"{name} {index}")
+            (folder / f"{seed}{index}.jpg").write_bytes(os.fsencode(f"{name} {index}"))
         return folder.parent
 
     return make

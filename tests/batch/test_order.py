@@ -36,13 +36,16 @@ def test_the_longest_captures_start_first(tmp_path: Path) -> None:
     pytest.importorskip("snakemake")
     jobs = [job(f"{name}1", seconds) for name, seconds in zip("abcdef", (30.0, 90.0, 10.0, 70.0, 50.0, 20.0), strict=True)]
     jobs.append(job("b2", 40.0, "b1"))
-    arguments = workflow._prepare(jobs, BatchOptions(tmp_path, "smoke"), workflow.Execution(1), tmp_path, "unused")
-    document = json.loads((tmp_path / "jobs.json").read_text())
+    work = tmp_path / "a #b"  # in no argument of Snakemake, which would read it as YAML
+    work.mkdir()
+    arguments = workflow._prepare(jobs, BatchOptions(work, "smoke"), workflow.Execution(1), work, "unused")
+    document = json.loads((work / "jobs.json").read_text())
     for row in document["jobs"]:
         row["shell"] = f"echo {row['id']} >> {tmp_path / 'log'}"
-    (tmp_path / "jobs.json").write_text(json.dumps(document))
+    (work / "jobs.json").write_text(json.dumps(document))
     done = subprocess.run(
-        python_command("-m", "snakemake", *arguments), env=python_environment(), capture_output=True, text=True, timeout=120, check=False
-    )
+        python_command("-m", "snakemake", *arguments), cwd=work, env=python_environment(), capture_output=True, text=True, timeout=120,
+        check=False,
+    )  # fmt: skip
     assert done.returncode == 0, done.stderr[-2000:]
     assert (tmp_path / "log").read_text().split() == ["b1", "d1", "e1", "b2", "a1", "f1", "c1"]

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from gsbake.batch.page import COLUMNS, Cell, Row, render
+from gsbake.batch.page import COLUMNS, Cell, Row, render, write_index
 
 #: A document of the page's rows that knows what the script asks for; prints the order of the names after each selection.
 _DOCUMENT = """
@@ -55,3 +55,16 @@ def test_the_page_needs_no_network_and_escapes_names() -> None:
     page = render([row("<b>&", 3), row("two", 4, "running")])
     assert "&lt;b&gt;&amp;" in page and "<b>" not in page and "1 done, 1 running, 0 failed" in page
     assert not re.search(r"(src|href)=\"(?!data:)[a-z]+:", page)
+
+
+def test_an_index_that_gsbake_did_not_write_stays(tmp_path: Path) -> None:
+    index = write_index([], tmp_path)
+    assert index == tmp_path / "index.html" and write_index([], tmp_path) == index
+    page = index.read_text()
+    for theirs in ("<h1>my page</h1>", page.replace("<body>", "<body>note to self")):
+        index.write_text(theirs)
+        assert write_index([], tmp_path) == write_index([], tmp_path) == tmp_path / "index.new.html"
+        assert index.read_text() == theirs and (tmp_path / "index.new.html").read_text() == page
+    index.unlink()
+    index.symlink_to(tmp_path / "elsewhere.html")
+    assert write_index([], tmp_path) == tmp_path / "index.new.html" and not (tmp_path / "elsewhere.html").exists()

@@ -61,6 +61,34 @@ def test_captures_of_one_name_are_refused(run: Run, make_capture: Make, tmp_path
     assert end.code == 2 and "same name 'one'" in end.err
 
 
+def test_folders_of_the_users_are_refused(run: Run, make_capture: Make, tmp_path: Path) -> None:
+    """Output folders that are the captures themselves, and a folder `.batch` of another program."""
+    scans = [make_capture("one"), make_capture("two")]
+    before = sorted(tmp_path.rglob("*"))
+    for command in ("plan", "batch"):
+        end = run(command, *scans, "--out", tmp_path / "captures")
+        assert end.code == 2 and end.err.count("\n") == 1 and "holds other files (images)" in end.err
+    assert sorted(tmp_path.rglob("*")) == before
+    (tmp_path / "root" / ".batch").mkdir(parents=True)
+    (tmp_path / "root" / ".batch" / "payroll.csv").write_text("mine")
+    end = run("batch", *scans, "--out", tmp_path / "root")
+    assert end.code == 2 and "payroll.csv" in end.err and [p.name for p in (tmp_path / "root").rglob("*")] == [".batch", "payroll.csv"]
+
+
+def test_a_result_that_was_published_beside_an_edited_one_counts(run: Run, make_capture: Make, tmp_path: Path) -> None:
+    capture, out = make_capture("one"), tmp_path / "out" / "one"
+    options = BatchOptions(tmp_path / "out", "smoke")
+    run("run", capture, "--profile", "smoke")
+    (out / "asset.glb").write_text("edited")
+    run("run", capture, "--profile", "smoke")
+    (plan,) = plan_captures([capture], options)
+    assert plan.done and plan.files["asset.glb"] == out / "asset.new.glb"
+    (out / "asset.new.glb").unlink()
+    (out / "asset.glb").unlink()
+    (plan,) = plan_captures([capture], options)
+    assert not plan.done and not plan.to_run and [job.stages for job in make_jobs([plan], options, History(), threads=1)] == [("report",)]
+
+
 @pytest.mark.parametrize("stage", ORDER)
 def test_estimates_grow_with_the_work(stage: str) -> None:
     small, large = PhotoSet(20, 0.2), PhotoSet(200, 12.0)
@@ -121,17 +149,6 @@ def test_openjd_template_is_valid(count: int) -> None:
         assert template.steps[1].dependencies[0].dependsOn == "c0000_mesh"
     with pytest.raises(UsageError, match="rename"):
         as_openjd([job(0, name="{{x}}")])
-
-
-def test_snakefile_is_one_that_snakemake_reads(tmp_path: Path) -> None:
-    pytest.importorskip("snakemake")
-    from gsbake.python_process import python_command, python_environment
-
-    (tmp_path / "Snakefile").write_text(emit("snakemake", [job(0, "mesh", name="{a} 'b'"), job(0, "bake", ("c0000_mesh",))]))
-    command = python_command("-m", "snakemake", "--dry-run", "--cores", "1", "--printshellcmds")
-    done = subprocess.run(command, cwd=tmp_path, env=python_environment(), capture_output=True, text=True, timeout=120, check=False)
-    assert done.returncode == 0, done.stdout + done.stderr
-    assert shlex.quote("/photos/{a} 'b'") in done.stdout + done.stderr
 
 
 def test_an_unknown_format_is_named(run: Run, make_capture: Make) -> None:

@@ -8,6 +8,7 @@ import time
 import zlib
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 import OpenImageIO as oiio
@@ -15,12 +16,15 @@ import pytest
 
 from gsbake.capture.ingest import IngestOptions, ingest, photo_names
 from gsbake.capture.photos.decode import UnreadablePhotoError, read_header, read_photo
-from gsbake.capture.photos.memory_budget import MemoryBudget
 from gsbake.capture.poses.frames import PhotoIndex, PhotoSize
 from gsbake.capture.poses.given import read_poses
+from gsbake.capture.poses.validation import read_xml
 from gsbake.config.schema import Ingest
 from gsbake.errors import BadInputError
+from gsbake.imaging.exr import write_exr
 from gsbake.imaging.png import write_png
+from gsbake.memory_budget import MemoryBudget
+from tests.support.large_files import sparse_file
 from tests.support.slow import slow
 
 SIZES = {"a.jpg": PhotoSize(200, 100)}
@@ -238,3 +242,70 @@ def test_many_frames_are_matched_in_linear_time() -> None:
     begin = time.monotonic()
     assert all(index.match(f"images/{name}") == name for name in photos)
     assert time.monotonic() - begin < 10  # comparing all pairs takes minutes
+
+
+def test_a_sparse_colmap_model_is_refused_by_its_size(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A terabyte that is not there neither lifts the limit of the reader nor is read; nor are other files of the folder."""
+    monkeypatch.setattr("gsbake.capture.poses.colmap_model.read_in_child", lambda *_: pytest.fail("it is read"))
+    folder = colmap_model(tmp_path / "sparse", struct.pack("<Q", 0))
+    sparse_file(folder / "points3D.bin", head=struct.pack("<Q", 2**30))
+    begin = time.monotonic()
+    with pytest.raises(BadInputError, match=r"COLMAP model .*sparse needs 1\.6e\+04 GB of memory to be read"):
+        read_poses(folder, [], SIZES)
+    assert time.monotonic() - begin < 5
+
+
+def test_a_colmap_models_limit_is_within_the_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    limits: list[int] = []
+
+    def stop(_: object, request: dict[str, Any], *__: object) -> dict[str, Any]:
+        limits.append(request["memory"])
+        raise BadInputError("stopped")
+
+    monkeypatch.setattr("gsbake.memory_budget.available_memory", lambda: 3 << 30)
+    monkeypatch.setattr("gsbake.capture.poses.colmap_model.read_in_child", stop)
+    folder = colmap_model(tmp_path / "sparse", struct.pack("<Q", 0))
+    sparse_file(folder / "notes.txt")  # no file of the model
+    with pytest.raises(BadInputError, match="stopped"):
+        read_poses(folder, [], SIZES)
+    assert 2 << 30 <= limits[0] < 3 << 30
+
+
+def test_a_photo_that_needs_more_memory_than_there_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """An EXR of 16 channels: its header is enough, and the run ends with its name, for another machine may read it."""
+    monkeypatch.setattr("gsbake.memory_budget.available_memory", lambda: 400_000_000)
+    folder, out = tmp_path / "photos", tmp_path / "out"
+    folder.mkdir()
+    out.mkdir()
+    for k in range(3):
+        photo(folder / f"{k}.png", k)
+    write_exr(folder / "bomb.exr", np.zeros((1500, 1500, 16), np.float16))
+    assert (folder / "bomb.exr").stat().st_size < 200_000
+    with pytest.raises(BadInputError, match=r"The photo bomb\.exr needs 0\.369 GB of memory to be read, and 0\.3 GB may be used") as caught:
+        ingest(folder, out, IngestOptions(Ingest()))
+    assert caught.value.exit_code == 42
+
+
+@pytest.mark.parametrize(
+    "encoding", ["utf-8", "utf-8-sig", "utf-16", "utf-16-le", "utf-16-be", "utf-32", "utf-7", "latin-1", "utf-16-declared"]
+)
+def test_entities_are_refused_in_every_encoding(tmp_path: Path, encoding: str) -> None:
+    """The parser says that there is a document type, not a search for its text; what it cannot decode is no XML."""
+    body = '<!DOCTYPE d [<!ENTITY a "aaaa"><!ENTITY b "&a;&a;&a;&a;">]><document><chunk label="&b;">&b;</chunk></document>'
+    name = encoding.removesuffix("-declared")
+    declared = "" if name == encoding and encoding.startswith("utf-16") else f'<?xml version="1.0" encoding="{name.removesuffix("-sig")}"?>'
+    path = tmp_path / "cameras.xml"
+    path.write_bytes((declared + body).encode(name))
+    with pytest.raises(BadInputError, match="declares XML entities|is not a valid XML file") as caught:
+        read_xml(path, "file of Metashape cameras")
+    assert "\n" not in str(caught.value)
+    if encoding in ("utf-16", "utf-16-declared", "utf-8", "latin-1"):
+        assert "declares XML entities" in str(caught.value)
+
+
+def test_xml_is_read_as_the_standard_library_does(tmp_path: Path) -> None:
+    text = '<a xmlns="urn:x" xmlns:p="urn:y" p:k="1"> t&amp;u <p:b j="2"/>tail<!-- c --><![CDATA[<d>]]></a>'
+    for encoding in ("utf-8", "utf-16"):
+        (tmp_path / "a.xml").write_bytes(text.encode(encoding))
+        found = read_xml(tmp_path / "a.xml", "file")
+        assert ElementTree.tostring(found) == ElementTree.tostring(ElementTree.fromstring(text))

@@ -10,6 +10,9 @@ from gsbake.errors import BadInputError
 from gsbake.pipeline.registry import Registry
 from gsbake.pipeline.stage import Context, Stage
 
+#: Names that no target's file has.
+FOREIGN_NAMES = (".envrc", ".git/hooks/post-checkout", "project.json", "stages/planted", "asset.glb", "notes.txt", "asset_film/.envrc")
+
 
 def _ingest(ctx: Context) -> dict[str, Any]:
     folder = ctx.inputs["photos"]
@@ -53,6 +56,14 @@ def _report(ctx: Context) -> dict[str, Any]:
     return {}
 
 
+def _targets(ctx: Context) -> dict[str, Any]:
+    """Files of targets, and such as only an output from outside holds."""
+    for name in ("asset_web.glb", "asset_film/base_color.exr", *FOREIGN_NAMES):
+        (ctx.out / name).parent.mkdir(parents=True, exist_ok=True)
+        (ctx.out / name).write_text("from the targets")
+    return {}
+
+
 INGEST = Stage(
     "ingest", 1, "Reading photos", _ingest, sources=("photos", "masks", "poses"), settings=("ingest.min_photos", "ingest.invert_masks")
 )
@@ -60,4 +71,8 @@ MESH = Stage("mesh", 1, "Meshing", _mesh, needs=("ingest",), settings=("mesh.fac
 EXPORT = Stage("export", 1, "Exporting", _export, needs=("mesh",), settings=("bake.materials",))
 REPORT = Stage("report", 1, "Reporting", _report, needs=("export",))
 
+TARGETS = Stage("targets", 1, "Targets", _targets, needs=("export",), settings=("targets.files",))
+
 REGISTRY = Registry({name: f"tests.cli.toy_bake:{name.upper()}" for name in ("ingest", "mesh", "export", "report")})
+#: The same with the files of targets.
+WITH_TARGETS = Registry({**REGISTRY.references, "targets": "tests.cli.toy_bake:TARGETS"})

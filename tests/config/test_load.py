@@ -191,3 +191,10 @@ def test_unknown_profile() -> None:
 )  # fmt: skip
 def test_bounds_in_words(key: str, allowed: str) -> None:
     assert bounds(fields()[key]) == allowed
+
+
+def test_a_profile_that_is_too_large_to_be_one(tmp_path: Path) -> None:
+    path = tmp_path / "a.toml"
+    path.write_text("#" * 1_000_001)
+    with pytest.raises(BadInputError, match=r"a\.toml has 1 MB; a profile has at most 1 MB"):
+        load_profile(str(path))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from gsbake.config.schema import Targets
-from gsbake.config.targets import BUDGETS, Target, parse_target, require_packages
+from gsbake.config.targets import BUDGETS, Target, is_target_file, parse_target, require_packages
 from gsbake.errors import UsageError
 
 
@@ -23,6 +23,14 @@ def test_targets(text: str, target: Target, stem: str, form: str) -> None:
     found = parse_target(text)
     assert found == target and (found.stem, found.file_form) == (stem, form)
     assert parse_target(found.text) == found
+
+
+def test_names_of_other_files_are_no_targets() -> None:
+    for name in ("asset.glb", "asset_web.glb.sh", "asset_film/../x.exr", "asset_film/sub/orm.exr", "asset_web/orm.exr", ".asset.usdz", "",
+                 "asset_web_lod1.exe", "asset.obj\n", "surfels.ply/x", "asset_lod0.glb", "ASSET_WEB.glb", "/asset.usdz"):  # fmt: skip
+        assert not is_target_file(name), name
+    for name in ("asset_lod1.glb", "asset_lods.glb", "asset_film_webp/orm.exr", "asset_planner_base_color.jpg", "asset_lod2.usdc"):
+        assert is_target_file(name), name
 
 
 @pytest.mark.parametrize(

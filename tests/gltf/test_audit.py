@@ -71,6 +71,14 @@ def test_mirrored_and_overlapping_uvs(mesh: GltfMesh, images: GltfTextures) -> N
     assert "no overlapping UVs" in broken(build_glb(squeezed, images, "b", "g", "", EXTRAS))
 
 
+def test_triangles_that_cover_the_square_often_overlap_without_a_look_at_the_texels(
+    mesh: GltfMesh, images: GltfTextures, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("gsbake.gltf.audit.MAX_COVERED", 0.01)
+    monkeypatch.setattr("gsbake.gltf.audit.overlapping", None)
+    assert "no overlapping UVs" in broken(build_glb(mesh, images, "b", "g", "", EXTRAS))
+
+
 def test_tangents_out_of_the_surface(mesh: GltfMesh, images: GltfTextures) -> None:
     leaning = replace(mesh, tangent=np.column_stack([mesh.normal, mesh.tangent[:, 3]]).astype(np.float32))
     assert "tangents in the surface" in broken(build_glb(leaning, images, "b", "g", "", EXTRAS))
@@ -130,3 +138,12 @@ def test_limits(glb: bytes) -> None:
 def test_an_unreadable_file() -> None:
     (only,) = audit(b"nothing", "a.glb", 5, 100)
     assert only.rule == "readable GLB" and not only.passed and only.severity == "error"
+
+
+def test_long_oblique_triangles_are_not_looked_for(mesh: GltfMesh, images: GltfTextures, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Their boxes are large although they cover little: the rule says that it did not look."""
+    monkeypatch.setattr("gsbake.gltf.audit.overlapping", None)
+    monkeypatch.setattr("gsbake.gltf.audit.MAX_BOXES", 0.1)
+    glb = build_glb(mesh, images, "b", "g", "", EXTRAS)
+    found = next(f for f in audit(glb, "a", 20, 100_000) if f.rule == "no overlapping UVs")
+    assert found.passed and found.severity == "info" and "not looked at" in found.detail

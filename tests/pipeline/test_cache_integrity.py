@@ -14,6 +14,7 @@ from gsbake.errors import BadInputError, InterruptedRun
 from gsbake.pipeline import files as disk
 from gsbake.pipeline import store as store_module
 from gsbake.pipeline.digest import list_files
+from gsbake.pipeline.garbage import choose, delete, list_entries
 from gsbake.pipeline.project import Project
 from gsbake.pipeline.replace import replace_output, undo_replacement
 from gsbake.pipeline.store import MANIFEST, REPLACEMENT, Store, read_manifest
@@ -31,8 +32,27 @@ def test_planted_file_is_set_aside(photos: Path, name: str, finished: Path) -> N
     again, recorder = engine(out, photos)
     again.run()
     assert recorder.cached == ["read", "sum", "tell"]
-    moved = [path for path in (out / "unexpected").rglob("*") if path.is_file()]
+    moved = [path for path in (out / "set-aside").rglob("*") if path.is_file()]
     assert [path.read_text() for path in moved] == ["stranger"] and not planted.exists()
+
+
+@pytest.mark.parametrize("damage", ["edited", "edited, and its manifest cut off"])
+def test_an_output_edited_in_place_is_set_aside(photos: Path, finished: Path, damage: str) -> None:
+    """The stage is computed again, as its output is not what the key says, but the edit is not lost."""
+    folder = artifact(finished, "sum")
+    total = (folder / "total.txt").read_text()
+    (folder / "total.txt").write_text("edited by hand")
+    if damage != "edited":
+        (folder / MANIFEST).write_text("{")
+    again, recorder = engine(finished, photos)
+    lines: list[str] = []
+    recorder.warning = lambda name, text: lines.append(text)  # type: ignore[method-assign]
+    again.run()
+    assert recorder.ran == ["sum"] and (folder / "total.txt").read_text() == total
+    assert (finished / "set-aside" / "sum" / folder.name / "total.txt").read_text() == "edited by hand"
+    assert len(lines) == 1 and "total.txt" in lines[0] and "set-aside" in lines[0]
+    delete(again.store, choose(list_entries(again.store, ("read", "sum", "tell")), keep=0))
+    assert len(list(finished.glob("set-aside/sum/*/total.txt"))) == 1
 
 
 def test_only_the_artifacts_of_the_run_are_looked_at(tmp_path: Path, photos: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -64,7 +84,7 @@ def test_planted_file_in_a_replacement_is_set_aside(tmp_path: Path, photos: Path
     planted = replace_output(Store(out), "sum", {"total.txt": mine}, None).folder / "emissive.exr"
     planted.write_text("stranger")
     engine(out, photos)[0].run()
-    assert not planted.exists() and [path.read_text() for path in out.glob("unexpected/sum/*/*")] == ["stranger"]
+    assert not planted.exists() and [path.read_text() for path in out.glob("set-aside/sum/*/*")] == ["stranger"]
     assert (artifact(out, "tell") / "tell.txt").exists()
 
 
@@ -205,7 +225,7 @@ def test_malformed_manifest_is_no_artifact(photos: Path, change: dict[str, objec
 )  # fmt: skip
 def test_damaged_project_is_one_sentence(tmp_path: Path, text: str) -> None:
     (tmp_path / "project.json").write_bytes(text.encode("latin-1"))
-    with pytest.raises(BadInputError, match="delete it and give the photos again") as caught:
+    with pytest.raises(BadInputError, match="move it away and give the photos again") as caught:
         Project.load(tmp_path)
     assert "\n" not in str(caught.value)
 

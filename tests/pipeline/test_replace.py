@@ -58,3 +58,40 @@ def test_damaged_replacement_raises(tmp_path: Path, photos: Path) -> None:
     (artifact.folder / "total.txt").write_text("3")
     with pytest.raises(BadInputError, match="replace sum --undo"):
         engine(tmp_path / "out", photos)[0].plan()
+
+
+def test_the_only_copy_of_the_users_files_is_set_aside(tmp_path: Path, photos: Path, finished: Path) -> None:
+    """By a second replacement, by undoing it, and where its files were edited in place."""
+    made, _ = engine(finished, photos)
+    mine = tmp_path / "total.txt"
+    aside = finished / "set-aside" / "sum"
+    for text in ("first", "second", "third"):
+        mine.write_text(text)
+        artifact = replace_output(made.store, "sum", {"total.txt": mine}, None)
+    assert {path.read_text() for path in aside.rglob("*") if path.is_file()} == {"first", "second"}
+    (artifact.folder / "total.txt").write_text("edited in place")
+    mine.unlink()
+    undo_replacement(made.store, "sum")
+    assert {path.read_text() for path in aside.rglob("*") if path.is_file()} == {"first", "second", "edited in place"}
+    assert len(made.store.take_moved()) == 3 and made.store.take_moved() == []
+    assert not list((finished / "stages" / "sum").glob("by-hand-*"))
+
+
+def test_files_kept_from_the_stages_own_output_are_not_set_aside(tmp_path: Path, photos: Path, finished: Path) -> None:
+    made, _ = engine(finished, photos)
+    base = made.run()[1].artifact
+    assert base is not None
+    extra = tmp_path / "extra.txt"
+    extra.write_text("mine")
+    replace_output(made.store, "sum", {"extra.txt": extra}, base)
+    undo_replacement(made.store, "sum")
+    assert [path.name for path in (finished / "set-aside").rglob("*") if path.is_file()] == ["extra.txt"]
+
+
+def test_names_that_no_manifest_may_have_are_refused(tmp_path: Path, photos: Path, finished: Path) -> None:
+    (tmp_path / "mine.txt").write_text("1")
+    store = engine(finished, photos)[0].store
+    for name in ("a?.txt", "../total.txt", "con", "manifest.json/a", "line\nbreak"):
+        with pytest.raises(UsageError, match="rename it"):
+            replace_output(store, "sum", {name: tmp_path / "mine.txt"}, None)
+    assert not list(store.stage_folder("sum").glob("by-hand*"))

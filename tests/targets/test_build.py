@@ -12,16 +12,19 @@ import pytest
 import trimesh
 
 from gsbake.config.schema import Export, Targets
+from gsbake.config.targets import is_target_file
 from gsbake.errors import BadInputError
 from gsbake.geometry.tangents import frame_to_world
 from gsbake.gltf.audit import MAX_NON_UNIT, non_unit_share
-from gsbake.gltf.document import Document, decode_image
+from gsbake.gltf.document import Document
 from gsbake.gltf.encode import TextureMaps, quantise
 from gsbake.gltf.read import read_glb
 from gsbake.gltf.scene import open_scene
 from gsbake.gltf.write import GltfMesh
+from gsbake.imaging.encoded import decode_image
 from gsbake.imaging.jpeg import encode_jpeg
 from gsbake.imaging.srgb import decode_bytes
+from gsbake.publish import INTERNAL
 from gsbake.targets.build import TargetOptions, build_targets
 from gsbake.targets.images import fit_images
 from gsbake.targets.maps import resized
@@ -50,6 +53,8 @@ def test_every_target_has_its_files(built: tuple[Path, dict[str, Any]]) -> None:
     assert all((out / name).stat().st_size > 0 for name in figures)
     assert json.loads((out / "targets.json").read_text()) == figures
     assert (out / "asset_film/base_color.exr").exists()
+    written = {path.relative_to(out).as_posix() for path in out.rglob("*") if path.is_file()}
+    assert all(is_target_file(name) for name in written if not name.endswith(INTERNAL))
 
 
 def test_plain_files_pass_the_validator_without_a_message(built: tuple[Path, dict[str, Any]]) -> None:

@@ -107,3 +107,28 @@ def test_errors_are_one_sentence(
     assert call(monkeypatch, *(ball if a == "BALL" else a for a in arguments)) == code
     error = capsys.readouterr().err
     assert message in error and "Traceback" not in error
+
+
+def test_outputs_replace_no_input_and_no_other_file(
+    ball: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Also where the output is a link to an input, or an image that is the user's."""
+    mine = tmp_path / "asset.png"  # a GLB by its content
+    mine.write_bytes(ball.read_bytes())
+    (tmp_path / "link.png").symlink_to(mine)
+    (tmp_path / "photo.png").write_text("the user's")
+    small = ("--views", 1, "--size", 16)
+    for sheet, says in ((ball, "written as .png"), (mine, "an input"), (tmp_path / "link.png", "an input")):
+        for flags in ((), ("--overwrite",)):
+            assert call(monkeypatch, "compare", mine, ball, "--sheet", sheet, *flags, *small) == 2
+            assert says in capsys.readouterr().err
+            assert call(monkeypatch, "render", mine, "--turntable", sheet, *flags, *small) == 2
+            capsys.readouterr()
+    assert mine.read_bytes() == ball.read_bytes()
+    photo = tmp_path / "photo.png"
+    for command in (("compare", ball, ball, "--sheet", photo), ("render", ball, "--turntable", photo)):
+        assert call(monkeypatch, *command, *small) == 2
+        assert "--overwrite" in capsys.readouterr().err and photo.read_text() == "the user's"
+    assert call(monkeypatch, "render", ball, "--turntable", photo, "--overwrite", *small, "--quiet") == 0
+    with Image.open(photo) as image:
+        assert image.size == (16, 16)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 from typing import Any
 
@@ -11,13 +12,14 @@ import numpy as np
 
 from gsbake.errors import BadInputError
 from gsbake.imaging.png import write_png
+from gsbake.own_files import require_own_folder
 
 
 def export_masks(ingest: Path, poses: Path | None, folder: Path, only: frozenset[str] | None = None) -> list[Path]:
     """Write the masks in use into `folder`, one per photo, of its size and under its name; returns the files.
 
     `ingest` and `poses` are artifact folders; without `poses` there are no automatic masks. `only` names the photos whose masks are
-    written; None writes all. Raises BadInputError when there are no masks, or a file exists already: it may have been edited.
+    written; None writes all. Raises BadInputError when there are no masks, UsageError when the folder is neither new nor empty.
     """
     entries: list[dict[str, Any]] = json.loads((ingest / "photos.json").read_text(encoding="utf-8"))["photos"]
     files = {}
@@ -32,10 +34,11 @@ def export_masks(ingest: Path, poses: Path | None, folder: Path, only: frozenset
         raise BadInputError("None of this run's masks is doubtful; without --doubtful all of them are written.")
     if not chosen:
         raise BadInputError("This run has no masks; give some with --masks, or install the mask network (`gsbake doctor` says how).")
+    require_own_folder(folder, False, "a mask")
     targets = [(folder / entry["source"]).with_suffix(".png") for entry in chosen]
-    there = [target for target in targets if target.exists()]
-    if there:
-        raise BadInputError(f"'{there[0]}' exists already and may hold your edits; name another folder.")
+    for target in targets:
+        if Path(os.path.abspath(folder)) not in Path(os.path.abspath(target)).parents:
+            raise BadInputError(f"The mask '{target}' would lie outside '{folder}'; run `gsbake ingest` again.")
     for entry, target in zip(chosen, targets, strict=True):
         mask: Any = cv2.imread(str(files[entry["name"]]), cv2.IMREAD_GRAYSCALE)
         if mask is None:

@@ -61,12 +61,12 @@ class ConvertedPhoto:
     quality: Quality
 
 
-def decoded_bytes(what: Conversion) -> int:
-    """Bytes of the decoded photo and mask, from their headers. Raises UnreadablePhotoError for the photo; the mask's turn comes later."""
-    size = read_header(what.path, what.max_megapixels).decoded_bytes
+def needed_bytes(what: Conversion) -> int:
+    """Bytes that converting the photo and its mask needs, from headers. Raises UnreadablePhotoError for the photo; the mask comes later."""
+    size = read_header(what.path, what.max_megapixels).needed_bytes
     if what.mask is not None:
         with suppress(UnreadablePhotoError):
-            size += read_header(what.mask, what.max_megapixels).decoded_bytes
+            size += read_header(what.mask, what.max_megapixels).needed_bytes
     return size
 
 

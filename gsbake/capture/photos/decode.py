@@ -29,6 +29,8 @@ Floats = NDArray[np.float32]
 
 #: Default of `ingest.max_megapixels`.
 MAX_MEGAPIXELS = 250.0
+#: Bytes per pixel of the conversion to linear colours and their filter.
+CONVERSION_BYTES = 36
 #: Largest edge in pixels and most channels of an image that is decoded at all.
 _MAX_EDGE, _MAX_CHANNELS = 100_000, 16
 #: Alpha (of 255) below which the colour of a pixel is undefined.
@@ -87,9 +89,9 @@ class ImageHeader:
         return self.width * self.height / 1e6
 
     @property
-    def decoded_bytes(self) -> int:
-        """Bytes of the decoded pixels."""
-        return self.width * self.height * self.channels * self.sample_bytes
+    def needed_bytes(self) -> int:
+        """Bytes that decoding and conversion hold at once: the pixels and a copy, and the colours in single precision twice."""
+        return self.width * self.height * (2 * self.channels * self.sample_bytes + CONVERSION_BYTES)
 
 
 @contextmanager

@@ -1,7 +1,8 @@
 """The processes that decode photos, and what becomes of those that a photo ends.
 
-A photo whose decoder crashes or takes more memory than its size explains is unreadable, and its process is started again. A process that is
-killed from outside or takes too long says nothing about the photo: the run is interrupted and nothing is stored.
+A photo whose decoder crashes or takes more memory than its size explains is unreadable, and its process is started again. One whose header
+states more than the budget of memory is an error of the input, which is not stored: another machine may have more. A process that is killed
+from outside or takes too long says nothing about the photo: the run is interrupted and nothing is stored.
 """
 
 from __future__ import annotations
@@ -14,15 +15,15 @@ import numpy as np
 
 from gsbake.capture.photos.conversion import Conversion, ConvertedPhoto
 from gsbake.capture.photos.decode import UnreadablePhotoError
-from gsbake.capture.photos.memory_budget import BYTES_PER_DECODED_BYTE, MemoryBudget
 from gsbake.capture.photos.quality import Quality
 from gsbake.errors import BadInputError, InterruptedRun
 from gsbake.limited_process import ParserFailedError, ParserKilledError, ParserProcess
+from gsbake.memory_budget import MemoryBudget, too_large
 
 #: Module of the child.
 READER = "gsbake.capture.photos.reader_process"
-#: Seconds that a photo may take: at least, and per decoded byte (ten megabytes a second). Far above any measured time.
-MIN_SECONDS, SECONDS_PER_BYTE = 300.0, 1e-7
+#: Seconds that a photo may take: at least, and per byte that it needs (a hundred megabytes a second). Far above any measured time.
+MIN_SECONDS, SECONDS_PER_BYTE = 300.0, 1e-8
 #: Threads of the libraries in a child; the pool runs in parallel instead.
 _ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OPENIMAGEIO_THREADS"), "1")
 
@@ -47,10 +48,13 @@ class ReaderPool:
     def convert(self, what: Conversion) -> ConvertedPhoto:
         """Write the working files of a photo; waits for memory and for an idle process.
 
-        Raises UnreadablePhotoError for the photo, BadInputError for its mask, OSError for the output, InterruptedRun.
+        Raises UnreadablePhotoError for the photo, BadInputError for its mask and for more memory than there is, OSError for the output,
+        InterruptedRun.
         """
         size = int(self._ask("size", what, 0)["bytes"])
-        with self._budget.reserve(BYTES_PER_DECODED_BYTE * size):
+        if size > self._budget.total:
+            raise too_large(size, self._budget.total, f"The photo {what.relative}" + (" with its mask" if what.mask else ""))
+        with self._budget.reserve(size):
             found = self._ask("convert", what, size)
         quality = Quality(**{**found["quality"], "thumbnail": np.asarray(found["quality"]["thumbnail"], np.float32)})
         return ConvertedPhoto(found["entry"], int(found["orientation"]), quality)

@@ -11,26 +11,26 @@ from typing import Any
 import cv2
 import OpenImageIO as oiio
 
-from gsbake.capture.photos.conversion import Conversion, convert, decoded_bytes
+from gsbake.capture.photos.conversion import Conversion, convert, needed_bytes
 from gsbake.capture.photos.decode import UnreadablePhotoError
-from gsbake.capture.photos.memory_budget import BYTES_PER_DECODED_BYTE
 from gsbake.errors import BadInputError
 from gsbake.limited_process import limit_memory, serve
+from gsbake.memory_budget import child_limit
 
 #: Bytes that reading may take beyond what the pixels need: buffers of the decoders, stacks of threads, what the allocator reserves.
 SPARE_MEMORY = 1 << 30
 
 
 def answer(request: dict[str, Any]) -> dict[str, Any]:
-    """The bytes of the decoded pixels for the task "size", the converted photo for "convert".
+    """The bytes that conversion needs for the task "size", the converted photo for "convert".
 
     Errors: {"unreadable": reason} for the photo, {"refused": sentence} for its mask, {"os_error": [number, text, file]} for the output.
     """
     what = Conversion.from_json(request["what"])
-    limit_memory(SPARE_MEMORY + BYTES_PER_DECODED_BYTE * int(request["bytes"]))
+    limit_memory(child_limit(int(request["bytes"]), SPARE_MEMORY))
     try:
         if request["task"] == "size":
-            return {"bytes": decoded_bytes(what)}
+            return {"bytes": needed_bytes(what)}
         done = convert(what)
     except UnreadablePhotoError as error:
         return {"unreadable": str(error)}

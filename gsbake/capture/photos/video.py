@@ -4,11 +4,13 @@ The video is decoded twice. The first pass measures each frame at a small size: 
 since the frame before (median length of dense optical flow; Farnebäck, *Two-frame motion estimation based on polynomial expansion*, SCIA
 2003).
 The cumulative motion is divided into equal stretches, so that a camera at rest does not give many equal photos, and the second pass writes
-the sharpest frame of each. Videos come from strangers: this runs in a process of its own (`video_process`).
+the sharpest frame of each. Videos come from strangers: this runs in a process of its own (`video_process`), and FFmpeg may use the readers
+of containers alone, and files alone: its lists of other files (ffconcat, HLS, SDP, numbered images) would open what they name.
 """
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,6 +22,10 @@ from numpy.typing import NDArray
 from gsbake.capture.photos.decode import UnreadablePhotoError
 from gsbake.imaging.png import write_png
 
+#: FFmpeg's readers of the containers in which videos come, by FFmpeg's names; all others are refused, whatever a file is called.
+CONTAINERS = ("mov", "mp4", "m4a", "3gp", "3g2", "mj2", "matroska", "webm", "avi")
+#: OpenCV's variable for options of FFmpeg.
+_OPTIONS = "OPENCV_FFMPEG_CAPTURE_OPTIONS"
 #: Longer side in pixels at which sharpness and motion are measured.
 ANALYSIS_SIZE = 240
 #: Share of the motion that is added evenly in time: a film without motion still gives frames.
@@ -36,11 +42,12 @@ class FrameMeasures:
 
 def frames(path: Path, max_megapixels: float) -> Iterator[NDArray[np.uint8]]:
     """All frames (h, w, 3) BGR in order, upright. Raises UnreadablePhotoError where there is no frame, or too large ones."""
+    os.environ[_OPTIONS] = f"format_whitelist;{','.join(CONTAINERS)}|protocol_whitelist;file"
     video = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
     try:
         width, height = video.get(cv2.CAP_PROP_FRAME_WIDTH), video.get(cv2.CAP_PROP_FRAME_HEIGHT)
         if not video.isOpened() or width < 1 or height < 1:
-            raise UnreadablePhotoError("it is damaged, or its codec is not known")
+            raise UnreadablePhotoError("it is damaged, no MP4, MOV, AVI, MKV or WebM, or its codec is not known")
         if width * height / 1e6 > max_megapixels:
             raise UnreadablePhotoError(f"its frames have {width * height / 1e6:.0f} megapixels, more than ingest.max_megapixels")
         count = 0

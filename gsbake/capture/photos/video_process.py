@@ -11,10 +11,11 @@ from gsbake.capture.photos.decode import UnreadablePhotoError
 from gsbake.capture.photos.video import write_frames
 from gsbake.errors import BadInputError, InterruptedRun
 from gsbake.limited_process import ParserFailedError, ParserKilledError, ParserProcess, limit_memory, serve
+from gsbake.memory_budget import budget
 
 #: Module of the child.
 READER = "gsbake.capture.photos.video_process"
-#: Bytes that decoding may take: reference frames of 8K video in several threads.
+#: Bytes that decoding may take, where there are as many: reference frames of 8K video in several threads.
 MEMORY = 4 << 30
 #: Seconds that a video may take: at least, and per byte of the file (a megabyte in ten seconds).
 MIN_SECONDS, SECONDS_PER_BYTE = 600.0, 1e-5
@@ -42,7 +43,7 @@ def extract_frames(path: Path, out: Path, count: int, max_megapixels: float) -> 
 
 def answer(request: dict[str, Any]) -> dict[str, Any]:
     """Write the frames; {"unreadable": reason} for the video, {"os_error": [number, text, file]} for the output."""
-    limit_memory(MEMORY)
+    limit_memory(min(MEMORY, budget()))
     try:
         written, total = write_frames(Path(request["path"]), Path(request["out"]), int(request["count"]), float(request["max_megapixels"]))
     except UnreadablePhotoError as error:

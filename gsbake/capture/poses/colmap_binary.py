@@ -13,6 +13,8 @@ from gsbake.errors import BadInputError
 
 #: Number of parameters of COLMAP's camera models by their identifier.
 _PARAMETERS = {0: 3, 1: 4, 2: 4, 3: 5, 4: 8, 5: 8, 6: 12, 7: 5, 8: 4, 9: 5, 10: 12, 11: 16, 12: 4, 13: 5, 14: 3, 15: 4, 16: 6, 17: 2}
+#: No record is shorter.
+MIN_RECORD = 8
 _COUNT = struct.Struct("<Q")
 
 
@@ -42,7 +44,7 @@ def _walk(data: bytes, record: Callable[[bytes, int], int]) -> None:
     """Go through a count, then so many records."""
     (count,) = _COUNT.unpack_from(data)
     at = _COUNT.size
-    if count > len(data):  # no record is shorter than a byte
+    if count * MIN_RECORD > len(data):
         raise _ShortError
     for _ in range(count):
         at = record(data, at)
@@ -82,3 +84,5 @@ def _frame(data: bytes, at: int) -> int:
 
 
 _WALKS = {"cameras.bin": _camera, "images.bin": _image, "points3D.bin": _point, "rigs.bin": _rig, "frames.bin": _frame}
+#: Names of the binary files of a model.
+BINARY_FILES = tuple(_WALKS)

@@ -13,13 +13,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gsbake.capture.poses.colmap_binary import check_binary_files
+from gsbake.capture.poses.colmap_binary import BINARY_FILES, check_binary_files
 from gsbake.capture.poses.frames import GivenPoses, PhotoSize, checked_rigid, match_cameras
 from gsbake.capture.poses.validation import MAX_COORDINATE
-from gsbake.errors import BadInputError, InterruptedRun
+from gsbake.errors import BadInputError
 from gsbake.geometry.cameras import Camera
-from gsbake.limited_process import ParserFailedError, ParserKilledError, ParserProcess
+from gsbake.limited_process import ParserProcess, read_in_child
+from gsbake.memory_budget import check, child_limit
 
+#: Files of a model.
+FILES = (*BINARY_FILES, *(name.replace(".bin", ".txt") for name in BINARY_FILES))
 #: Camera model → index of each of fx, fy, cx, cy, k1, k2, p1, p2, k3, k4, k5, k6 in COLMAP's parameters, as far as the model has them.
 _LAYOUT = {
     "SIMPLE_PINHOLE": (0, 0, 1, 2),
@@ -30,8 +33,8 @@ _LAYOUT = {
     "FULL_OPENCV": (0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11),
 }
 
-#: Address space of the process that reads a model: at least, and per byte of the model. Seconds it may take.
-MIN_READER_MEMORY, READER_MEMORY_FACTOR, READER_SECONDS = 2 << 30, 40, 600.0
+#: Memory of the process that reads a model: of the libraries, and per byte of the model. Seconds it may take.
+SPARE_MEMORY, MEMORY_FACTOR, READER_SECONDS = 2 << 30, 16, 600.0
 
 
 def intrinsics(model: str, params: Any, where: str) -> dict[str, Any]:
@@ -71,19 +74,14 @@ def model_reader() -> ParserProcess:
 
 def read_model_with(reader: ParserProcess, folder: Path, sizes: Mapping[str, PhotoSize]) -> GivenPoses:
     """`read_model` through a running `model_reader`."""
+    name = f"The COLMAP model {folder}"
+    needed = MEMORY_FACTOR * sum((folder / file).stat().st_size for file in FILES if (folder / file).is_file())
+    check(needed, name)  # by the size that the files state: a sparse one of a terabyte is as long to read
     check_binary_files(folder)
-    total = sum(path.stat().st_size for path in folder.iterdir() if path.is_file())
     with tempfile.TemporaryDirectory(prefix="gsbake-colmap-") as scratch:
         target = Path(scratch) / "model.npz"
-        request = {"folder": str(folder), "target": str(target), "memory": MIN_READER_MEMORY + READER_MEMORY_FACTOR * total}
-        try:
-            listed = reader.ask(request, READER_SECONDS)
-        except (ParserFailedError, ParserKilledError) as error:
-            if isinstance(error, ParserKilledError) and not error.timed_out:
-                raise InterruptedRun(f"The process that read the COLMAP model {folder} {error}; run the same command again.") from error
-            raise BadInputError(f"The COLMAP model {folder} cannot be read (its reader {error}).") from error
-        if "error" in listed:
-            raise BadInputError(f"The COLMAP model {folder} cannot be read ({listed['error']}).")
+        request = {"folder": str(folder), "target": str(target), "memory": child_limit(needed, SPARE_MEMORY)}
+        listed = read_in_child(reader, request, READER_SECONDS, name)
         with np.load(target, allow_pickle=False) as body:
             arrays = {name: body[name] for name in body.files}
     frames = []

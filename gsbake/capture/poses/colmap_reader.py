@@ -18,17 +18,17 @@ from gsbake.limited_process import limit_memory, serve
 def answer(request: dict[str, Any]) -> dict[str, Any]:
     """Names and camera models of the registered images of the model in "folder", whose arrays are written to the file "target" (NPZ).
 
-    Errors: {"error": reason}.
+    Errors: {"error": sentence}.
     """
-    memory = int(request["memory"])
+    memory, name = int(request["memory"]), f"The COLMAP model {request['folder']} cannot be read"
     limit_memory(memory)
     try:
         return _read(Path(request["folder"]), Path(request["target"]))
     except MemoryError:
-        return {"error": f"reading it needs more than {memory / 1e9:.0f} GB"}
+        return {"error": f"{name} (it needs more than {memory / 1e9:.0f} GB)."}
     except (ValueError, RuntimeError, OSError, IndexError, KeyError, TypeError, OverflowError) as error:
         text = " ".join(str(error).split()) or type(error).__name__
-        return {"error": text[-300:]}
+        return {"error": f"{name} ({text[-300:]})."}
 
 
 def _read(folder: Path, target: Path) -> dict[str, Any]:

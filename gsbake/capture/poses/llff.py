@@ -6,10 +6,8 @@ Its camera axes are (down, right, backwards).
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from tokenize import TokenError
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,11 +16,7 @@ from gsbake.capture.poses.frames import GivenPoses, PhotoSize, checked_rigid, fi
 from gsbake.capture.poses.validation import check_file_size
 from gsbake.errors import BadInputError
 from gsbake.geometry.cameras import Camera
-
-#: What NumPy raises for headers that it cannot parse; some come from Python's own tokenizer and parser.
-_HEADER_ERRORS = (
-    OSError, ValueError, EOFError, SyntaxError, TokenError, TypeError, KeyError, OverflowError, RecursionError, MemoryError,
-)  # fmt: skip
+from gsbake.imaging.npy import read_npy
 
 
 def read_llff(path: Path, listing: Sequence[str], sizes: Mapping[str, PhotoSize]) -> GivenPoses:
@@ -50,16 +44,11 @@ def _load(path: Path, count: int) -> NDArray[np.float64]:
     """The array (count, 17) of the file, whose header is checked before the data are read."""
     check_file_size(path)
     try:
-        with path.open("rb") as file, warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)  # of headers written by Python 2
-            version = np.lib.format.read_magic(file)
-            read_header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-            shape, _, dtype = read_header(file)
-            if len(shape) != 2 or shape[1] != 17 or dtype.kind not in "fiu":
-                raise BadInputError(f"{path} holds an array of shape {shape} of {dtype}; LLFF poses have 17 numbers per photo.")
-            if shape[0] != count:
-                raise BadInputError(f"{path} has {shape[0]} poses but there are {count} photos; use the photos the poses were made with.")
-            file.seek(0)
-            return np.asarray(np.load(file, allow_pickle=False), np.float64)
-    except _HEADER_ERRORS as error:
+        values = read_npy(path)
+    except (OSError, ValueError) as error:
         raise BadInputError(f"{path} cannot be read as a NumPy array ({' '.join(str(error).split())[:200]}).") from error
+    if values.ndim != 2 or values.shape[1] != 17:
+        raise BadInputError(f"{path} holds an array of shape {values.shape}; LLFF poses have 17 numbers per photo.")
+    if len(values) != count:
+        raise BadInputError(f"{path} has {len(values)} poses but there are {count} photos; use the photos the poses were made with.")
+    return values.astype(np.float64)

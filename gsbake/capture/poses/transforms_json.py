@@ -25,7 +25,7 @@ from gsbake.capture.poses.validation import (
     Size,
     Strict,
     first_error,
-    read_file,
+    read_json_text,
 )
 from gsbake.errors import BadInputError
 from gsbake.geometry.cameras import Camera
@@ -118,7 +118,7 @@ def read_transforms(path: Path, sizes: Mapping[str, PhotoSize]) -> GivenPoses:
     camera.
     """
     try:
-        body = _Transforms.model_validate_json(read_file(path))
+        body = _Transforms.model_validate_json(read_json_text(path))
     except ValidationError as error:
         raise BadInputError(f"{_frame_name(error)}{path} is not a valid transforms.json ({first_error(error)}).") from error
     frames, index = [], PhotoIndex(sizes)

@@ -9,15 +9,19 @@ import math
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 from xml.etree import ElementTree
+from xml.parsers import expat
 
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
 from gsbake.errors import BadInputError
+from gsbake.memory_budget import check, json_bytes
 
 #: Largest pose file in bytes: a transforms.json of 100 000 frames has about 100 MB.
 MAX_FILE_SIZE = 256 << 20
 #: Largest coordinate of a camera or point, in units of the file; beyond it double precision loses the object.
 MAX_COORDINATE = 1e9
+#: Bytes that an element or an attribute takes.
+XML_BYTES = 400
 #: Most frames of a pose file.
 MAX_FRAMES = 100_000
 #: Largest effect in pixels at which a coefficient that is not supported is ignored.
@@ -74,23 +78,49 @@ def read_file(path: Path, most: int = -1) -> bytes:
 _Body = TypeVar("_Body")
 
 
+def read_json_text(path: Path) -> bytes:
+    """The content of a JSON file. Raises BadInputError as `read_file`, and when its objects would take more memory than there is."""
+    content = read_file(path)
+    check(json_bytes(content), str(path))
+    return content
+
+
 def read_json(path: Path, kind: type[_Body], what: str) -> _Body:
     """The content of a JSON file as `kind`, a model or a container of models. Raises BadInputError when it is no valid `what`."""
     try:
-        return TypeAdapter(kind).validate_json(read_file(path))
+        return TypeAdapter(kind).validate_json(read_json_text(path))
     except ValidationError as error:
         raise BadInputError(f"{path} is not a valid {what} ({first_error(error)}).") from error
 
 
 def read_xml(path: Path, what: str) -> ElementTree.Element:
-    """The root of an XML file. Raises BadInputError when it is no XML, or declares entities, which may expand without end."""
+    """The root of an XML file. Raises BadInputError when it is no XML, or has a document type: its entities may expand without end.
+
+    The parser itself says so, whatever the encoding of the file; `ElementTree` has no such handler.
+    """
     content = read_file(path)
-    if b"<!DOCTYPE" in content or b"<!ENTITY" in content:
+    check(len(content) + XML_BYTES * content.count(b"<") + XML_BYTES * content.count(b"="), str(path))
+    builder, parser = ElementTree.TreeBuilder(), expat.ParserCreate(None, "}")
+
+    def refuse(*_: object) -> None:
         raise BadInputError(f"{path} declares XML entities, which no {what} does; export it again.")
+
+    def start(tag: str, attributes: dict[str, str]) -> None:
+        builder.start(_qualified(tag), {_qualified(name): value for name, value in attributes.items()})
+
+    parser.StartDoctypeDeclHandler = parser.EntityDeclHandler = refuse
+    parser.StartElementHandler, parser.CharacterDataHandler = start, builder.data
+    parser.EndElementHandler = lambda tag: builder.end(_qualified(tag))
     try:
-        return ElementTree.fromstring(content)  # nosec B314: without entities
-    except (ElementTree.ParseError, ValueError, LookupError) as error:
+        parser.Parse(content, True)
+        return builder.close()
+    except (expat.ExpatError, ValueError, LookupError, AssertionError) as error:
         raise BadInputError(f"{path} is not a valid XML file ({' '.join(str(error).split())[:200]}).") from error
+
+
+def _qualified(name: str) -> str:
+    """A name as `ElementTree` writes it, "{namespace}name", of one as expat does, "namespace}name"."""
+    return "{" + name if "}" in name else name
 
 
 def refuse_coefficient(coefficient: str, pixels: float, frame: str, source: str) -> None:

@@ -24,6 +24,9 @@ from numpy.typing import NDArray
 from gsbake.capture.photos.undistortion import remap_tables
 from gsbake.errors import BadInputError
 from gsbake.geometry.cameras import Camera, CameraSet
+from gsbake.imaging.image_process import read_pixels
+from gsbake.imaging.npy import read_npy
+from gsbake.memory_budget import read_bytes
 from gsbake.surfels.views import TrainView
 
 Floats = NDArray[np.float32]
@@ -41,16 +44,16 @@ def _read(path: Path, channels: int) -> Floats:
     """A map (h, w[, 3]) as floats in the units of the file (PNG normals in −1..1); BadInputError for anything else."""
     try:
         if path.suffix.lower() == ".npy":
-            values = np.load(path, allow_pickle=False)
+            values = read_npy(path)
         else:
-            values = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-            if values is not None and channels == 3 and values.ndim == 3:
+            values = read_pixels(read_bytes(path), str(path))
+            if channels == 3 and values.ndim == 3:
                 half = 32767.5 if values.dtype == np.uint16 else 127.5
                 values = values[..., 2::-1].astype(np.float32) / half - 1
     except (OSError, ValueError) as error:
         raise BadInputError(f"{path} cannot be read ({error}); give a PNG or a .npy file, or remove it.") from error
     wanted = "an array (height, width, 3) of normals" if channels == 3 else "an array (height, width) of depths"
-    if values is None or values.ndim != (3 if channels == 3 else 2) or (channels == 3 and values.shape[2] != 3) or not values.size:
+    if values.ndim != (3 if channels == 3 else 2) or (channels == 3 and values.shape[2] != 3) or not values.size:
         raise BadInputError(f"{path} is not {wanted}; write it again or remove it.")
     return np.nan_to_num(values.astype(np.float32), nan=0.0, posinf=0.0, neginf=0.0)
 

@@ -17,7 +17,7 @@ from gsbake.capture.masks import weights
 from gsbake.capture.masks.consensus import MIN_CERTAIN_OVERLAP, intersection_over_union
 from gsbake.capture.masks.editing import export_masks
 from gsbake.capture.posed_photos import PosedPhotos
-from gsbake.errors import BadInputError
+from gsbake.errors import BadInputError, UsageError
 from gsbake.geometry.cameras import Camera
 from gsbake.geometry.ply import write_cloud
 from tests.capture.conftest import Runner
@@ -97,7 +97,7 @@ def test_masks_are_made_corrected_and_written_for_editing(
 
     files = export_masks(runner.root / "ingest", runner.root / "poses", tmp_path / "edit")
     assert [path.name for path in files] == [f"p{i:02}.png" for i in range(COUNT)]
-    with pytest.raises(BadInputError, match="may hold your edits"):
+    with pytest.raises(UsageError, match="holds other files"):
         export_masks(runner.root / "ingest", runner.root / "poses", tmp_path / "edit")
     (only,) = export_masks(runner.root / "ingest", runner.root / "poses", tmp_path / "one", frozenset({"p08"}))
     with pytest.raises(BadInputError, match="is doubtful"):

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from gsbake.capture.ingest import IngestOptions, ingest
-from gsbake.capture.photos.video import FrameMeasures, choose, measure
+from gsbake.capture.photos.decode import UnreadablePhotoError
+from gsbake.capture.photos.video import FrameMeasures, choose, frames, measure
 from gsbake.capture.sources import discover
 from gsbake.config.schema import Ingest
 from gsbake.errors import BadInputError
@@ -89,3 +90,21 @@ def test_frames_that_are_too_large_are_refused(tmp_path: Path) -> None:
     (tmp_path / "out").mkdir()
     with pytest.raises(BadInputError, match="more than ingest.max_megapixels"):
         ingest(path, tmp_path / "out", IngestOptions(Ingest(max_megapixels=0.01)))
+
+
+@pytest.mark.parametrize(
+    ("suffix", "text"),
+    [
+        (".mp4", "ffconcat version 1.0\nfile other.avi\n"),
+        (".mkv", "ffconcat version 1.0\nfile 'other.avi'\ninpoint 0\n"),
+        (".mp4", "#EXTM3U\n#EXT-X-TARGETDURATION:5\n#EXTINF:5,\nother.avi\n#EXT-X-ENDLIST\n"),
+        (".mov", "v=0\no=- 0 0 IN IP4 127.0.0.1\ns=x\nc=IN IP4 127.0.0.1\nm=video 5004 RTP/AVP 96\na=rtpmap:96 H264/90000\n"),
+    ],
+)
+def test_a_list_of_other_files_opens_none_of_them(tmp_path: Path, suffix: str, text: str) -> None:
+    """FFmpeg recognises its lists by their content, whatever the file is called."""
+    write_video(tmp_path / "other.avi", [0, 5, 10], size=64)
+    assert len(list(frames(tmp_path / "other.avi", 1.0))) == 3
+    (tmp_path / f"x{suffix}").write_text(text)
+    with pytest.raises(UnreadablePhotoError, match="no MP4, MOV, AVI, MKV or WebM"):
+        list(frames(tmp_path / f"x{suffix}", 1.0))

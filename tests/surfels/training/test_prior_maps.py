@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -18,6 +19,7 @@ from gsbake.geometry.cameras import CameraSet
 from gsbake.surfels.training.prior_maps import add_priors
 from gsbake.surfels.views import TrainView, camera_tensors
 from tests.support.cameras import look_at
+from tests.support.large_files import png_header
 
 
 def scene(folder: Path, distortion: tuple[float, ...] = ()) -> tuple[list[TrainView], CameraSet]:
@@ -106,3 +108,33 @@ def test_folders_beside_the_photos_are_sources_where_they_have_a_weight(tmp_path
     assert _source_names({"photos": tmp_path / "images"} | found)["normals"] == ["a.npy"]
 
 
+def npy(shape: tuple[int, ...], dtype: str = "<f4") -> bytes:
+    """A header that states a shape, and no numbers."""
+    header = repr({"descr": dtype, "fortran_order": False, "shape": shape}).encode()
+    header += b" " * ((-(10 + len(header) + 1)) % 64) + b"\n"
+    return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(header)) + header
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("p0.npy", npy((10**6, 10**6)), "states 4000000000000 bytes and holds 0"),
+        ("p0.npy", npy((-1, 4)), "cannot be read"),
+        ("p0.npy", npy((2, 2), "|O"), "cannot be read"),
+        ("p0.npy", b"", "cannot be read"),
+        ("p0.npy", npy((8, 8))[:20], "cannot be read"),
+        ("p0.png", b"text", "must be PNG"),
+        ("p0.png", png_header(30_000, 30_000), "30000 × 30000"),
+        ("p0.png", png_header(9_000, 9_000), "needs 1.94 GB of memory"),
+    ],
+)
+def test_maps_that_ask_for_more_than_there_is(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, content: bytes, message: str
+) -> None:
+    monkeypatch.setattr("gsbake.memory_budget.available_memory", lambda: 400_000_000)
+    views, cameras = scene(tmp_path)
+    (tmp_path / "depths").mkdir()
+    (tmp_path / "depths" / name).write_bytes(content)
+    with pytest.raises(BadInputError, match=message) as caught:
+        add_priors(views, cameras, tmp_path, None, tmp_path / "depths")
+    assert name in str(caught.value) and "\n" not in str(caught.value)

@@ -1,0 +1,72 @@
+"""The child process that reads a mesh from outside (PLY, OBJ, STL), and its parent's side; see `limited_process` for why.
+
+The reader, trimesh, opens what a file names (materials, textures) when it has the file's folder: it is given the content alone.
+"""
+
+from __future__ import annotations
+
+import io
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gsbake.errors import BadInputError
+from gsbake.limited_process import ParserProcess, limit_memory, read_in_child, serve
+from gsbake.memory_budget import check, child_limit
+
+#: File name suffixes of the formats.
+SUFFIXES = (".ply", ".obj", ".stl")
+#: Bytes that reading takes per byte of the file (text is split into Python's objects), and beyond: libraries, what the allocator reserves.
+MEMORY_FACTOR, SPARE_MEMORY = 24, 1 << 30
+#: Seconds that a mesh may take: at least, and per byte of the file (half a megabyte a second).
+MIN_SECONDS, SECONDS_PER_BYTE = 60.0, 2e-6
+
+
+def read_foreign_mesh(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Vertices (v, 3), all finite, and triangles (f, 3) of a mesh. Raises BadInputError."""
+    name = f"'{path}'"
+    if path.suffix.lower() not in SUFFIXES:
+        raise BadInputError(f"{name} is not a readable mesh; give a GLB, glTF, {', '.join(s[1:].upper() for s in SUFFIXES)} file.")
+    try:
+        size = path.stat().st_size
+    except OSError as error:
+        raise BadInputError(f"{name} cannot be read: {error.strerror}.") from error
+    needed = MEMORY_FACTOR * size
+    check(needed, name)
+    with tempfile.TemporaryDirectory(prefix="gsbake-mesh-") as scratch, ParserProcess(__name__) as child:
+        target = Path(scratch, "mesh.npz")
+        request = {"path": str(path.absolute()), "name": name, "target": str(target), "needed": needed}
+        read_in_child(child, request, MIN_SECONDS + SECONDS_PER_BYTE * size, name)
+        with np.load(target, allow_pickle=False) as body:
+            return body["vertices"], body["faces"]
+
+
+def answer(request: dict[str, Any]) -> dict[str, Any]:
+    """Write the arrays of the mesh in "path" to "target" (NPZ). Errors: {"error": sentence}."""
+    import trimesh
+
+    path, name = Path(request["path"]), str(request["name"])
+    limit_memory(child_limit(int(request["needed"]), SPARE_MEMORY))
+    try:
+        options: dict[str, Any] = {"skip_materials": True} if path.suffix.lower() == ".obj" else {}
+        content = io.BytesIO(path.read_bytes())  # an open file has a name, from which the reader would go on
+        mesh: Any = trimesh.load(content, file_type=path.suffix.lower()[1:], force="mesh", process=False, **options)
+        vertices, faces = np.asarray(mesh.vertices, np.float64).reshape(-1, 3), np.asarray(mesh.faces, np.int64).reshape(-1, 3)
+    except OSError as error:
+        return {"error": f"{name} cannot be read: {error.strerror or error}."}
+    except MemoryError:
+        raise
+    except Exception as error:  # the readers of trimesh raise what they come across
+        return {"error": f"{name} is not a readable mesh ({' '.join(repr(error).split())[:120]})."}
+    if len(faces) == 0 or not np.isfinite(vertices).all() or faces.min() < 0 or faces.max() >= len(vertices):
+        return {"error": f"{name} holds no triangles, or vertices that are not finite."}
+    np.savez(Path(request["target"]), vertices=vertices, faces=faces)
+    return {}
+
+
+def main() -> None:
+    """Answer requests until the parent closes the pipe."""
+    serve(answer)
