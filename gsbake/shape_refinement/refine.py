@@ -1,26 +1,32 @@
-"""The whole refinement: coarse light and blurred photos first, then finer ones, a few Gauss–Newton steps each."""
+"""The whole refinement: silhouettes and patches first; then, where the photos' patches confirm little, parallax and reflections.
+
+Masks are offset by the same amount everywhere, and surfels by as much: the first phase moves the surface as a whole, smoothly. Where photos
+correlate at most places the surface is matte and textured, and that is all. Elsewhere reflections are what the photos know of the shape:
+coarse light and blurred photos first, then finer ones, a few Gauss–Newton steps each.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gsbake.geometry.cameras import Camera
-from gsbake.geometry.raycast import RayCaster
 from gsbake.monitor import SILENT, Monitor
 from gsbake.shape_refinement.appearance import Appearance, Geometry, choose_light_vertices, fit_appearance, fit_light
-from gsbake.shape_refinement.contour import find_contour_points
 from gsbake.shape_refinement.reflection_map import ReflectionMap
 from gsbake.shape_refinement.samples import Doubles, Floats, Photo, sample_photos
-from gsbake.shape_refinement.step import Contour, StepOptions, contour_rows, solve_step
+from gsbake.shape_refinement.step import PhotoRows, StepOptions, measure_rows, solve_step
 from gsbake.shape_refinement.surface import Surface
+from gsbake.shape_refinement.targets import Targets, contour_targets
 
 Faces = NDArray[np.int32]
 #: A camera and its mask (h, w), 0..255.
 Mask = tuple[Camera, NDArray[np.uint8] | None]
+#: Measures patches of the photos at the vertices (v, 3) of a surface: targets, and the share of the vertices at which most photos agree.
+PatchMeasure = Callable[[Surface, Doubles], tuple[Targets, float]]
 #: Length in pixels of a refined mesh's edges: the photos say nothing between.
 EDGE_PIXELS = 2.0
 #: Level of the light at the start.
@@ -42,22 +48,24 @@ class Level:
 class RefinementOptions:
     """Settings of the refinement."""
 
-    levels: tuple[Level, ...] = (Level(16, 2, 2.0, False), Level(16, 2, 2.0), Level(24, 4, 1.4), Level(32, 4, 0.8))
+    #: Steps of the first phase and how much stiffer they are; share of confirmed vertices from which on there is no second phase.
+    first_steps: int = 3
+    first_stiffness: float = 3.0
+    confirmed: float = 0.2
+    levels: tuple[Level, ...] = (Level(16, 2, 2.0, held=False), Level(16, 2, 2.0), Level(24, 4, 1.4), Level(32, 4, 0.8))
     step: StepOptions = field(default_factory=StepOptions)
     #: Alternations of light and appearance at a level's first step, and at the others.
     first_alternations: int = 6
     alternations: int = 2
-    #: Steps between searches for contour points.
+    #: Steps of a level between searches for contour points.
     contour_every: int = 3
 
 
 @dataclass(frozen=True)
 class Refined:
-    """The refined `vertices` (v, 3), and what was found with them."""
+    """The refined `vertices` (v, 3), with figures of the first phase and, where there was a second one, of reflections."""
 
     vertices: Doubles
-    appearance: Appearance
-    light: ReflectionMap
     figures: dict[str, float]
 
 
@@ -66,6 +74,8 @@ def refine_shape(
     faces: Faces,
     load_photos: Callable[[float], Sequence[Photo]],
     masks: Callable[[], Iterable[Mask]] | None,
+    pixel: float,
+    measure_patches: PatchMeasure | None = None,
     options: RefinementOptions | None = None,
     *,
     seed: int = 0,
@@ -76,67 +86,90 @@ def refine_shape(
     """Refine the vertices (v, 3) of a mesh with outward `faces` (f, 3), in the frame of the cameras.
 
     `load_photos` returns the photos blurred by a number of pixels, the same cameras each time; `masks` yields the masks at their own size,
-    None where not every photo has one.
+    None where not every photo has one; `pixel` is the size of a photo's pixel at the object (`pixel_size`).
     """
     options = options or RefinementOptions()
-    surface = Surface(len(vertices), faces)
-    current = np.array(vertices, np.float64)
-    total, since_contour = np.zeros(len(current)), np.zeros(len(current))
-    robust: Floats | None = None
-    appearance = Appearance.initial(len(current))
-    light = ReflectionMap.constant(options.levels[0].light, FIRST_LEVEL)
-    variance = np.zeros(len(current), np.float32)
-    contour: Contour | None = None
-    figures: dict[str, float] = {}
-    offsets: list[float] = []
-    for level in options.levels:
-        photos = load_photos(level.blur)
-        centres = np.stack([photo.camera.centre for photo in photos])
-        pixel = pixel_size(current, [photo.camera for photo in photos])
-        robust = np.ones((len(current), len(photos)), np.float32) if robust is None else robust
-        light = light.resampled(level.light) if light.size != level.light else light
-        for index in range(level.steps):
-            monitor.check_stop()
-            normals = surface.normals(current)
-            geometry = Geometry(current, normals, centres)
-            samples = sample_photos(current, normals, faces, photos)
-            chosen = choose_light_vertices(samples, seed)
-            for _ in range(options.alternations if index else options.first_alternations):
-                light = fit_light(geometry, samples, robust, appearance, light, chosen)
-                appearance = fit_appearance(surface, geometry, samples, robust, light)
-            appearance = appearance.at_least(variance)
-            if masks is not None and index % options.contour_every == 0:
-                contour, since_contour = _find_contour(surface, geometry, masks(), threads), np.zeros(len(current))
-                offsets.append(contour.offset)
-            step = solve_step(
-                surface, geometry, samples, robust, light, appearance, total if level.held else None, pixel, contour, since_contour,
-                options.step,
-            )  # fmt: skip
-            variance = step.variance
-            total = total + step.displacement if level.held else total
-            since_contour = since_contour + step.displacement
-            current = current + normals * step.displacement[:, None]
-            figures = {
-                "explained": appearance.explained, "residual": step.relative_residual,
-                "step_pixels": float(np.abs(step.displacement).mean() / pixel),
-            }  # fmt: skip
-            on_step(f"light {level.light} step {index}: " + ", ".join(f"{k} {v:.3f}" for k, v in figures.items()), current)
-    figures["moved_pixels"] = float(np.linalg.norm(current - vertices, axis=1).mean() / pixel)
-    if offsets:
-        figures |= {"contour_before": offsets[0], "contour_after": offsets[-1]}
-    return Refined(current, appearance, light, figures)
+    run = _Refinement(Surface(len(vertices), faces), np.array(vertices, np.float64), masks, pixel, options, seed, threads, monitor, on_step)
+    if run.follow_targets(measure_patches) < options.confirmed:
+        run.follow_photos(load_photos)
+    moved = float(np.linalg.norm(run.current - vertices, axis=1).mean() / pixel)
+    return Refined(run.current, run.figures | {"moved_pixels": moved})
 
 
-def _find_contour(surface: Surface, geometry: Geometry, masks: Iterable[Mask], threads: int) -> Contour:
-    """Contour points of the mesh in all masks."""
-    caster = RayCaster(geometry.vertices, surface.faces, threads)
-    given = [(camera, mask) for camera, mask in masks if mask is not None]
-    parts = [find_contour_points(caster, geometry.normals, surface.edges, camera, mask) for camera, mask in given]
-    start, end, fraction, offset, pixel = (
-        np.concatenate([getattr(part, name) for part in parts]) for name in ("start", "end", "fraction", "offset", "pixel")
-    )
-    median = float(np.median(offset)) if len(offset) else 0.0
-    return Contour(contour_rows(start, end, fraction, surface.count), offset * pixel, pixel, median)
+@dataclass
+class _Refinement:
+    """State of one refinement."""
+
+    surface: Surface
+    current: Doubles
+    masks: Callable[[], Iterable[Mask]] | None
+    pixel: float
+    options: RefinementOptions
+    seed: int
+    threads: int
+    monitor: Monitor
+    on_step: Callable[[str, Doubles], None]
+    figures: dict[str, float] = field(default_factory=dict)
+
+    def contour(self) -> list[Targets]:
+        """Targets of the contour points, where there are masks."""
+        if self.masks is None:
+            return []
+        targets, offset = contour_targets(self.surface, self.current, self.masks(), self.threads)
+        self.figures = {"contour_before": offset} | self.figures | {"contour_after": offset}
+        return [targets]
+
+    def move(self, text: str, displacement: Doubles) -> None:
+        """Move the vertices along their normals by `displacement` (v,)."""
+        self.current = self.current + self.surface.normals(self.current) * displacement[:, None]
+        self.figures["step_pixels"] = float(np.abs(displacement).mean() / self.pixel)
+        self.on_step(text, self.current)
+
+    def follow_targets(self, measure_patches: PatchMeasure | None) -> float:
+        """The first phase; the share of the vertices at which the photos' patches agree."""
+        step, confirmed = self.options.step, 0.0
+        step = replace(step, bend=step.bend / self.options.first_stiffness, slope=step.slope / self.options.first_stiffness)
+        for index in range(self.options.first_steps):
+            self.monitor.check_stop()
+            targets = self.contour()
+            if measure_patches is not None:
+                patches, confirmed = measure_patches(self.surface, self.current)
+                targets.append(patches)
+            self.move(f"silhouettes and patches {index}", solve_step(self.surface, self.current, self.pixel, targets, step))
+        self.figures["confirmed"] = confirmed
+        return confirmed
+
+    def follow_photos(self, load_photos: Callable[[float], Sequence[Photo]]) -> None:
+        """The second phase."""
+        surface, options = self.surface, self.options
+        count = surface.count
+        total, variance = np.zeros(count), np.zeros(count, np.float32)
+        robust: Floats | None = None
+        appearance = Appearance.initial(count)
+        light = ReflectionMap.constant(options.levels[0].light, FIRST_LEVEL)
+        targets: list[Targets] = []
+        for level in options.levels:
+            photos = load_photos(level.blur)
+            centres = np.stack([photo.camera.centre for photo in photos])
+            robust = np.ones((count, len(photos)), np.float32) if robust is None else robust
+            light = light.resampled(level.light) if light.size != level.light else light
+            for index in range(level.steps):
+                self.monitor.check_stop()
+                geometry = Geometry(self.current, surface.normals(self.current), centres)
+                samples = sample_photos(geometry.vertices, geometry.normals, surface.faces, photos)
+                chosen = choose_light_vertices(samples, self.seed)
+                for _ in range(options.alternations if index else options.first_alternations):
+                    light = fit_light(geometry, samples, robust, appearance, light, chosen)
+                    appearance = fit_appearance(surface, geometry, samples, robust, light)
+                appearance = appearance.at_least(variance)
+                if index % options.contour_every == 0:
+                    targets = self.contour()
+                rows: PhotoRows = measure_rows(surface, geometry, samples, robust, light, appearance, self.pixel)
+                step = solve_step(surface, self.current, self.pixel, targets, options.step, rows, total if level.held else None)
+                variance, total = rows.variance, total + step if level.held else total
+                targets = [target.moved(step) for target in targets]
+                self.figures |= {"explained": appearance.explained, "residual": rows.relative_residual}
+                self.move(f"light {level.light} step {index}", step)
 
 
 def pixel_size(vertices: Doubles, cameras: Sequence[Camera]) -> float:

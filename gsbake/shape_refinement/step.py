@@ -1,6 +1,6 @@
-"""One Gauss–Newton step: displacements along the normals from the rows of parallax, reflections and silhouettes, and priors.
+"""One Gauss–Newton step: displacements along the normals from the rows of parallax, reflections and measured targets, and priors.
 
-    H = Σ J_d² + ∇ᵀ T ∇ + contour rows + priors,      T = Σ J_∇ J_∇ᵀ
+    H = Σ J_d² + ∇ᵀ T ∇ + targets + priors,      T = Σ J_∇ J_∇ᵀ
 
 Parallax is a diagonal, reflections see the gradient of the displacement, so they add a stiffness matrix with the tensor T; the rows that
 couple both are left out. Priors keep a step smooth, and hold the total move near 0 where the start explains the photos: their weights
@@ -9,10 +9,10 @@ redescend with the move, 1/(1 + q²), and are released where the residual is wor
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.linalg import LinearOperator, cg
 
@@ -22,6 +22,7 @@ from gsbake.shape_refinement.reflection_kernel import gauss_newton_rows
 from gsbake.shape_refinement.reflection_map import ReflectionMap
 from gsbake.shape_refinement.samples import Doubles, Floats, VertexSamples
 from gsbake.shape_refinement.surface import Surface, tangents
+from gsbake.shape_refinement.targets import Targets, add_systems
 
 
 @dataclass(frozen=True)
@@ -41,44 +42,28 @@ class StepOptions:
     release: float = 1.0
     #: Longest step.
     most: float = 1.5
-    #: Standard deviation of a silhouette's contour point, and the residual beyond which it counts linearly (Huber).
-    contour: float = 0.3
-    contour_outlier: float = 0.7
 
 
 @dataclass(frozen=True)
-class Contour:
-    """Contour points of all photos: `rows` (points, v) interpolate displacements, `target` (points,) what moves them to the masks, and
-    `pixel` (points,) the size of a pixel there; `offset` is their median distance in pixels outward to the masks."""
+class PhotoRows:
+    """Normal equations of the photos at each vertex: `hessian` (v, 4) of displacement and of the gradient along the `frame` (v, 2, 3) (uu,
+    uv, vv), `gradient` (v, 3); `worth` (v,), the square of how many pixels of parallax the residual is worth; `variance` (v,) of a sample
+    for the next appearance; `relative_residual`, the root mean square of a photo's residual over the brightness."""
 
-    rows: sparse.csr_matrix
-    target: Doubles
-    pixel: Doubles
-    offset: float
-
-
-@dataclass(frozen=True)
-class Step:
-    """Displacements (v,) along the normals; `variance` (v,) of a sample for the next appearance; `relative_residual`, the root mean square
-    of a photo's residual over the brightness."""
-
-    displacement: Doubles
+    frame: Doubles
+    hessian: Doubles
+    gradient: Doubles
+    worth: Doubles
     variance: Floats
     relative_residual: float
 
 
-def solve_step(
+def measure_rows(
     surface: Surface, geometry: Geometry, samples: VertexSamples, robust: Floats, light: ReflectionMap, appearance: Appearance,
-    total: Doubles | None, pixel: float, contour: Contour | None, since_contour: Doubles, options: StepOptions,
-) -> Step:  # fmt: skip
-    """The next displacements.
-
-    `robust` (v, photos) gets the weights of the samples' residuals; `total` (v,) is the move so far, None for a step that
-    nothing holds, `since_contour` (v,) the part since the
-    contour points were found, `pixel` the size of a pixel at the object, all in the mesh's unit.
-    """
-    count, faces = surface.count, surface.faces
-    frame = tangents(geometry.normals)
+    pixel: float,
+) -> PhotoRows:  # fmt: skip
+    """The photos' rows; `robust` (v, photos) gets the weights of the samples' residuals."""
+    count, frame = surface.count, tangents(geometry.normals)
     hessian, gradient, residual = np.zeros((count, 4)), np.zeros((count, 3)), np.zeros((count, 2), np.float32)
     fixed = (
         geometry.vertices, geometry.normals, frame, geometry.centres, samples.colour, samples.slope, samples.weight, robust, light.tables(),
@@ -86,70 +71,68 @@ def solve_step(
         hessian, gradient, residual,
     )  # fmt: skip
     run_chunks(lambda start, stop: gauss_newton_rows(start, stop, *fixed), count)
-    hessian *= options.independent
-    gradient *= options.independent
-
-    hat = surface.gradients(geometry.vertices)
-    t1, t2 = frame[:, 0], frame[:, 1]
-    share = 1 / surface.degree  # of a vertex in each of its faces
-    outer = (
-        hessian[:, 1, None, None] * t1[:, :, None] * t1[:, None]
-        + hessian[:, 3, None, None] * t2[:, :, None] * t2[:, None]
-        + hessian[:, 2, None, None] * (t1[:, :, None] * t2[:, None] + t2[:, :, None] * t1[:, None])
-    ) * share[:, None, None]
-    pull = (gradient[:, 1, None] * t1 + gradient[:, 2, None] * t2) * share[:, None]
-    tensor = outer[faces].sum(1) + np.eye(3) * (0.5 / np.radians(options.slope) ** 2)
-    matrix = surface.stiffness(hat @ tensor @ hat.transpose(0, 2, 1))
-    right = -gradient[:, 0] - surface.sum_corners(np.einsum("fia,fa->fi", hat, pull[faces].sum(1)))
-
-    edge = surface.mean_edge(geometry.vertices)
-    worth = _worth(surface, samples, residual, appearance.importance, pixel)
-    umbrella, bend = surface.umbrella, edge * np.radians(options.bend)
-    matrix = matrix + surface.bending * (1 / bend**2) + sparse.diags(hessian[:, 0] + 1 / (options.move * pixel) ** 2)
-    if total is not None:
-        keep_move, keep_bend = _total_weights(surface, total, worth, pixel, edge, options)
-        matrix = matrix + umbrella.T @ sparse.diags(keep_bend) @ umbrella + sparse.diags(keep_move)
-        right -= keep_move * total + umbrella.T @ (keep_bend * (umbrella @ total))
-    if contour is not None and len(contour.target):
-        distance = (contour.target - contour.rows @ since_contour) / contour.pixel
-        weight = np.minimum(1, options.contour_outlier / np.maximum(np.abs(distance), 1e-9)) / (options.contour * contour.pixel) ** 2
-        weight *= min(1.0, 0.5 * count / len(distance))  # points between the same vertices say the same
-        matrix = matrix + contour.rows.T @ sparse.diags(weight) @ contour.rows
-        right += contour.rows.T @ (weight * distance * contour.pixel)
-    matrix = matrix.tocsr()
-    inverse = 1 / np.maximum(matrix.diagonal(), 1e-30)
-    solution, _ = cg(matrix, right, rtol=1e-2, maxiter=150, M=LinearOperator(matrix.shape, matvec=lambda x: inverse * x.ravel()))
-    limit = options.most * pixel
     seen = samples.weight.max(1, initial=0) > 0
+    both = surface.averaged(np.stack([residual[:, 0], residual[:, 1] * pixel**2], 1) * appearance.importance[:, None], 12)
     smooth = surface.averaged(np.stack([residual[:, 0] * seen, seen], 1), 8)
     relative = residual[seen, 0] * appearance.importance[seen]
-    return Step(
-        np.clip(solution, -limit, limit),
+    return PhotoRows(
+        frame, hessian, gradient,
+        np.asarray(both[:, 0] / np.maximum(both[:, 1], 1e-12), np.float64),
         np.asarray(smooth[:, 0] / np.maximum(smooth[:, 1], 1e-3) / 3, np.float32),
         float(np.sqrt(relative.mean())) if len(relative) else 0.0,
-    )
+    )  # fmt: skip
 
 
-def _worth(surface: Surface, samples: VertexSamples, residual: Floats, importance: Floats, pixel: float) -> Doubles:
-    """How many pixels of parallax the residual is worth (v,), squared: its mean square over that of the slopes."""
-    both = surface.averaged(np.stack([residual[:, 0], residual[:, 1] * pixel**2], 1) * importance[:, None], 12)
-    return np.asarray(both[:, 0] / np.maximum(both[:, 1], 1e-12), np.float64)
+def solve_step(
+    surface: Surface, vertices: Doubles, pixel: float, targets: Sequence[Targets], options: StepOptions, photos: PhotoRows | None = None,
+    total: Doubles | None = None,
+) -> Doubles:  # fmt: skip
+    """The next displacements (v,) of the `vertices` (v, 3) along their normals, at most `options.most` pixels.
+
+    `pixel` is the size of a pixel at the object in the mesh's unit; `total` (v,) the move so far, which is held where `photos` are
+    explained, or None for a step that nothing holds.
+    """
+    count, edge = surface.count, surface.mean_edge(vertices)
+    hat = surface.gradients(vertices)
+    matrix, right = add_systems(targets, count)
+    matrix = matrix + surface.bending * (1 / (edge * np.radians(options.bend)) ** 2)
+    diagonal = np.full(count, 1 / (options.move * pixel) ** 2)
+    tensor = np.eye(3) * (0.5 / np.radians(options.slope) ** 2)
+    if photos is not None:
+        diagonal += options.independent * photos.hessian[:, 0]
+        curvature, pull = _reflection_system(surface, photos)
+        tensor = options.independent * curvature + tensor
+        right -= options.independent * (photos.gradient[:, 0] + surface.sum_corners(np.einsum("fia,fa->fi", hat, pull)))
+        if total is not None:
+            move, bend = _total_weights(surface, total, photos.worth, pixel, edge, options)
+            matrix = matrix + surface.umbrella.T @ sparse.diags(bend) @ surface.umbrella
+            diagonal += move
+            right -= move * total + surface.umbrella.T @ (bend * (surface.umbrella @ total))
+    matrix = (matrix + surface.stiffness(hat @ tensor @ hat.transpose(0, 2, 1)) + sparse.diags(diagonal)).tocsr()
+    inverse = 1 / np.maximum(matrix.diagonal(), 1e-30)
+    solution, _ = cg(matrix, right, rtol=1e-2, maxiter=150, M=LinearOperator(matrix.shape, matvec=lambda x: inverse * x.ravel()))
+    return np.clip(solution, -options.most * pixel, options.most * pixel)
+
+
+def _reflection_system(surface: Surface, photos: PhotoRows) -> tuple[Doubles, Doubles]:
+    """Tensors (f, 3, 3) and gradients (f, 3) of the faces for the displacement's gradient: a vertex has a share in each of its faces."""
+    share = 1 / surface.degree
+    t1, t2 = photos.frame[:, 0], photos.frame[:, 1]
+    uu, uv, vv = (photos.hessian[:, k, None, None] for k in (1, 2, 3))
+    outer = uu * t1[:, :, None] * t1[:, None] + vv * t2[:, :, None] * t2[:, None]
+    outer += uv * (t1[:, :, None] * t2[:, None] + t2[:, :, None] * t1[:, None])
+    pull = photos.gradient[:, 1, None] * t1 + photos.gradient[:, 2, None] * t2
+    faces = surface.faces
+    return (outer * share[:, None, None])[faces].sum(1), (pull * share[:, None])[faces].sum(1)
 
 
 def _total_weights(
     surface: Surface, total: Doubles, worth: Doubles, pixel: float, edge: float, options: StepOptions
 ) -> tuple[Doubles, Doubles]:
-    """Weights (v,) of the total move and of its bend."""
+    """Weights (v,) of the total move and of its bend; `worth` (v,) in square pixels."""
     free = 1 / (1 + (worth / options.release**2) ** 2)
     out = []
     for value, deviation in ((total, options.total_move * pixel), (surface.umbrella @ total, edge * np.radians(options.total_bend))):
         square = surface.averaged((value / deviation)[:, None] ** 2, 6)[:, 0].astype(float)
         out.append(free / (1 + square) / deviation**2)
     return out[0], out[1]
-
-
-def contour_rows(start: NDArray[np.int64], end: NDArray[np.int64], fraction: Doubles, count: int) -> sparse.csr_matrix:
-    """Interpolation (points, count) at `fraction` of the edges from `start` to `end`."""
-    rows = np.arange(len(start))
-    values, columns = np.concatenate([1 - fraction, fraction]), np.concatenate([start, end])
-    return sparse.csr_matrix((values, (np.concatenate([rows, rows]), columns)), (len(rows), count))
