@@ -8,7 +8,7 @@ coarse light and blurred photos first, then finer ones, a few Gauss–Newton ste
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,9 +48,9 @@ class Level:
 class RefinementOptions:
     """Settings of the refinement."""
 
-    #: Steps of the first phase and how much stiffer they are; share of confirmed vertices from which on there is no second phase.
+    #: Steps of the first phase and their weights; share of confirmed vertices from which on there is no second phase.
     first_steps: int = 3
-    first_stiffness: float = 3.0
+    first: StepOptions = field(default_factory=lambda: StepOptions(bend=6.0, slope=6.0, move=1.5))
     confirmed: float = 0.2
     levels: tuple[Level, ...] = (Level(16, 2, 2.0, held=False), Level(16, 2, 2.0), Level(24, 4, 1.4), Level(32, 4, 0.8))
     step: StepOptions = field(default_factory=StepOptions)
@@ -127,15 +127,14 @@ class _Refinement:
 
     def follow_targets(self, measure_patches: PatchMeasure | None) -> float:
         """The first phase; the share of the vertices at which the photos' patches agree."""
-        step, confirmed = self.options.step, 0.0
-        step = replace(step, bend=step.bend / self.options.first_stiffness, slope=step.slope / self.options.first_stiffness)
+        confirmed = 0.0
         for index in range(self.options.first_steps):
             self.monitor.check_stop()
             targets = self.contour()
             if measure_patches is not None:
                 patches, confirmed = measure_patches(self.surface, self.current)
                 targets.append(patches)
-            self.move(f"silhouettes and patches {index}", solve_step(self.surface, self.current, self.pixel, targets, step))
+            self.move(f"silhouettes and patches {index}", solve_step(self.surface, self.current, self.pixel, targets, self.options.first))
         self.figures["confirmed"] = confirmed
         return confirmed
 
