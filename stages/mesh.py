@@ -13,7 +13,12 @@ def run(ctx: Context) -> dict[str, Any]:
 
     s = ctx.settings
     options = MeshOptions(
-        s.mesh, s.train.max_size, s.stereo.max_size, s.skip.empty_cells, s.surfels.projected_depth, s.export.max_triangles,
+        s.mesh,
+        s.train.max_size,
+        s.stereo.max_size,
+        s.skip.empty_cells,
+        s.surfels.projected_depth,
+        s.export.max_triangles,
         s.train.holdout,
     )
     return extract_mesh(
@@ -22,7 +27,7 @@ def run(ctx: Context) -> dict[str, Any]:
     )  # fmt: skip
 
 
-#: Modules with the kernels of this stage, and with those of the shape's refinement.
+#: Modules with the kernels of this stage, with those of the shape's refinement, and with one that only depths of stereo need.
 KERNELS = (
     "gsbake.meshing.fusion_kernel", "gsbake.meshing.depth_views", "gsbake.meshing.hole_filling", "gsbake.geometry.sparse_lattice",
     "gsbake.meshing.marching_cubes", "gsbake.meshing.refinement.normals", "gsbake.geometry.surface_distance",
@@ -30,6 +35,14 @@ KERNELS = (
 REFINEMENT_KERNELS = (
     "gsbake.shape_refinement.samples_kernel", "gsbake.shape_refinement.reflection_kernel", "gsbake.shape_refinement.surface",
 )  # fmt: skip
+STEREO_KERNELS = ("gsbake.meshing.refinement.photometric_kernel",)
+
+
+def kernels(settings: Any) -> tuple[str, ...]:
+    """Modules with the kernels that these settings need."""
+    if not settings.mesh.refinement_vertices:
+        return KERNELS
+    return KERNELS + REFINEMENT_KERNELS + (() if settings.stereo.enabled == "never" else STEREO_KERNELS)
 
 
 STAGE = Stage(
@@ -44,5 +57,5 @@ STAGE = Stage(
         "export.max_triangles",
     ),
     uses_device=True,
-    kernels=lambda settings: KERNELS + REFINEMENT_KERNELS if settings.mesh.refinement_vertices else KERNELS,
+    kernels=kernels,
 )  # fmt: skip

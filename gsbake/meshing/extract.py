@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,7 @@ from gsbake.capture.photos.roles import test_photos
 from gsbake.capture.posed_photos import PosedPhotos
 from gsbake.config.schema import Mesh
 from gsbake.errors import BadInputError
+from gsbake.geometry.cameras import Camera
 from gsbake.geometry.ply import write_mesh
 from gsbake.meshing import cleanup
 from gsbake.meshing.decimation import decimate_to_error_bound
@@ -25,6 +26,7 @@ from gsbake.meshing.depth_cache import DepthViewCache
 from gsbake.meshing.depth_views import DepthView, depth_noise
 from gsbake.meshing.refinement.normal_filter import denoise
 from gsbake.meshing.refinement.normals import NormalAccumulator, integrate_normals
+from gsbake.meshing.refinement.photometric_measure import PatchTargets, PhotometricViews
 from gsbake.meshing.repair import close_holes, repair
 from gsbake.meshing.resolution import Resolution, choose_resolution, pixel_footprint
 from gsbake.meshing.stereo_depth import merge_stereo_depth
@@ -32,6 +34,7 @@ from gsbake.meshing.support_plane import SupportPlane, find_support_plane, remov
 from gsbake.meshing.tsdf import SparseTsdf
 from gsbake.monitor import SILENT, Monitor, Rule, decide_skip, skips
 from gsbake.mvs.depth_maps import read_depth
+from gsbake.mvs.pyramids import Photo, load_photo
 from gsbake.shape_refinement.refine import pixel_size, proxy_edge, refine_shape
 from gsbake.shape_refinement.samples import load_photos
 from gsbake.shape_refinement.surface import Surface
@@ -51,6 +54,8 @@ Faces = NDArray[np.int32]
 TRUNCATION_CELLS = (4.0, 10.0)
 #: Maximum difference in voxels at which a stereo depth replaces a rendered one.
 STEREO_TOLERANCE = 3.0
+#: Memory for photos whose patches are compared, in bytes.
+PHOTO_CACHE_BYTES = 1 << 29
 #: Most photos that the shape is refined with.
 MAX_REFINEMENT_PHOTOS = 96
 #: Minimum extent of the surfels in the unit frame.
@@ -149,7 +154,7 @@ class _Extraction:
         with self.monitor.part("clean"):
             vertices, faces, dropped = self._clean(vertices, faces, cache, resolution.cell, support)
         with self.monitor.part("shape"):
-            vertices, refinement = self._refine_shape(vertices, faces)
+            vertices, refinement = self._refine_shape(vertices, faces, resolution.cell)
         with self.monitor.part("denoising"):
             vertices = denoise(vertices, faces, self.options.mesh.denoising_iterations)
         write_mesh(self.out / "dense.ply", vertices, faces)
@@ -279,32 +284,55 @@ class _Extraction:
         wavelength = self.options.mesh.normal_wavelength * cell
         return integrate_normals(vertices, faces, normals, confidence, wavelength, max_displacement=1.5 * cell)
 
-    def _refine_shape(self, vertices: Doubles, faces: Faces) -> tuple[Doubles, dict[str, float]]:
-        """Refine the vertices by parallax, reflections and silhouettes, on a coarser mesh; also results for the manifest."""
+    def _refine_shape(self, vertices: Doubles, faces: Faces, cell: float) -> tuple[Doubles, dict[str, float]]:
+        """Refine the vertices by the masks and photos, on a coarser mesh; also results for the manifest."""
         settings, monitor, posed = self.options.mesh, self.monitor, self.posed
         if not settings.refinement_vertices:
             monitor.decide("shape refinement", "skipped", "set by the profile")
             return vertices, {}
-        chosen = [index for index in range(len(posed)) if index not in set(test_photos(len(posed), self.options.holdout))]
+        test = set(test_photos(len(posed), self.options.holdout))
+        chosen = [index for index in range(len(posed)) if index not in test]
         chosen = chosen[:: -(-len(chosen) // MAX_REFINEMENT_PHOTOS)]
         size, decimator = self.options.stereo_size, resolve_decimator(settings.decimator)
         cameras = [posed.cameras.cameras[index].downscaled_to(size) for index in chosen]
-        edge = proxy_edge(vertices, faces, pixel_size(vertices, cameras), settings.refinement_vertices)
+        pixel = pixel_size(vertices, cameras)
+        edge = proxy_edge(vertices, faces, pixel, settings.refinement_vertices)
         coarse, coarse_faces = remesh(vertices, faces, edge, decimator)
         if len(coarse_faces) == 0:
             return vertices, {}
-        masks = (lambda: (posed.mask(index) for index in chosen)) if posed.has_masks else None
         result = refine_shape(
-            coarse, coarse_faces, lambda blur: load_photos(posed, chosen, size, blur), masks, threads=self.threads, monitor=monitor
-        )
+            coarse, coarse_faces, lambda blur: load_photos(posed, chosen, size, blur),
+            (lambda: (posed.mask(index) for index in chosen)) if posed.has_masks else None,
+            pixel, self._patches(chosen, cameras, STEREO_TOLERANCE * cell), seed=self.seed, threads=self.threads, monitor=monitor,
+        )  # fmt: skip
         before, fine = Surface(len(coarse), coarse_faces), Surface(len(vertices), faces)
         move = transfer_displacements(vertices, fine.normals(vertices), coarse, before.normals(coarse), result.vertices)
         figures = result.figures
-        evidence = f"{len(coarse)} vertices in {len(chosen)} photos; reflections explain {100 * figures['explained']:.0f} % of what changes"
-        if masks is not None:
+        evidence = (
+            f"{len(coarse)} vertices in {len(chosen)} photos; {100 * figures['confirmed']:.0f} % of the surface match in most photos"
+        )
+        if "explained" in figures:
+            evidence += f"; reflections explain {100 * figures['explained']:.0f} % of what changes between photos"
+        if "contour_after" in figures:
             evidence += f"; contours {figures['contour_before']:+.2f} px from the masks before, {figures['contour_after']:+.2f} px after"
         monitor.decide("shape refinement", f"mean displacement {figures['moved_pixels']:.2f} px", evidence)
         return vertices + move, {f"refinement_{name}": value for name, value in figures.items()}
+
+    def _patches(self, chosen: list[int], cameras: list[Camera], tolerance: float) -> PatchTargets | None:
+        """What compares patches of the `chosen` photos where stereo confirmed depths; None where it did nowhere."""
+        files = [] if self.stereo is None else [self.stereo / "depth" / f"{camera.name}.npz" for camera in cameras]
+        if not any(file.exists() for file in files):
+            return None
+
+        @lru_cache(maxsize=max(8, PHOTO_CACHE_BYTES // (2 * max(c.width * c.height for c in cameras))))
+        def photo(index: int) -> Photo:
+            self.monitor.check_stop()
+            return load_photo(self.posed, chosen[index], self.options.stereo_size)
+
+        return PatchTargets(
+            PhotometricViews(cameras, photo, lambda index: read_depth(files[index]) if files[index].exists() else None, tolerance),
+            self.threads,
+        )
 
     def _decimate(self, vertices: Doubles, faces: Faces, cell: float) -> dict[str, Any]:
         """Decimate and write the low-poly mesh; its results for the manifest."""

@@ -50,9 +50,11 @@ class RefinementOptions:
 
     #: Steps of the first phase and their weights; share of confirmed vertices from which on there is no second phase.
     first_steps: int = 3
-    first: StepOptions = field(default_factory=lambda: StepOptions(bend=6.0, slope=6.0, move=1.5))
+    first: StepOptions = field(default_factory=lambda: StepOptions(bend=6.0, slope=8.0, move=3.0))
     confirmed: float = 0.2
-    levels: tuple[Level, ...] = (Level(16, 2, 2.0, held=False), Level(16, 2, 2.0), Level(24, 4, 1.4), Level(32, 4, 0.8))
+    levels: tuple[Level, ...] = (
+        Level(16, 2, 2.0, held=False), Level(16, 2, 2.0), Level(24, 4, 1.4), Level(32, 6, 0.8), Level(48, 3, 0.6),
+    )  # fmt: skip
     step: StepOptions = field(default_factory=StepOptions)
     #: Alternations of light and appearance at a level's first step, and at the others.
     first_alternations: int = 6
@@ -147,8 +149,10 @@ class _Refinement:
         appearance = Appearance.initial(count)
         light = ReflectionMap.constant(options.levels[0].light, FIRST_LEVEL)
         targets: list[Targets] = []
+        photos: Sequence[Photo] = ()
+        blur = -1.0
         for level in options.levels:
-            photos = load_photos(level.blur)
+            photos, blur = photos if level.blur == blur else load_photos(level.blur), level.blur
             centres = np.stack([photo.camera.centre for photo in photos])
             robust = np.ones((count, len(photos)), np.float32) if robust is None else robust
             light = light.resampled(level.light) if light.size != level.light else light

@@ -48,10 +48,6 @@ def load_photos(posed: PosedPhotos, indices: Sequence[int], max_size: int, blur:
         view = posed.view(index, max_size)
         rgb = decode_bytes(view.rgb).astype(np.float32)
         mask = np.ones(rgb.shape[:2], np.float32) if view.mask is None else np.asarray(view.mask / np.float32(255), np.float32)
-        import os
-        e=int(os.environ.get("ERODE","0"))
-        if e and view.mask is not None:
-            mask = cv2.erode((mask > 0.99).astype(np.float32), np.ones((2*e+1, 2*e+1)))
         if blur > 0:
             share = cv2.GaussianBlur(mask, (0, 0), blur)
             inside = cv2.GaussianBlur(rgb * mask[..., None], (0, 0), blur)

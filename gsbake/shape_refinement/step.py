@@ -36,7 +36,7 @@ class StepOptions:
     slope: float = 40.0
     move: float = 5.0
     #: Standard deviations of the total move: distance, and bend per edge.
-    total_move: float = 0.5
+    total_move: float = 1.0
     total_bend: float = 2.0
     #: Parallax that the residual must be worth for the total move to be free.
     release: float = 1.0

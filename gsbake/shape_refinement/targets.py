@@ -21,14 +21,12 @@ CONTOUR_DEVIATION, CONTOUR_OUTLIER = 0.3, 0.7
 @dataclass(frozen=True)
 class Targets:
     """Displacements along the normals: `rows` (m, v) interpolate them at measured points, `target` (m,) is what they should be, with
-    `information` (m,) per square length. Residuals over `outlier` (m,) count less: linearly (Huber), or hardly at all where `redescending`
-    (Geman–McClure)."""
+    `information` (m,) per square length. Residuals over `outlier` (m,) count linearly (Huber)."""
 
     rows: sparse.csr_matrix
     target: Doubles
     information: Doubles
     outlier: Doubles
-    redescending: bool = False
 
     def moved(self, displacement: Doubles) -> Targets:
         """What is left after the vertices moved by `displacement` (v,)."""
@@ -36,8 +34,7 @@ class Targets:
 
     def weights(self) -> Doubles:
         """Weight (m,) of each target."""
-        ratio = np.abs(self.target) / self.outlier
-        return self.information * ((1 + ratio**2) ** -2 if self.redescending else np.minimum(1, 1 / np.maximum(ratio, 1e-9)))
+        return self.information * np.minimum(1, self.outlier / np.maximum(np.abs(self.target), 1e-9 * self.outlier))
 
     def system(self) -> tuple[sparse.csr_matrix, Doubles]:
         """Matrix (v, v) and right side (v,) of the normal equations."""
@@ -51,10 +48,10 @@ def contour_targets(
     """Targets of the mesh's contour points in all masks, and their median distance in pixels outward to the masks."""
     caster, normals = RayCaster(vertices, surface.faces, threads), surface.normals(vertices)
     parts = [find_contour_points(caster, normals, surface.edges, camera, mask) for camera, mask in masks if mask is not None]
-    start, end, fraction, offset, pixel = (
-        np.concatenate([getattr(part, name) for part in parts]) if parts else np.zeros(0)
-        for name in ("start", "end", "fraction", "offset", "pixel")
-    )
+    if not parts:
+        return Targets(vertex_rows(np.zeros(0, np.int64), surface.count), *np.zeros((3, 0))), 0.0
+    start, end = (np.concatenate([getattr(part, name) for part in parts]) for name in ("start", "end"))
+    fraction, offset, pixel = (np.concatenate([getattr(part, name) for part in parts]) for name in ("fraction", "offset", "pixel"))
     count = len(offset)
     share = min(1.0, 0.5 * surface.count / max(count, 1))  # points between the same vertices say the same
     rows = interpolation(start, end, fraction, surface.count)

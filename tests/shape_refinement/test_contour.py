@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from gsbake.geometry.cameras import Camera
 from gsbake.geometry.raycast import RayCaster
 from gsbake.shape_refinement.contour import find_contour_points
-from gsbake.shape_refinement.refine import RefinementOptions, refine_shape
+from gsbake.shape_refinement.refine import pixel_size, refine_shape
 from gsbake.shape_refinement.samples import Photo
 from gsbake.shape_refinement.surface import Surface
 from tests.support.cameras import look_at
@@ -42,7 +42,8 @@ def refined(mesh: trimesh.Trimesh, views: list[Masked]) -> np.ndarray:
     """The vertices after refinement by masks alone: the photos are grey."""
     photos = [Photo(camera, np.full((*mask.shape, 3), 0.5, np.float32), mask.astype(np.float32) / 255) for camera, mask in views]
     vertices, faces = np.array(mesh.vertices), np.ascontiguousarray(mesh.faces, np.int32)
-    return refine_shape(vertices, faces, lambda blur: photos, lambda: views, RefinementOptions()).vertices
+    pixel = pixel_size(vertices, [camera for camera, _ in views])
+    return refine_shape(vertices, faces, lambda blur: photos, lambda: views, pixel).vertices
 
 
 def sphere(radius: float) -> trimesh.Trimesh:

@@ -123,7 +123,7 @@ def test_shape_refinement(name: str, kind: str, mask: str) -> None:
     vertices, faces = MESHES[name]()
     given = None if mask == "none" else lambda: zip(CAMERAS, masks(mask), strict=True)
     options = RefinementOptions(levels=(Level(16, 1, 1.0, False), Level(16, 2, 1.0)))
-    assert_valid(refine_shape(vertices, faces, lambda blur: photos(kind), given, options).vertices, faces)
+    assert_valid(refine_shape(vertices, faces, lambda blur: photos(kind), given, 0.05, options=options).vertices, faces)
 
 
 def test_contour_points_of_a_camera_in_a_vertex() -> None:

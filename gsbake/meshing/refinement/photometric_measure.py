@@ -47,8 +47,8 @@ MAX_STEPS = 1.5
 PIXELS_PER_POINT = 24.0
 #: Weighted mean squared distance of a patch's samples from its centre in square pixels; maximum random-walk steps.
 PATCH_VARIANCE, MAX_WALK_STEPS = 36.0, 200
-#: Scale of the Geman-McClure weight in pixels: typical error of an inlier.
-ROBUST_SCALE = 0.6
+#: Residual in pixels beyond which a patch counts linearly: typical error of an inlier.
+OUTLIER = 0.6
 #: Minimum residual cost (aliasing, compression).
 NOISE_FLOOR = 0.02
 #: Maximum information per square pixel of one measurement.
@@ -86,34 +86,23 @@ class MeasurementPlan:
         sample = np.arange(0, count, max(1, count // PAIRING_POINTS))
         pairs, _ = select_views(cameras, vertices[sample], surface.normals(vertices)[sample], NEIGHBOURS, NEIGHBOURS)
         measured_vertices = np.arange(0, count, max(1, round(PIXELS_PER_POINT / vertex_area)))
-        return MeasurementPlan(
-            surface, measured_vertices, pixel_size, pairs, min(vertex_area / (np.pi * RADIUS**2), 1.0)
-        )
+        return MeasurementPlan(surface, measured_vertices, pixel_size, pairs, min(vertex_area / (np.pi * RADIUS**2), 1.0))
 
 
 @dataclass(frozen=True)
 class Measurements:
-    """Measurements (m,), one per photo and visible vertex: `photo` and `vertex`; `displacement` along the normal in world units;
-    `information` per square pixel, 0 when invalid; mean `ncc` of the matching photos."""
+    """Measurements (m,), one per photo that sees a `vertex`: `displacement` along the normal in world units;
+    `information` per square pixel, 0 when invalid."""
 
-    photo: Indices
     vertex: Indices
     displacement: Doubles
     information: Doubles
-    ncc: Doubles
 
     def weights(self) -> Doubles:
         """Information (m,) times the majority at its vertex: the share of valid measurements minus that of invalid ones, or 0."""
         visible = np.bincount(self.vertex)
         useful = np.bincount(self.vertex, self.information > 0)
         return self.information * np.maximum(2 * useful / np.maximum(visible, 1) - 1, 0)[self.vertex]
-
-    def shared(self, other: Measurements) -> tuple[Indices, Indices]:
-        """Rows of the measurements with positive weight, and rows of `other` with the same photos and vertices."""
-        rows = np.flatnonzero(self.weights() > 0)
-        keys = [s.vertex << 32 | s.photo for s in (self, other)]
-        _, rows_self, rows_other = np.intersect1d(keys[0][rows], keys[1], assume_unique=True, return_indices=True)
-        return rows[rows_self], rows_other
 
 
 class PatchTargets:
@@ -125,6 +114,8 @@ class PatchTargets:
 
     def __call__(self, surface: Surface, vertices: Vertices) -> tuple[Targets, float]:
         """Targets at the measured vertices, and the share of them at which most photos agree."""
+        if surface_area(vertices, surface.faces) == 0:
+            return Targets(vertex_rows(np.zeros(0, np.int64), len(vertices)), *np.zeros((3, 0))), 0.0
         self._plan = plan = self._plan or MeasurementPlan.make(surface, vertices, self._views.cameras)
         found = measure(vertices, plan, self._views, self._threads)
         # Patches overlap: a measurement is weighted by the share of a patch that is not shared with others.
@@ -132,8 +123,8 @@ class PatchTargets:
         weight = found.weights() * min(stride * plan.patch_share, 1.0)
         used = weight > 0
         rows = vertex_rows(found.vertex[used], len(vertices))
-        outlier = np.full(int(used.sum()), ROBUST_SCALE * plan.pixel_size)
-        targets = Targets(rows, found.displacement[used], weight[used] / plan.pixel_size**2, outlier, redescending=True)
+        outlier = np.full(int(used.sum()), OUTLIER * plan.pixel_size)
+        targets = Targets(rows, found.displacement[used], weight[used] / plan.pixel_size**2, outlier)
         return targets, len(np.unique(found.vertex[used])) / len(plan.measured_vertices)
 
 
@@ -170,22 +161,21 @@ def measure(vertices: Vertices, plan: MeasurementPlan, views: PhotometricViews, 
     ray_offset = 0.5 * float(np.linalg.norm(vertices[edges[:, 0]] - vertices[edges[:, 1]], axis=1).mean())
     visible = np.stack([caster.visible_from(camera, points, normals, MIN_COSINE, ray_offset) for camera in views.cameras])
     parts = [_measure_photo(index, others, visible, (points, normals, plane_offset), views) for index, others in enumerate(plan.pairs)]
-    photo = np.repeat(np.arange(len(parts)), [len(part[0]) for part in parts])
-    rows, displacement, information, ncc = (np.concatenate(column) for column in zip(*parts, strict=True))
-    return Measurements(photo, measured_vertices[rows], displacement, information, ncc)
+    rows, displacement, information = (np.concatenate(column) for column in zip(*parts, strict=True))
+    return Measurements(measured_vertices[rows], displacement, information)
 
 
 def _measure_photo(
     index: int, others: list[int], visible: NDArray[np.bool_], surface: tuple[Vertices, Vertices, Doubles], views: PhotometricViews
-) -> tuple[Indices, Doubles, Doubles, Doubles]:
-    """Rows of the points visible in photo `index` and one of the `others`, with displacement, information and NCC.
+) -> tuple[Indices, Doubles, Doubles]:
+    """Rows of the points visible in photo `index` and one of the `others`, with displacement and information.
 
     `surface` is points and normals (n, 3), and the offset (n,) along the normal of the mesh's mean over a patch at normal incidence.
     """
     camera = views.cameras[index]
     rows = np.flatnonzero(visible[index] & visible[others].any(0))
     if len(rows) == 0:
-        return rows, np.zeros(0), np.zeros(0), np.zeros(0)
+        return rows, np.zeros(0), np.zeros(0)
     points, normals, plane_offset = (part[rows] for part in surface)
     to_camera = camera.centre - points
     cosine = np.einsum("nk,nk->n", normals, to_camera) / np.linalg.norm(to_camera, axis=1)
@@ -206,7 +196,7 @@ def _measure_photo(
     information = np.minimum(SAMPLES / 2 * curvature / STEP_PIXELS**2 / (cost + NOISE_FLOOR), MAX_INFORMATION)
     valid = (np.abs(displacement) <= MAX_STEPS * steps) & (np.abs(oblique_offset) <= MAX_STEPS * steps)
     weight = _confidence(camera, points, views.depth(index), views.tolerance)
-    return rows, displacement.astype(np.float64), np.where(valid, information, 0.0) * weight, 1.0 - cost.astype(np.float64)
+    return rows, displacement.astype(np.float64), np.where(valid, information, 0.0) * weight
 
 
 def _confidence(camera: Camera, points: Vertices, stereo: tuple[Floats, Floats] | None, tolerance: float) -> Doubles:
