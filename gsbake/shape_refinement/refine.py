@@ -91,6 +91,8 @@ def refine_shape(
     None where not every photo has one; `pixel` is the size of a photo's pixel at the object (`pixel_size`).
     """
     options = options or RefinementOptions()
+    if len(faces) == 0:
+        return Refined(np.array(vertices, np.float64), {"confirmed": 0.0, "moved_pixels": 0.0})
     run = _Refinement(Surface(len(vertices), faces), np.array(vertices, np.float64), masks, pixel, options, seed, threads, monitor, on_step)
     if run.follow_targets(measure_patches) < options.confirmed:
         run.follow_photos(load_photos)

@@ -92,7 +92,7 @@ def solve_step(
     `pixel` is the size of a pixel at the object in the mesh's unit; `total` (v,) the move so far, which is held where `photos` are
     explained, or None for a step that nothing holds.
     """
-    count, edge = surface.count, surface.mean_edge(vertices)
+    count, edge = surface.count, max(surface.mean_edge(vertices), 1e-6 * pixel)  # of a collapsed mesh
     hat = surface.gradients(vertices)
     matrix, right = add_systems(targets, count)
     matrix = matrix + surface.bending * (1 / (edge * np.radians(options.bend)) ** 2)
