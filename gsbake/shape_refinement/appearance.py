@@ -26,11 +26,11 @@ RIDGE = 1e-3
 #: Error of the model as a share of a vertex's brightness; the darkest count as BLACK.
 MODEL_ERROR, BLACK = 0.015, 0.05
 #: Least number of photos of a vertex that the light is fitted to, and most such vertices.
-LIGHT_VIEWS, LIGHT_VERTICES = 4, 25_000
+LIGHT_VIEWS, LIGHT_VERTICES = 4, 8_000
 #: Weight of the light's smoothness as a share of its data, and of the pull to its mean.
 LIGHT_SMOOTHNESS, LIGHT_PULL = 0.02, 1e-3
 #: Iterations of conjugate gradients, and the reduction of the squared residual that ends them.
-LIGHT_ITERATIONS, LIGHT_TOLERANCE = 25, 1e-4
+LIGHT_ITERATIONS, LIGHT_TOLERANCE = 12, 1e-4
 #: Reflectance at the start.
 FIRST_REFLECTANCE = 0.3
 #: Chunks of vertices whose sums are added in order: they do not depend on the number of threads.
