@@ -83,13 +83,13 @@ def test_smooth_surface_keeps_its_face_count(decimator: Decimator) -> None:
 @both_libraries
 def test_thin_features_raise_the_face_count(decimator: Decimator) -> None:
     vertices, faces = thin_rings()
-    target, bound = 4000 if decimator == "pymeshlab" else 2500, 0.5 * VOXEL
+    target, bound = 2000, 0.5 * VOXEL
     free = decimate_to_error_bound(vertices, faces, target, 4 * target, 0.0, decimator)
     assert free.deviation.quantile > bound and len(free.faces) <= target
     stops: list[int] = []
     bounded = decimate_to_error_bound(vertices, faces, target, 4 * target, bound, decimator, lambda: stops.append(1))
     assert bounded.deviation.quantile <= bound
-    assert 1.4 * target < len(bounded.faces) <= 4 * target
+    assert 1.2 * target < len(bounded.faces) <= 4 * target
     assert len(stops) == bounded.retries >= 1
     # Independent of the measure used by the bound: distances to the analytic tori, whose tessellation lies within 1 % of the tube.
     assert np.quantile(distance_to_rings(samples(bounded)), 0.999) < bound + 0.01 * TUBE
@@ -117,7 +117,7 @@ def test_retries_are_limited(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(decimation, "decimate", fixed)
     monkeypatch.setattr(decimation, "surface_deviation", lambda first, second: decimation.Deviation(1.01, 1.01))
     result = decimate_to_error_bound(*sphere(3), 100, 10**6, 1.0, "pymeshlab")
-    assert targets == [100, 150, 225, 338] and result.retries == MAX_RETRIES
+    assert targets == [100, 125, 157, 197] and result.retries == MAX_RETRIES
 
 
 def test_a_mesh_with_fewer_faces_is_unchanged() -> None:
