@@ -146,3 +146,22 @@ def test_closed_meshes_stay_closed_and_manifold(decimator: Decimator) -> None:
     result = decimate_to_error_bound(np.asarray(mesh.vertices), np.asarray(mesh.faces, np.int32), 3000, 3000, 0.0, decimator)
     assert result.topology.watertight and len(result.faces) <= 3000
     assert trimesh.Trimesh(result.vertices, result.faces, process=False).is_winding_consistent
+
+
+@both_libraries
+def test_flat_faces_stay_flat_and_give_their_triangles_to_the_curved_part(decimator: Decimator) -> None:
+    """A finely meshed cube with a dome on top, 49 152 faces, to 800."""
+    box = trimesh.creation.box((1, 1, 1))
+    for _ in range(6):
+        box = box.subdivide()
+    vertices, faces = np.asarray(box.vertices).copy(), np.asarray(box.faces, np.int32)
+    radius = np.minimum(0.3, np.linalg.norm(vertices[:, :2], axis=1))
+    vertices[:, 2] += np.where(vertices[:, 2] > 0.49, 0.5 * np.sqrt(0.09 - radius**2), 0)
+    low = decimate(vertices, faces, 800, decimator)
+    assert surface_deviation((vertices, faces), low).quantile < 0.003
+    corners = low[0][low[1]]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    below = corners[..., 2].max(1) < 0.49
+    assert below.sum() < 250  # of 800, on more than four fifths of the area
+    assert np.degrees(np.arccos(np.minimum(1, np.abs(normals[below]).max(1)))).max() < 0.1
