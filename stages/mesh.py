@@ -31,6 +31,7 @@ def run(ctx: Context) -> dict[str, Any]:
 KERNELS = (
     "gsbake.meshing.fusion_kernel", "gsbake.meshing.depth_views", "gsbake.meshing.hole_filling", "gsbake.geometry.sparse_lattice",
     "gsbake.meshing.marching_cubes", "gsbake.meshing.refinement.normals", "gsbake.geometry.surface_distance",
+    "gsbake.geometry.self_intersection", "gsbake.meshing.untangling",
 )  # fmt: skip
 REFINEMENT_KERNELS = (
     "gsbake.shape_refinement.samples_kernel", "gsbake.shape_refinement.reflection_kernel", "gsbake.shape_refinement.surface",
@@ -47,7 +48,7 @@ def kernels(settings: Any) -> tuple[str, ...]:
 
 STAGE = Stage(
     name="mesh",
-    version=9,
+    version=10,
     title="Mesh",
     run=run,
     summary="{faces} triangles, {dense_faces} before decimation",

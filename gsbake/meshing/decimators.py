@@ -19,6 +19,9 @@ AGGRESSIVENESS = (3.0, 5.0, 7.0)
 #: measured best among 1, 10 and 100; for pymeshlab it is about that of the unit frame.
 DIAGONAL: dict[Decimator, float] = {"pymeshlab": 2.0, "fast-simplification": 10.0}
 
+#: Weight of the planes perpendicular to the faces beside those of the faces, for pymeshlab. Its own, 1e-3, outweighs the shape of a dense
+#: mesh: of one of 421 000 faces, reduced to 22 500, the 99.9 % quantile of the deviation was then 2.7 times that of 3e-5.
+PLANAR_WEIGHT = 3e-5
 #: Diagonal of a mesh over its distance from the origin, below which it is a point.
 MIN_EXTENT = 1e-12
 
@@ -57,6 +60,7 @@ def _pymeshlab(vertices: Vertices, faces: Faces, target: int) -> tuple[Vertices,
         preservetopology=True,
         optimalplacement=True,
         planarquadric=True,  # avoids slivers on flat surfaces
+        planarweight=PLANAR_WEIGHT,
         autoclean=True,
     )
     mesh = meshes.current_mesh()

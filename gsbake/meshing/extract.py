@@ -32,6 +32,7 @@ from gsbake.meshing.resolution import Resolution, choose_resolution, pixel_footp
 from gsbake.meshing.stereo_depth import merge_stereo_depth
 from gsbake.meshing.support_plane import SupportPlane, find_support_plane, remove_background_components
 from gsbake.meshing.tsdf import SparseTsdf
+from gsbake.meshing.untangling import untangle
 from gsbake.monitor import SILENT, Monitor, Rule, decide_skip, skips
 from gsbake.mvs.depth_maps import read_depth
 from gsbake.mvs.pyramids import Photo, load_photo
@@ -153,10 +154,13 @@ class _Extraction:
             )
         with self.monitor.part("clean"):
             vertices, faces, dropped = self._clean(vertices, faces, cache, resolution.cell, support)
+        start = vertices
         with self.monitor.part("shape"):
             vertices, refinement = self._refine_shape(vertices, faces, resolution.cell)
         with self.monitor.part("denoising"):
             vertices = denoise(vertices, faces, self.options.mesh.denoising_iterations)
+        with self.monitor.part("untangling"):
+            vertices, faces = untangle(vertices, faces, start)
         write_mesh(self.out / "dense.ply", vertices, faces)
         self.monitor.check_stop()
         with self.monitor.part("decimate"):
@@ -256,22 +260,26 @@ class _Extraction:
     def _clean(
         self, vertices: Doubles, faces: Faces, cache: DepthViewCache, cell: float, support: SupportPlane | None
     ) -> tuple[Doubles, Faces, int]:
-        """Remove small and background components, integrate rendered normals, smooth, close holes; also the number removed."""
+        """Remove small and background components, integrate rendered normals, smooth, untangle, close holes; also the number removed."""
         settings, background = self.options.mesh, 0
         if support is not None:
             vertices, faces, background = remove_background_components(vertices, faces, BALL_RADIUS - 3 * cell)
             vertices = support.snap_to_plane(vertices, cell)
         vertices, faces, dropped = cleanup.remove_small_components(vertices, faces, settings.min_component)
+        start = vertices
         if settings.normal_wavelength > 0:
             if settings.normals == "field":
                 vertices = self._integrate_gradients(vertices, faces, cell)
             else:
                 vertices = _integrate_normals(cache, vertices, faces, settings.normal_wavelength, cell)
         vertices = cleanup.smooth(vertices, faces, settings.smoothing_iterations)
-        if not cleanup.topology(vertices, faces).watertight:
+        if cleanup.topology(vertices, faces).watertight:
+            vertices, faces = untangle(vertices, faces, start)
+        else:
             vertices, faces = repair(vertices, faces)
             if settings.holes == "close":
                 vertices, faces = close_holes(vertices, faces, MAX_HOLE_EDGES)
+            vertices, faces = untangle(vertices, faces)
         return vertices, faces, dropped + background
 
     def _integrate_gradients(self, vertices: Doubles, faces: Faces, cell: float) -> Doubles:
