@@ -76,7 +76,8 @@ class Surface:
 
     def sum_corners(self, values: Doubles) -> Doubles:
         """Sums (count, …) over the faces of `values` (f, 3, …) at their corners."""
-        return np.asarray(self._corner_sum @ values.reshape(len(values) * 3, int(np.prod(values.shape[2:]))), np.float64).reshape(self.count, *values.shape[2:])
+        flat = values.reshape(len(values) * 3, int(np.prod(values.shape[2:])))  # -1 is ambiguous without faces
+        return np.asarray(self._corner_sum @ flat, np.float64).reshape(self.count, *values.shape[2:])
 
     def normals(self, vertices: Doubles) -> Doubles:
         """Area-weighted unit normals (count, 3); 0 without a face."""
