@@ -1,4 +1,4 @@
-"""Test model of a pressure gauge: a printed glossy dial set back behind a polished rim, a needle before it, and no glass."""
+"""Test model of a pressure gauge: a printed glossy dial set back behind a metal rim, a needle before it, and no glass."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def dial_print() -> Array:
 
 
 def gauge_material(p: Array) -> Material:
-    """Black lacquer, polished steel rim, brass stem, black needle, glossy printed dial."""
+    """Black lacquer, bright steel rim, brass stem, black needle, glossy printed dial."""
     n, own = len(p), p @ ROTATION
     radius, depth = np.hypot(own[:, 0], own[:, 1]), own[:, 2]
     material = Material.uniform(n, (0.02, 0.02, 0.022), 0.3)

@@ -106,7 +106,7 @@ def terracotta_material(p: Array) -> Material:
 
 
 def box_material(p: Array) -> Material:
-    """Varnished wood outside and on the rim, white paint inside."""
+    """Varnished wood outside and on the rim, white lacquer inside."""
     n = len(p)
     grain = noise(p * [0.8, 6, 6], 9.0, 7)
     wood = Material.uniform(n, (0.42, 0.25, 0.12), 0.35).shaded(1 + 0.12 * grain + 0.08 * noise(p * [2, 20, 20], 9.0, 8))
