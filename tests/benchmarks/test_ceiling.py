@@ -16,7 +16,11 @@ from benchmarks import ceiling
 from benchmarks.ceiling import finished_runs, lay_true_maps, main
 from benchmarks.ceiling_rows import OWN, TRUE, TRUE_NORMALS, Row, beside, ceilings, markdown, newest
 from benchmarks.csv_rows import write_rows
+from benchmarks.lab import fits
 from benchmarks.maps import ReferencePoints
+from benchmarks.materials import Row as PartRow
+from benchmarks.objects.__main__ import Row as ObjectRow
+from benchmarks.skip import write
 from gsbake.errors import UsageError
 from gsbake.geometry.cameras import CameraSet, Similarity
 from tests.support.cameras import look_at
@@ -124,3 +128,21 @@ def test_a_ceiling_holds_for_its_mesh(tmp_path: Path) -> None:
     assert found[TRUE] == true and not ceilings("toy", 0.06, file) and not ceilings("vase", 0.05, file)
     assert beside(25.04, found[TRUE], "relit", 1) == "25.0/30.0" and beside(25.04, None, "relit", 1) == "25.0"
     assert markdown([ROW]).splitlines()[-1] == "| toy | 0.050 | 3.0 | 25.0 (26.0) | – | – | 23.0 (24.0) | – |"
+
+
+def test_tables_print_figures_beside_their_ceilings(tmp_path: Path) -> None:
+    """An object with a ceiling, one whose mesh has changed, and parts of the fit, which are scored on three views."""
+    shape = "relight", "", 0, "abc1234", "cpu", 100.0
+    figures = 25.0, 26.0, 23.0, 24.0, 0.1, 0.2, "1.00 1.00 1.00", "2026-11-28"
+    objects = [ObjectRow("toy", "none", *shape, 0.05, 3.0, *figures), ObjectRow("vase", "none", *shape, 0.2, 3.0, *figures)]
+    true = replace(ROW, maps=TRUE, relit=30.0, relit_scaled=31.0, base=28.0, base_scaled=29.0, roughness=0.01, metallic=0.02)
+    normals = replace(true, maps=TRUE_NORMALS, relit=33.0, relit_scaled=34.0)
+    write_rows(tmp_path / "objects.csv", objects)
+    write_rows(
+        tmp_path / "ceiling.csv", [ROW, true, normals, replace(true, object="vase"), replace(true, object="box", views=3, relit=40.0)]
+    )
+    write(tmp_path / "materials.csv", [PartRow("box", "relight", "projected", "", 50.0, 20.0)], 3)
+    toy, vase, median = fits.objects(tmp_path).rows
+    assert toy[3:] == ["25.0/30.0 (26.0/31.0)", "33.0 (34.0)", "23.0/28.0 (24.0/29.0)", "0.100/0.010", "0.200/0.020"]
+    assert vase[3:5] == median[3:5] == ["25.0 (26.0)", "–"]
+    assert fits.parts(tmp_path).rows[1] == ["", "true maps, newest mesh", "–", "40.0 (31.0)", "29.0", "0.010", "0.020", "–"]
