@@ -1,7 +1,7 @@
 """The whole refinement: silhouettes and patches first; then, where the photos' patches confirm little, parallax and reflections.
 
 Masks are offset by the same amount everywhere, and surfels by as much: the first phase moves the surface as a whole, smoothly. Where photos
-correlate at most places the surface is matte and textured, and that is all. Elsewhere reflections are what the photos know of the shape:
+correlate at most places the surface is diffuse and textured, and that is all. Elsewhere reflections are what the photos know of the shape:
 coarse light and blurred photos first, then finer ones, a few Gauss–Newton steps each.
 """
 
@@ -29,8 +29,8 @@ Mask = tuple[Camera, NDArray[np.uint8] | None]
 PatchMeasure = Callable[[Surface, Doubles], tuple[Targets, float]]
 #: Length in pixels of a refined mesh's edges: the photos say nothing between.
 EDGE_PIXELS = 2.0
-#: Level of the light at the start.
-FIRST_LEVEL = 0.5
+#: Radiance of the light at the start.
+FIRST_RADIANCE = 0.5
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ class RefinementOptions:
 
     #: Steps of the first phase and their weights; share of confirmed vertices from which on there is no second phase.
     first_steps: int = 3
-    first: StepOptions = field(default_factory=lambda: StepOptions(bend=6.0, slope=8.0, move=3.0))
+    first: StepOptions = field(default_factory=lambda: StepOptions(curvature=6.0, slope=8.0, move=3.0))
     confirmed: float = 0.2
     levels: tuple[Level, ...] = (
         Level(16, 2, 2.0, held=False), Level(16, 2, 2.0), Level(24, 4, 1.4), Level(32, 6, 0.8), Level(48, 3, 0.6),
@@ -149,7 +149,7 @@ class _Refinement:
         total, variance = np.zeros(count), np.zeros(count, np.float32)
         robust: Floats | None = None
         appearance = Appearance.initial(count)
-        light = ReflectionMap.constant(options.levels[0].light, FIRST_LEVEL)
+        light = ReflectionMap.constant(options.levels[0].light, FIRST_RADIANCE)
         targets: list[Targets] = []
         photos: Sequence[Photo] = ()
         blur = -1.0

@@ -31,13 +31,13 @@ class StepOptions:
 
     #: Share of the information of the samples that counts: errors of neighbouring vertices and photos are correlated.
     independent: float = 0.2
-    #: Standard deviations of a step: bend per edge, slope, move.
-    bend: float = 6.0
+    #: Standard deviations of a step: curvature per edge, slope, move.
+    curvature: float = 6.0
     slope: float = 40.0
     move: float = 5.0
-    #: Standard deviations of the total move: distance, and bend per edge.
+    #: Standard deviations of the total move: distance, and curvature per edge.
     total_move: float = 1.0
-    total_bend: float = 2.0
+    total_curvature: float = 2.0
     #: Parallax that the residual must be worth for the total move to be free.
     release: float = 1.0
     #: Longest step.
@@ -95,7 +95,7 @@ def solve_step(
     count, edge = surface.count, max(surface.mean_edge(vertices), 1e-6 * pixel)  # of a collapsed mesh
     hat = surface.gradients(vertices)
     matrix, right = add_systems(targets, count)
-    matrix = matrix + surface.bending * (1 / (edge * np.radians(options.bend)) ** 2)
+    matrix = matrix + surface.squared_umbrella * (1 / (edge * np.radians(options.curvature)) ** 2)
     diagonal = np.full(count, 1 / (options.move * pixel) ** 2)
     tensor = np.eye(3) * (0.5 / np.radians(options.slope) ** 2)
     if photos is not None:
@@ -104,10 +104,10 @@ def solve_step(
         tensor = options.independent * curvature + tensor
         right -= options.independent * (photos.gradient[:, 0] + surface.sum_corners(np.einsum("fia,fa->fi", hat, pull)))
         if total is not None:
-            move, bend = _total_weights(surface, total, photos.worth, pixel, edge, options)
-            matrix = matrix + surface.umbrella.T @ sparse.diags(bend) @ surface.umbrella
+            move, curvature = _total_weights(surface, total, photos.worth, pixel, edge, options)
+            matrix = matrix + surface.umbrella.T @ sparse.diags(curvature) @ surface.umbrella
             diagonal += move
-            right -= move * total + surface.umbrella.T @ (bend * (surface.umbrella @ total))
+            right -= move * total + surface.umbrella.T @ (curvature * (surface.umbrella @ total))
     matrix = (matrix + surface.stiffness(hat @ tensor @ hat.transpose(0, 2, 1)) + sparse.diags(diagonal)).tocsr()
     inverse = 1 / np.maximum(matrix.diagonal(), 1e-30)
     solution, _ = cg(matrix, right, rtol=1e-2, maxiter=150, M=LinearOperator(matrix.shape, matvec=lambda x: inverse * x.ravel()))
@@ -129,10 +129,10 @@ def _reflection_system(surface: Surface, photos: PhotoRows) -> tuple[Doubles, Do
 def _total_weights(
     surface: Surface, total: Doubles, worth: Doubles, pixel: float, edge: float, options: StepOptions
 ) -> tuple[Doubles, Doubles]:
-    """Weights (v,) of the total move and of its bend; `worth` (v,) in square pixels."""
+    """Weights (v,) of the total move and of its curvature; `worth` (v,) in square pixels."""
     free = 1 / (1 + (worth / options.release**2) ** 2)
     out = []
-    for value, deviation in ((total, options.total_move * pixel), (surface.umbrella @ total, edge * np.radians(options.total_bend))):
+    for value, deviation in ((total, options.total_move * pixel), (surface.umbrella @ total, edge * np.radians(options.total_curvature))):
         square = surface.averaged((value / deviation)[:, None] ** 2, 6)[:, 0].astype(float)
         out.append(free / (1 + square) / deviation**2)
     return out[0], out[1]

@@ -50,7 +50,7 @@ class Surface:
         return (sparse.diags(some.astype(float)) - sparse.diags(1 / self.degree) @ self.adjacency).tocsr()
 
     @cached_property
-    def bending(self) -> sparse.csr_matrix:
+    def squared_umbrella(self) -> sparse.csr_matrix:
         """UᵀU of the umbrella operator."""
         return (self.umbrella.T @ self.umbrella).tocsr()
 

@@ -38,7 +38,7 @@ def refined(ball: Ball, vertices: np.ndarray, photos: list[Photo], masks: bool =
 
 @pytest.mark.parametrize(("metal", "texture", "left"), [(1.0, 0.0, 0.6), (0.0, 1.0, 0.75), (0.7, 0.3, 0.6)])
 def test_bumps_go(ball: Ball, metal: float, texture: float, left: float) -> None:
-    """Of a mirror by its reflections, of a matte ball by parallax, which sees less of a slope, of one with both."""
+    """Of a mirror by its reflections, of a diffuse ball by parallax, which sees less of a slope, of one with both."""
     start = bumps(ball, 0.008)
     found = refined(ball, start, ball.photos(metal, texture))
     assert radii(found) < 0.6 * radii(start)
