@@ -29,11 +29,11 @@ from unittest.mock import patch
 
 import numpy as np
 
+from benchmarks.ceiling import finished_folders
 from benchmarks.csv_rows import current_commit, read_rows, today, write_rows
 from benchmarks.materials import truth_subset
 from benchmarks.objects.__main__ import FIGURES, PYTHON, SCORER, score
 from benchmarks.timeline import ROOT
-from benchmarks.upper_bound import finished_folders
 from gsbake.config.load import load_profile
 from gsbake.errors import GsbakeError
 from gsbake.gltf.export import ExportOptions, export_asset

@@ -28,6 +28,8 @@ from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
+from benchmarks.ceiling_rows import markdown as ceiling_table
+from benchmarks.ceiling_rows import newest
 from benchmarks.csv_rows import today
 from benchmarks.maps import measure_maps
 from benchmarks.skip import CpuClock, reuse, write
@@ -182,6 +184,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     except GsbakeError as error:
         parser.error(str(error))
     sys.stdout.write("\n" + markdown(rows))
+    if known := [row for capture in captures for row in newest(capture.name, views=args.views).values()]:
+        sys.stdout.write("\nCeilings of `benchmarks.ceiling` on the newest mesh:\n" + ceiling_table(known))
 
 
 if __name__ == "__main__":

@@ -13,7 +13,13 @@ def run(ctx: Context) -> dict[str, Any]:
 
     s = ctx.settings
     options = MeshOptions(
-        s.mesh, s.train.max_size, s.stereo.max_size, s.skip.empty_cells, s.surfels.projected_depth, s.export.max_triangles
+        s.mesh,
+        s.train.max_size,
+        s.stereo.max_size,
+        s.skip.empty_cells,
+        s.surfels.projected_depth,
+        s.export.max_triangles,
+        s.train.holdout,
     )
     return extract_mesh(
         ctx.inputs["poses"], ctx.inputs["refine"], ctx.out, options, stereo=ctx.inputs["stereo"],
@@ -21,24 +27,36 @@ def run(ctx: Context) -> dict[str, Any]:
     )  # fmt: skip
 
 
-#: Modules with the kernels of this stage, and with one that only depths of stereo are refined with.
+#: Modules with the kernels of this stage, with those of the shape's refinement, and with one that only depths of stereo need.
 KERNELS = (
     "gsbake.meshing.fusion_kernel", "gsbake.meshing.depth_views", "gsbake.meshing.hole_filling", "gsbake.geometry.sparse_lattice",
     "gsbake.meshing.marching_cubes", "gsbake.meshing.refinement.normals", "gsbake.geometry.surface_distance",
+    "gsbake.geometry.self_intersection", "gsbake.meshing.untangling",
+)  # fmt: skip
+REFINEMENT_KERNELS = (
+    "gsbake.shape_refinement.samples_kernel", "gsbake.shape_refinement.reflection_kernel", "gsbake.shape_refinement.surface",
 )  # fmt: skip
 STEREO_KERNELS = ("gsbake.meshing.refinement.photometric_kernel",)
 
 
+def kernels(settings: Any) -> tuple[str, ...]:
+    """Modules with the kernels that these settings need."""
+    if not settings.mesh.refinement_vertices:
+        return KERNELS
+    return KERNELS + REFINEMENT_KERNELS + (() if settings.stereo.enabled == "never" else STEREO_KERNELS)
+
+
 STAGE = Stage(
     name="mesh",
-    version=8,
+    version=10,
     title="Mesh",
     run=run,
     summary="{faces} triangles, {dense_faces} before decimation",
     needs=("poses", "stereo", "refine"),
     settings=(
-        "mesh.*", "surfels.projected_depth", "train.max_size", "stereo.max_size", "skip.empty_cells", "export.max_triangles",
+        "mesh.*", "surfels.projected_depth", "train.max_size", "train.holdout", "stereo.max_size", "skip.empty_cells",
+        "export.max_triangles",
     ),
     uses_device=True,
-    kernels=lambda settings: KERNELS if settings.stereo.enabled == "never" else KERNELS + STEREO_KERNELS,
+    kernels=kernels,
 )  # fmt: skip

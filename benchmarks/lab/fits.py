@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import statistics
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 
-from benchmarks.lab.tables import Line, Maker, Table, newest, number, pair, read, signed, spaced
+from benchmarks.ceiling_rows import TRUE, TRUE_NORMALS, beside, beside_pair, ceilings
+from benchmarks.ceiling_rows import newest as newest_ceilings
+from benchmarks.lab.tables import Line, Maker, Table, newest, number, read, signed, spaced
 
 #: Names of the rows of `benchmarks.materials` that are shown.
 PARTS = {
@@ -16,13 +19,21 @@ PARTS = {
     "priors": "+ priors but sparsity",
     "sparsity": "+ sparsity",
 }
-OBJECT_HEADINGS = ("object", "metal", "Chamfer %", "relit dB", "base colour dB", "roughness", "metallic", "measured")
+OBJECT_HEADINGS = ("object", "metal", "Chamfer %", "relit dB", "true normals, dB", "base colour dB", "roughness", "metallic")
+#: Names of the rows of `benchmarks.ceiling`, and the views that the parts are scored on.
+CEILINGS, PART_VIEWS = {TRUE: "true maps, newest mesh", TRUE_NORMALS: "+ true normals"}, 3
 
 
-def _object(line: Line) -> list[str]:
-    maps = number(line["roughness"], 3), number(line["metallic"], 3)
-    shape = number(line["chamfer_pct"], 3)
-    return [spaced(line["object"]), line["metal"], shape, pair(line, "relit"), pair(line, "base"), *maps, line["date"]]
+def _object(line: Line, results: Path) -> list[str]:
+    def figure(column: str) -> float:
+        return float(line[column])
+
+    found = ceilings(line["object"], figure("chamfer_pct"), results / "ceiling.csv")
+    true, normals = found.get(TRUE), found.get(TRUE_NORMALS)
+    relit, base = (beside_pair(figure, true, column) for column in ("relit", "base"))
+    maps = (beside(figure(column), true, column, 3) for column in ("roughness", "metallic"))
+    upper = beside_pair(partial(getattr, normals), None, "relit") if normals else "–"
+    return [spaced(line["object"]), line["metal"], number(line["chamfer_pct"], 3), relit, upper, base, *maps]
 
 
 def _objects(results: Path, photos: bool) -> list[Line]:
@@ -33,13 +44,13 @@ def _objects(results: Path, photos: bool) -> list[Line]:
 def objects(results: Path) -> Table:
     """The newest row of every object from given poses and masks, and their medians."""
     lines = _objects(results, photos=False)
-    rows = [_object(line) for line in lines]
+    rows = [_object(line, results) for line in lines]
 
     def median(column: str) -> str:
         return str(statistics.median(float(line[column]) for line in lines))
 
     columns = ("chamfer_pct", "relit", "relit_scaled", "base", "base_scaled", "roughness", "metallic")
-    rows.append(_object({"object": "**median**", "metal": "", "date": ""} | {column: median(column) for column in columns}))
+    rows.append(_object({"object": "**median**", "metal": ""} | {column: median(column) for column in columns}, results))
     return Table("python -m benchmarks.objects OUT", OBJECT_HEADINGS, rows, lines)
 
 
@@ -47,20 +58,26 @@ def objects_alone(results: Path) -> Table:
     """The newest row of every object on a table, from photos alone."""
     lines = _objects(results, photos=True)
     command = f"python -m benchmarks.objects OUT --only {','.join(line['object'] for line in lines)}"
-    return Table(command, OBJECT_HEADINGS, [_object(line) for line in lines], lines)
+    return Table(command, OBJECT_HEADINGS, [_object(line, results) for line in lines], lines)
 
 
 def parts(results: Path) -> Table:
-    """Rows of `benchmarks.materials`, each with everything of the one above."""
+    """Rows of `benchmarks.materials`, each with everything of the one above, and below those of a capture its ceilings."""
     lines = newest((x for x in read(results, "materials") if x["row"] in PARTS), "capture", "row")
-    rows = []
-    for line in lines:
-        relit = f"{number(line['relight_psnr'], 1)} ({number(line['relight_psnr_scaled'], 1)})"
-        maps = number(line["roughness_rmse"], 3), number(line["metallic_rmse"], 3)
-        figures = number(line["psnr"], 1), relit, number(line["albedo_psnr_scaled"], 1), *maps, number(line["cpu_s"], 0)
-        rows.append([line["capture"] if line["row"] == "projected" else "", PARTS[line["row"]], *figures])
+    rows, dated = [], list(lines)
+    for capture in dict.fromkeys(line["capture"] for line in lines):
+        for line in (x for x in lines if x["capture"] == capture):
+            relit = f"{number(line['relight_psnr'], 1)} ({number(line['relight_psnr_scaled'], 1)})"
+            maps = number(line["roughness_rmse"], 3), number(line["metallic_rmse"], 3)
+            figures = number(line["psnr"], 1), relit, number(line["albedo_psnr_scaled"], 1), *maps, number(line["cpu_s"], 0)
+            rows.append([capture if line["row"] == "projected" else "", PARTS[line["row"]], *figures])
+        for name, row in newest_ceilings(capture, results / "ceiling.csv", PART_VIEWS).items():
+            if name in CEILINGS:
+                relit, texels = beside_pair(partial(getattr, row), None, "relit"), (f"{row.roughness:.3f}", f"{row.metallic:.3f}")
+                rows.append(["", CEILINGS[name], "–", relit, f"{row.base_scaled:.1f}", *texels, "–"])
+                dated.append({"date": row.date})
     headings = ("capture", "with", "held out dB", "relit dB", "base colour dB, with gains", "roughness", "metallic", "CPU s")
-    return Table("python -m benchmarks.materials --views 3", headings, rows, lines)
+    return Table(f"python -m benchmarks.materials --views {PART_VIEWS}", headings, rows, dated)
 
 
 def rules(results: Path) -> Table:

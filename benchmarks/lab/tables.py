@@ -55,11 +55,6 @@ def number(text: str, digits: int, factor: float = 1) -> str:
     return f"{factor * float(text):.{digits}f}" if text else "–"
 
 
-def pair(line: Line, column: str, digits: int = 1) -> str:
-    """A figure, and in brackets the one with a gain per channel."""
-    return f"{number(line[column], digits)} ({number(line[column + '_scaled'], digits)})"
-
-
 def change(before: str, after: str, digits: int, factor: float = 1) -> str:
     """Two figures with an arrow between them; one where they are the same."""
     first, second = number(before, digits, factor), number(after, digits, factor)

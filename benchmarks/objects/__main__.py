@@ -18,9 +18,12 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+from benchmarks.ceiling_rows import TRUE, beside, beside_pair, ceilings
+from benchmarks.ceiling_rows import Row as Ceiling
 from benchmarks.csv_rows import current_commit, read_rows, today, write_rows
 from benchmarks.objects.entries import Entry, read_entries
 from benchmarks.timeline import ROOT
@@ -76,20 +79,20 @@ def row_of(entry: Entry, arguments: argparse.Namespace, commit: str, seconds: fl
 
 
 def markdown(rows: Sequence[Row]) -> str:
-    """A table of the rows, with the medians of all as its last line."""
+    """A table of the rows, beside their ceilings where `benchmarks.ceiling` measured the mesh, with medians as the last line."""
     lines = ["| object | metal | s | Chamfer % | normal ° | relit (scaled) dB | base colour (scaled) dB | roughness | metallic | gains |"]
     lines.append("|---" * 10 + "|")
     for row in rows:
-        lines.append(_line(row.object, row.metal, row.gains, lambda name, row=row: getattr(row, name)))  # type: ignore[misc]
+        lines.append(_line(row.object, row.metal, row.gains, partial(getattr, row), ceilings(row.object, row.chamfer_pct).get(TRUE)))
     if len(rows) > 1:
         lines.append(_line("**median**", "", "", lambda name: statistics.median(getattr(row, name) for row in rows)))
     return "\n".join(lines) + "\n"
 
 
-def _line(name: str, metal: str, gains: str, figure: Callable[[str], float]) -> str:
-    relit, base = (f"{figure(k):.1f} ({figure(k + '_scaled'):.1f})" for k in ("relit", "base"))
-    formats = {"seconds": ".0f", "chamfer_pct": ".3f", "normal_deg": ".1f", "roughness": ".3f", "metallic": ".3f"}
-    seconds, chamfer, normal, roughness, metallic = (format(figure(k), form) for k, form in formats.items())
+def _line(name: str, metal: str, gains: str, figure: Callable[[str], float], ceiling: Ceiling | None = None) -> str:
+    relit, base = (beside_pair(figure, ceiling, column) for column in ("relit", "base"))
+    roughness, metallic = (beside(figure(column), ceiling, column, 3) for column in ("roughness", "metallic"))
+    seconds, chamfer, normal = (format(figure(k), form) for k, form in (("seconds", ".0f"), ("chamfer_pct", ".3f"), ("normal_deg", ".1f")))
     return f"| {' | '.join([name, metal, seconds, chamfer, normal, relit, base, roughness, metallic, gains])} |"
 
 

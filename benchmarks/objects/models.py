@@ -1,9 +1,9 @@
-"""Procedural test models: surfaces of revolution and displaced spheres with textures that are functions of position.
+"""Procedural test models: shapes made by formula, with textures that are functions of position.
 
     python -m benchmarks.objects.models OUT
 
 writes one GLB each. Materials cover what the material fit must tell apart: coloured, neutral and dark metals, oxide beside clean metal,
-perforated metal, wood with iron bands, coloured glossy plastic, white glaze, cloth, and an emissive part. Base colours of metals are
+perforated metal, wood with iron bands, coloured glossy plastic, glaze, cloth, print, and an emissive part. Base colours of metals are
 measured reflectances (Lagarde & de Rousiers, *Moving Frostbite to PBR*, 2014); noise is a sum of random plane waves, so models do not
 depend on library versions.
 """
@@ -13,81 +13,23 @@ from __future__ import annotations
 import argparse
 import io
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import trimesh
 import xatlas
-from numpy.typing import NDArray
 from PIL import Image
 from scipy import ndimage
 
+from benchmarks.objects import hollows
+from benchmarks.objects.gauge import gauge, gauge_material
+from benchmarks.objects.parts import COPPER, IRON, PATINA, RUST, STEEL, Array, Material, noise, revolved, step
 from gsbake.imaging.srgb import encode
 from gsbake.texturing.texels import rasterise
 
-Array = NDArray[np.float64]
-
 #: Edge of the textures in texels.
 TEXTURE_SIZE = 1024
-IRON, COPPER, BRASS, STEEL = (0.30, 0.28, 0.27), (0.955, 0.638, 0.538), (0.91, 0.78, 0.42), (0.62, 0.60, 0.57)
-RUST, PATINA = (0.20, 0.075, 0.03), (0.16, 0.36, 0.29)
-
-
-@dataclass(frozen=True)
-class Material:
-    """Linear base colour (n, 3), roughness, metallic (n,) and emission (n, 3)."""
-
-    base: Array
-    roughness: Array
-    metallic: Array
-    emission: Array
-
-    @classmethod
-    def uniform(cls, count: int, base: tuple[float, float, float], roughness: float, metallic: float = 0.0) -> Material:
-        """The same material at `count` points."""
-        return cls(np.tile(base, (count, 1)), np.full(count, roughness), np.full(count, metallic), np.zeros((count, 3)))
-
-    def blend(self, other: Material, share: Array) -> Material:
-        """This material with a `share` (n,) of the other one."""
-        s, t = share, share[:, None]
-        return Material(
-            self.base * (1 - t) + other.base * t, self.roughness * (1 - s) + other.roughness * s,
-            self.metallic * (1 - s) + other.metallic * s, self.emission * (1 - t) + other.emission * t,
-        )  # fmt: skip
-
-    def shaded(self, factor: Array) -> Material:
-        """The material with its base colour times `factor` (n,)."""
-        return Material(np.clip(self.base * factor[:, None], 0, 0.98), self.roughness, self.metallic, self.emission)
-
-
-def noise(points: Array, frequency: float, seed: int, waves: int = 24) -> Array:
-    """Smooth noise (n,) of unit variance at `points` (n, 3)."""
-    rng = np.random.default_rng(seed)
-    direction = rng.normal(size=(waves, 3))
-    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-    wave = direction * frequency * rng.uniform(0.5, 1.5, (waves, 1))
-    return np.asarray(np.sin(points @ wave.T + rng.uniform(0, 2 * np.pi, waves)).sum(1) * np.sqrt(2 / waves))
-
-
-def step(value: Array, edge: float, width: float) -> Array:
-    """Smooth step from 0 to 1 across `edge`."""
-    return np.asarray(np.clip((value - edge) / width + 0.5, 0, 1))
-
-
-def revolved(profile: list[tuple[float, float]], sections: int = 96) -> trimesh.Trimesh:
-    """A surface of revolution around z of a `profile` of (radius, height), smoothed by Catmull-Rom interpolation."""
-    points = np.asarray(profile, np.float64)
-    padded = np.concatenate([points[:1], points, points[-1:]])
-    t = np.linspace(0, 1, 6, endpoint=False)[:, None]
-    parts = [
-        0.5 * (2 * b + (c - a) * t + (2 * a - 5 * b + 4 * c - d) * t**2 + (3 * b - a - 3 * c + d) * t**3)
-        for a, b, c, d in zip(padded[:-3], padded[1:-2], padded[2:-1], padded[3:], strict=True)
-    ]
-    smooth = np.concatenate([*parts, points[-1:]])
-    smooth[:, 0] = np.maximum(smooth[:, 0], 0)
-    return trimesh.creation.revolve(smooth, sections=sections)
 
 
 def figurine(seed: int, amplitude: float = 0.16) -> trimesh.Trimesh:
@@ -237,6 +179,12 @@ MODELS: dict[str, tuple[Callable[[], trimesh.Trimesh], Callable[[Array], Materia
     "toy": (lambda: figurine(5, 0.2), toy_material),
     "steel": (lambda: figurine(9, 0.12), steel_material),
     "lantern": (lantern, lantern_material),
+    "mug": (hollows.mug, hollows.mug_material),
+    "bowl": (hollows.bowl, hollows.bowl_material),
+    "flower_pot": (hollows.flower_pot, hollows.terracotta_material),
+    "box": (hollows.box, hollows.box_material),
+    "shoe": (hollows.shoe, hollows.shoe_material),
+    "gauge": (gauge, gauge_material),
 }
 
 

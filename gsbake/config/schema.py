@@ -228,9 +228,8 @@ class Mesh(Section):
     decimator: Literal["auto", "pymeshlab", "fast-simplification"] = Field("auto", description="Library that decimates. auto: pymeshlab (GPL) where it is installed, else fast-simplification (MIT).")
     smoothing_iterations: int = Field(2, ge=0, le=1000, description="Taubin smoothing iterations on the dense mesh.")
     normal_wavelength: float = Field(8.0, ge=0, le=1000, description="Wavelength in voxels below which detail comes from rendered normals instead of depth; 0 is off.")
-    silhouette_iterations: int = Field(3, ge=0, le=100, description="Mesh refinement iterations against the masks; 0 is off.")
+    refinement_vertices: int = Field(60_000, ge=0, le=10_000_000, description="Most vertices of the mesh that is refined by parallax, reflections and silhouettes; its displacements move the dense mesh. 0 is off.")
     denoising_iterations: int = Field(20, ge=0, le=1000, description="Iterations of bilateral normal filtering on the dense mesh; 0 is off.")
-    photometric_iterations: int = Field(2, ge=0, le=100, description="Mesh refinement iterations by photometric consistency on textured surfaces; 0 is off.")
     min_component: Fraction = Field(0.02, description="Minimum area of a connected component as a share of the largest one's; smaller ones are removed.")
 
 

@@ -1,8 +1,8 @@
 """Exact distances from points to the surface of a triangle mesh.
 
-A bounding volume hierarchy over the triangles in Morton order, four to a leaf, is searched depth first, the nearer child first; boxes
-beyond the best distance so far are left out. The distance to a triangle is that of Ericson, *Real-Time Collision Detection*, 2005,
-section 5.1.5. Double precision; each point is independent, so the result does not depend on the number of threads.
+The hierarchy of boxes is searched depth first, the nearer child first; boxes beyond the best distance so far are left out. The distance to
+a triangle is that of Ericson, *Real-Time Collision Detection*, 2005, section 5.1.5. Double precision; each point is independent, so the
+result does not depend on the number of threads.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from gsbake.geometry.triangle_tree import LEAF, STACK, TriangleTree
 from gsbake.kernels.declaration import kernel
 from gsbake.system.limits import usable_processors
 
@@ -21,55 +22,19 @@ Doubles = NDArray[np.float64]
 
 #: Points of one call of the kernel.
 CHUNK = 1 << 14
-#: Triangles in a leaf of the hierarchy.
-LEAF = 4
-#: Bits per axis of a Morton code.
-MORTON_BITS = 20
-#: Capacity of the search stack: one entry a level and one more; 2⁶⁰ leaves.
-STACK = 64
 
 
 def surface_distances(points: Doubles, vertices: Doubles, faces: NDArray[Any]) -> Doubles:
     """Distance (n,) from each of `points` (n, 3) to the surface of a mesh of `vertices` (v, 3) and `faces` (f, 3); inf without faces."""
     if len(faces) == 0:
         return np.full(len(points), np.inf)
-    corners = np.ascontiguousarray(np.asarray(vertices, np.float64)[faces])
-    corners = np.ascontiguousarray(corners[_morton_order(corners.mean(1))])
-    lower, upper = _boxes(corners)
+    tree = TriangleTree.over(vertices, faces)
     points = np.ascontiguousarray(points, np.float64)
     out = np.empty(len(points))
     with ThreadPoolExecutor(usable_processors()) as pool:
         chunks = [slice(start, start + CHUNK) for start in range(0, len(points), CHUNK)]
-        list(pool.map(lambda chunk: _distances(points[chunk], corners, lower, upper, out[chunk]), chunks))
+        list(pool.map(lambda chunk: _distances(points[chunk], tree.corners, tree.lower, tree.upper, out[chunk]), chunks))
     return out
-
-
-def _morton_order(points: Doubles) -> NDArray[Any]:
-    """Order (n,) of points along a Z-shaped curve."""
-    lower = points.min(0)
-    extent = max(float((points.max(0) - lower).max()), np.finfo(np.float64).tiny)
-    cells = ((points - lower) / extent * (2**MORTON_BITS - 1)).astype(np.int64)
-    code = np.zeros(len(points), np.int64)
-    for bit in range(MORTON_BITS):
-        for axis in range(3):
-            code |= ((cells[:, axis] >> bit) & 1) << (3 * bit + axis)
-    return np.argsort(code, kind="stable")
-
-
-def _boxes(corners: Doubles) -> tuple[Doubles, Doubles]:
-    """Corners (m, 3) of the boxes of a complete binary tree: node 1 is the root, 2i and 2i+1 the children of i, the last half leaves."""
-    count = 1 << max(0, int(np.ceil(np.log2(-(-len(corners) // LEAF)))))
-    padded_lower = np.full((count * LEAF, 3), np.inf)
-    padded_upper = np.full((count * LEAF, 3), -np.inf)
-    padded_lower[: len(corners)], padded_upper[: len(corners)] = corners.min(1), corners.max(1)
-    lower, upper = np.full((2 * count, 3), np.inf), np.full((2 * count, 3), -np.inf)
-    lower[count:] = padded_lower.reshape(count, LEAF, 3).min(1)
-    upper[count:] = padded_upper.reshape(count, LEAF, 3).max(1)
-    while count > 1:
-        count //= 2
-        lower[count : 2 * count] = lower[2 * count : 4 * count].reshape(count, 2, 3).min(1)
-        upper[count : 2 * count] = upper[2 * count : 4 * count].reshape(count, 2, 3).max(1)
-    return lower, upper
 
 
 @nb.njit(cache=True, nogil=True, forceinline=True)

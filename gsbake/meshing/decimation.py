@@ -16,11 +16,12 @@ from gsbake.meshing.cleanup import Faces, Topology, Vertices, remove_small_compo
 from gsbake.meshing.decimator_choice import Decimator
 from gsbake.meshing.decimators import decimate
 from gsbake.meshing.repair import close_holes, repair
+from gsbake.meshing.untangling import untangle
 
 #: Quantile of the distances that the bound applies to.
 QUANTILE = 0.999
-#: Minimum factor between the face counts of two attempts, and maximum number of attempts above the first face count.
-MIN_FACTOR, MAX_RETRIES = 1.5, 3
+#: Minimum and maximum factor between the face counts of two attempts, and maximum number of attempts above the first face count.
+MIN_FACTOR, MAX_FACTOR, MAX_RETRIES = 1.25, 2.0, 3
 #: Deviation falls with the face count to about this power (measured: 0.63 to 0.99 on dense meshes of 160 000 to 1 000 000 faces).
 DEVIATION_EXPONENT = 0.75
 #: Share of the bound in the estimate of the next face count: an error of the estimate must not cost another retry.
@@ -80,16 +81,18 @@ def decimate_to_error_bound(
     while True:
         low_poly = decimate(vertices, faces, target, decimator)
         mesh_topology = topology(*low_poly)
-        if mesh_topology.non_manifold_edges:
-            low_poly = _repaired(*low_poly, close=closed)
+        if low_poly[1] is not faces:
+            if mesh_topology.non_manifold_edges:
+                low_poly = _repaired(*low_poly, close=closed)
+            low_poly = untangle(*low_poly, rings=0)  # crossings only: the walls of a rib are few faces wide
             mesh_topology = topology(*low_poly)
         deviation = Deviation(0.0, 0.0) if len(faces) <= target else surface_deviation((vertices, faces), low_poly)
         exceeded = 0 < max_error < deviation.quantile
         if not exceeded or target >= max_target or retries == MAX_RETRIES:
             return DecimatedMesh(*low_poly, mesh_topology, deviation, retries)
         check_stop()
-        factor = max(MIN_FACTOR, (deviation.quantile / (SAFETY_FACTOR * max_error)) ** (1 / DEVIATION_EXPONENT))
-        target = int(np.ceil(min(max_target, target * factor)))
+        factor = (deviation.quantile / (SAFETY_FACTOR * max_error)) ** (1 / DEVIATION_EXPONENT)
+        target = int(np.ceil(min(max_target, target * min(max(factor, MIN_FACTOR), MAX_FACTOR))))
         retries += 1
 
 

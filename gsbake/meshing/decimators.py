@@ -1,4 +1,4 @@
-"""Quadric edge collapse to a number of faces, by one of two libraries (`mesh.decimator`).
+"""Quadric edge collapse to a number of faces, by one of two libraries (`mesh.decimator`), and remeshing with edges of one length.
 
 Garland & Heckbert, *Surface simplification using quadric error metrics*, SIGGRAPH 1997. pymeshlab, which is under the GPL, is imported in
 this module only, and only when it decimates. fast-simplification, under the MIT licence, takes its place where it is not installed:
@@ -19,6 +19,9 @@ AGGRESSIVENESS = (3.0, 5.0, 7.0)
 #: measured best among 1, 10 and 100; for pymeshlab it is about that of the unit frame.
 DIAGONAL: dict[Decimator, float] = {"pymeshlab": 2.0, "fast-simplification": 10.0}
 
+#: Weight of the planes perpendicular to the faces beside those of the faces, for pymeshlab. Its own, 1e-3, outweighs the shape of a dense
+#: mesh: of one of 421 000 faces, reduced to 22 500, the 99.9 % quantile of the deviation was then 2.7 times that of 3e-5.
+PLANAR_WEIGHT = 3e-5
 #: Diagonal of a mesh over its distance from the origin, below which it is a point.
 MIN_EXTENT = 1e-12
 
@@ -57,6 +60,7 @@ def _pymeshlab(vertices: Vertices, faces: Faces, target: int) -> tuple[Vertices,
         preservetopology=True,
         optimalplacement=True,
         planarquadric=True,  # avoids slivers on flat surfaces
+        planarweight=PLANAR_WEIGHT,
         autoclean=True,
     )
     mesh = meshes.current_mesh()
@@ -72,3 +76,22 @@ def _fast_simplification(vertices: Vertices, faces: Faces, target: int) -> tuple
         if len(out[1]) <= target:
             break
     return remove_unused_vertices(np.asarray(out[0], np.float64), np.asarray(out[1], np.int32))
+
+
+def remesh(vertices: Vertices, faces: Faces, edge: float, decimator: Decimator) -> tuple[Vertices, Faces]:
+    """The surface with edges of about the length `edge`, by pymeshlab; the mesh itself where that is not installed (Botsch & Kobbelt, *A
+    remeshing approach to multiresolution modeling*, SGP 2004)."""
+    if decimator != "pymeshlab" or len(faces) == 0 or not edge > 0:
+        return vertices, faces
+    import pymeshlab
+
+    scale = 1 / edge
+    meshes = pymeshlab.MeshSet(verbose=False)
+    meshes.add_mesh(pymeshlab.Mesh(np.ascontiguousarray(vertices * scale, np.float64), np.ascontiguousarray(faces, np.int32)))
+    meshes.meshing_isotropic_explicit_remeshing(
+        iterations=3, targetlen=pymeshlab.PureValue(1.0), adaptive=False, checksurfdist=False, featuredeg=40
+    )
+    mesh = meshes.current_mesh()
+    found, corners = np.asarray(mesh.vertex_matrix(), np.float64), np.asarray(mesh.face_matrix(), np.int32).reshape(-1, 3)
+    low, low_faces = remove_unused_vertices(found, corners)
+    return low / scale, low_faces

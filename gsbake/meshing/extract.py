@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +12,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from gsbake.capture.photos.roles import test_photos
 from gsbake.capture.posed_photos import PosedPhotos
 from gsbake.config.schema import Mesh
 from gsbake.errors import BadInputError
@@ -21,18 +21,25 @@ from gsbake.geometry.ply import write_mesh
 from gsbake.meshing import cleanup
 from gsbake.meshing.decimation import decimate_to_error_bound
 from gsbake.meshing.decimator_choice import resolve_decimator
+from gsbake.meshing.decimators import remesh
 from gsbake.meshing.depth_cache import DepthViewCache
 from gsbake.meshing.depth_views import DepthView, depth_noise
 from gsbake.meshing.refinement.normal_filter import denoise
 from gsbake.meshing.refinement.normals import NormalAccumulator, integrate_normals
-from gsbake.meshing.refinement.silhouette import refine_silhouettes
+from gsbake.meshing.refinement.photometric_measure import PatchTargets, PhotometricViews
 from gsbake.meshing.repair import close_holes, repair
 from gsbake.meshing.resolution import Resolution, choose_resolution, pixel_footprint
 from gsbake.meshing.stereo_depth import merge_stereo_depth
 from gsbake.meshing.support_plane import SupportPlane, find_support_plane, remove_background_components
 from gsbake.meshing.tsdf import SparseTsdf
+from gsbake.meshing.untangling import untangle
 from gsbake.monitor import SILENT, Monitor, Rule, decide_skip, skips
 from gsbake.mvs.depth_maps import read_depth
+from gsbake.mvs.pyramids import Photo, load_photo
+from gsbake.shape_refinement.refine import pixel_size, proxy_edge, refine_shape
+from gsbake.shape_refinement.samples import load_photos
+from gsbake.shape_refinement.surface import Surface
+from gsbake.shape_refinement.transfer import transfer_displacements
 from gsbake.surfels.field import Field
 from gsbake.surfels.fields.continuous import ContinuousField
 from gsbake.surfels.fields.registry import load_field
@@ -48,8 +55,10 @@ Faces = NDArray[np.int32]
 TRUNCATION_CELLS = (4.0, 10.0)
 #: Maximum difference in voxels at which a stereo depth replaces a rendered one.
 STEREO_TOLERANCE = 3.0
-#: Memory for photos in photometric refinement, in bytes.
+#: Memory for photos whose patches are compared, in bytes.
 PHOTO_CACHE_BYTES = 1 << 29
+#: Most photos that the shape is refined with.
+MAX_REFINEMENT_PHOTOS = 96
 #: Minimum extent of the surfels in the unit frame.
 MIN_EXTENT = 1e-9
 #: Maximum boundary edges of a hole that is filled after meshing; larger ones are openings.
@@ -59,7 +68,8 @@ MAX_HOLE_EDGES = 400
 @dataclass(frozen=True)
 class MeshOptions:
     """Settings of mesh extraction; `train_size` and `stereo_size` are the longer sides in pixels of the photos in training and stereo,
-    `empty_cells` is the rule of [skip], `projected_depth` that of [surfels], `max_triangles` the limit of the exported asset."""
+    `empty_cells` is the rule of [skip], `projected_depth` that of [surfels], `max_triangles` the limit of the exported asset; every
+    `holdout`-th photo is kept out."""
 
     mesh: Mesh = Mesh()
     train_size: int = 512
@@ -67,6 +77,7 @@ class MeshOptions:
     empty_cells: Rule = "auto"
     projected_depth: bool = False
     max_triangles: int = 100_000
+    holdout: int = 8
 
     @property
     def max_faces(self) -> int:
@@ -143,12 +154,13 @@ class _Extraction:
             )
         with self.monitor.part("clean"):
             vertices, faces, dropped = self._clean(vertices, faces, cache, resolution.cell, support)
-        with self.monitor.part("silhouettes"):
-            vertices = self._refine_silhouettes(vertices, faces)
+        start = vertices
+        with self.monitor.part("shape"):
+            vertices, refinement = self._refine_shape(vertices, faces, resolution.cell)
         with self.monitor.part("denoising"):
             vertices = denoise(vertices, faces, self.options.mesh.denoising_iterations)
-        with self.monitor.part("photos"):
-            vertices, photometric = self._refine_photometric(vertices, faces, resolution.cell)
+        with self.monitor.part("untangling"):
+            vertices, faces = untangle(vertices, faces, start)
         write_mesh(self.out / "dense.ply", vertices, faces)
         self.monitor.check_stop()
         with self.monitor.part("decimate"):
@@ -160,7 +172,7 @@ class _Extraction:
             "cells": resolution.cells,
             "depth_noise_cells": noise / resolution.cell,
             "dropped_components": dropped,
-            **photometric,
+            **refinement,
         }
 
     def _samples(self) -> OrientedPoints:
@@ -248,22 +260,26 @@ class _Extraction:
     def _clean(
         self, vertices: Doubles, faces: Faces, cache: DepthViewCache, cell: float, support: SupportPlane | None
     ) -> tuple[Doubles, Faces, int]:
-        """Remove small and background components, integrate rendered normals, smooth, close holes; also the number removed."""
+        """Remove small and background components, integrate rendered normals, smooth, untangle, close holes; also the number removed."""
         settings, background = self.options.mesh, 0
         if support is not None:
             vertices, faces, background = remove_background_components(vertices, faces, BALL_RADIUS - 3 * cell)
             vertices = support.snap_to_plane(vertices, cell)
         vertices, faces, dropped = cleanup.remove_small_components(vertices, faces, settings.min_component)
+        start = vertices
         if settings.normal_wavelength > 0:
             if settings.normals == "field":
                 vertices = self._integrate_gradients(vertices, faces, cell)
             else:
                 vertices = _integrate_normals(cache, vertices, faces, settings.normal_wavelength, cell)
         vertices = cleanup.smooth(vertices, faces, settings.smoothing_iterations)
-        if not cleanup.topology(vertices, faces).watertight:
+        if cleanup.topology(vertices, faces).watertight:
+            vertices, faces = untangle(vertices, faces, start)
+        else:
             vertices, faces = repair(vertices, faces)
             if settings.holes == "close":
                 vertices, faces = close_holes(vertices, faces, MAX_HOLE_EDGES)
+            vertices, faces = untangle(vertices, faces)
         return vertices, faces, dropped + background
 
     def _integrate_gradients(self, vertices: Doubles, faces: Faces, cell: float) -> Doubles:
@@ -276,65 +292,55 @@ class _Extraction:
         wavelength = self.options.mesh.normal_wavelength * cell
         return integrate_normals(vertices, faces, normals, confidence, wavelength, max_displacement=1.5 * cell)
 
-    def _refine_silhouettes(self, vertices: Doubles, faces: Faces) -> Doubles:
-        """Refine the vertices against the masks, where every photo has one."""
-        iterations, monitor = self.options.mesh.silhouette_iterations, self.monitor
-        if not iterations or not self.posed.has_masks:
-            reason = "not every photo has a mask" if iterations else "set by the profile"
-            monitor.decide("silhouette refinement", "skipped", reason)
-            return vertices
-
-        def views() -> Iterator[tuple[Camera, NDArray[np.uint8]]]:
-            for index in range(len(self.posed)):
-                monitor.check_stop()
-                view = self.posed.view(index)
-                if view.mask is not None:
-                    yield view.camera, view.mask
-
-        result = refine_silhouettes(vertices, faces, views, iterations, self.threads)
-        if result.contour_points == 0:
-            monitor.decide("silhouette refinement", "no change", "fewer than 100 contour points lie near mask boundaries")
-        else:
-            evidence = f"{result.contour_points} contour points, median distance to mask boundaries {result.offset_before:+.2f} px"
-            monitor.decide("silhouette refinement", f"now {result.offset_after:+.2f} px", evidence)
-        return result.vertices
-
-    def _refine_photometric(self, vertices: Doubles, faces: Faces, cell: float) -> tuple[Doubles, dict[str, float]]:
-        """Refine the vertices by photometric consistency, where stereo confirmed depths; also results for the manifest."""
-        from functools import lru_cache
-
-        from gsbake.meshing.refinement.photometric import refine_photometric
-        from gsbake.meshing.refinement.photometric_measure import PhotometricViews
-        from gsbake.mvs.pyramids import Photo, load_photo
-
-        iterations, size = self.options.mesh.photometric_iterations, self.options.stereo_size
-        files = [] if self.stereo is None else [self.stereo / "depth" / f"{camera.name}.npz" for camera in self.posed.cameras.cameras]
-        if not iterations or not any(file.exists() for file in files):
-            self.monitor.decide("photometric refinement", "skipped", "stereo confirmed no depths" if iterations else "set by the profile")
+    def _refine_shape(self, vertices: Doubles, faces: Faces, cell: float) -> tuple[Doubles, dict[str, float]]:
+        """Refine the vertices by the masks and photos, on a coarser mesh; also results for the manifest."""
+        settings, monitor, posed = self.options.mesh, self.monitor, self.posed
+        if not settings.refinement_vertices:
+            monitor.decide("shape refinement", "skipped", "set by the profile")
             return vertices, {}
-        cameras = [camera.downscaled_to(size) for camera in self.posed.cameras.cameras]
+        test = set(test_photos(len(posed), self.options.holdout))
+        chosen = [index for index in range(len(posed)) if index not in test]
+        chosen = chosen[:: -(-len(chosen) // MAX_REFINEMENT_PHOTOS)]
+        size, decimator = self.options.stereo_size, resolve_decimator(settings.decimator)
+        cameras = [posed.cameras.cameras[index].downscaled_to(size) for index in chosen]
+        pixel = pixel_size(vertices, cameras)
+        edge = proxy_edge(vertices, faces, pixel, settings.refinement_vertices)
+        coarse, coarse_faces = remesh(vertices, faces, edge, decimator)
+        if len(coarse_faces) == 0:
+            return vertices, {}
+        result = refine_shape(
+            coarse, coarse_faces, lambda blur: load_photos(posed, chosen, size, blur),
+            (lambda: (posed.mask(index) for index in chosen)) if posed.has_masks else None,
+            pixel, self._patches(chosen, cameras, STEREO_TOLERANCE * cell), seed=self.seed, threads=self.threads, monitor=monitor,
+        )  # fmt: skip
+        before, fine = Surface(len(coarse), coarse_faces), Surface(len(vertices), faces)
+        move = transfer_displacements(vertices, fine.normals(vertices), coarse, before.normals(coarse), result.vertices)
+        figures = result.figures
+        evidence = (
+            f"{len(coarse)} vertices in {len(chosen)} photos; {100 * figures['confirmed']:.0f} % of the surface match in most photos"
+        )
+        if "explained" in figures:
+            evidence += f"; reflections explain {100 * figures['explained']:.0f} % of what changes between photos"
+        if "contour_after" in figures:
+            evidence += f"; contours {figures['contour_before']:+.2f} px from the masks before, {figures['contour_after']:+.2f} px after"
+        monitor.decide("shape refinement", f"mean displacement {figures['moved_pixels']:.2f} px", evidence)
+        return vertices + move, {f"refinement_{name}": value for name, value in figures.items()}
+
+    def _patches(self, chosen: list[int], cameras: list[Camera], tolerance: float) -> PatchTargets | None:
+        """What compares patches of the `chosen` photos where stereo confirmed depths; None where it did nowhere."""
+        files = [] if self.stereo is None else [self.stereo / "depth" / f"{camera.name}.npz" for camera in cameras]
+        if not any(file.exists() for file in files):
+            return None
 
         @lru_cache(maxsize=max(8, PHOTO_CACHE_BYTES // (2 * max(c.width * c.height for c in cameras))))
         def photo(index: int) -> Photo:
             self.monitor.check_stop()
-            return load_photo(self.posed, index, size)
+            return load_photo(self.posed, chosen[index], self.options.stereo_size)
 
-        views = PhotometricViews(
-            cameras, photo, lambda index: read_depth(files[index]) if files[index].exists() else None, STEREO_TOLERANCE * cell
+        return PatchTargets(
+            PhotometricViews(cameras, photo, lambda index: read_depth(files[index]) if files[index].exists() else None, tolerance),
+            self.threads,
         )
-        photometric = refine_photometric(vertices, faces, views, iterations, self.threads)
-        evidence = f"{100 * photometric.consistent_share:.0f} % of the surface points are consistent in most photos"
-        if photometric.rounds:
-            evidence += f"; NCC {photometric.ncc_before:.3f} → {photometric.ncc_after:.3f}"
-            self.monitor.decide("photometric refinement", f"median displacement {photometric.median_displacement:.2f} px", evidence)
-        else:
-            self.monitor.decide("photometric refinement", "no change", f"{evidence}; NCC does not increase")
-        return photometric.vertices, {
-            "photometric_share": photometric.consistent_share,
-            "photometric_move_pixels": photometric.median_displacement,
-            "photometric_ncc_before": photometric.ncc_before,
-            "photometric_ncc_after": photometric.ncc_after,
-        }
 
     def _decimate(self, vertices: Doubles, faces: Faces, cell: float) -> dict[str, Any]:
         """Decimate and write the low-poly mesh; its results for the manifest."""

@@ -37,7 +37,7 @@ def close_holes(vertices: Vertices, faces: Faces, max_edges: int) -> tuple[Verti
         return vertices, faces
     vertices, faces = split_non_manifold_vertices(vertices, faces)
     edges = np.unique(edge_keys(vertices, faces))
-    patches = [_fill(vertices, loop, edges) for loop in _boundary_loops(vertices, faces) if len(loop) <= max_edges]
+    patches = [fill_hole(vertices, loop, edges) for loop in boundary_loops(_boundary(vertices, faces)) if len(loop) <= max_edges]
     return vertices, np.concatenate([faces, *patches]).astype(np.int32)
 
 
@@ -126,13 +126,17 @@ def _doubled_areas(vertices: Vertices, faces: Faces) -> NDArray[np.float64]:
     return np.asarray(np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1), np.float64)
 
 
-def _boundary_loops(vertices: Vertices, faces: Faces) -> list[NDArray[np.int64]]:
-    """Vertices of each closed boundary, in the direction of the faces that are missing there."""
-    start, end = faces.ravel().astype(np.int64), faces[:, [1, 2, 0]].ravel().astype(np.int64)
+def _boundary(vertices: Vertices, faces: Faces) -> NDArray[np.int64]:
+    """Edges (n, 2) with one face, in the direction of the face that is missing there."""
     _, inverse, counts = np.unique(edge_keys(vertices, faces), return_inverse=True, return_counts=True)
     boundary = counts[inverse.ravel()] == 1
     boundary &= ~np.repeat(boundary.reshape(-1, 3).all(1), 3)  # a single face: the only face over its boundary is that face again
-    following = dict(zip(end[boundary].tolist(), start[boundary].tolist(), strict=True))
+    return np.stack([faces[:, [1, 2, 0]].ravel()[boundary], faces.ravel()[boundary]], 1).astype(np.int64)
+
+
+def boundary_loops(edges: NDArray[np.int64]) -> list[NDArray[np.int64]]:
+    """Vertices of each closed loop of directed `edges` (n, 2), of which at most one leaves each vertex."""
+    following = dict(edges.tolist())
     loops = []
     while following:
         first = min(following)
@@ -145,7 +149,7 @@ def _boundary_loops(vertices: Vertices, faces: Faces) -> list[NDArray[np.int64]]
     return loops
 
 
-def _fill(vertices: Vertices, loop: NDArray[np.int64], edges: NDArray[np.int64]) -> Faces:
+def fill_hole(vertices: Vertices, loop: NDArray[np.int64], edges: NDArray[np.int64]) -> Faces:
     """Faces (n − 2, 3) of least area over a loop of n vertices whose diagonals are not in `edges` (sorted keys); none if there are none."""
     n = len(loop)
     points = vertices[loop]

@@ -48,6 +48,12 @@ def encode(dirs: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     return u, v
 
 
+def encode_array(directions: Array) -> tuple[Array, Array]:
+    """Octahedral coordinates u, v (n,) in [−1, 1] of directions (n, 3), as `encode`."""
+    u, v = encode(torch.from_numpy(np.ascontiguousarray(directions)))
+    return u.numpy(), v.numpy()
+
+
 def texel_directions(size: int) -> Array:
     """Unit directions (size², 3) of the texel centres, in row-major order."""
     x = (2.0 * np.arange(size) + 1.0) / size - 1.0
@@ -57,7 +63,7 @@ def texel_directions(size: int) -> Array:
 
 def texel_index(size: int, dirs: Array) -> Index:
     """Flat index (n,) of the texel that contains each direction (n, 3)."""
-    u, v = (c.numpy() for c in encode(torch.from_numpy(np.ascontiguousarray(dirs))))
+    u, v = encode_array(dirs)
     col = np.clip(((u + 1.0) * 0.5 * size).astype(np.int64), 0, size - 1)
     row = np.clip(((v + 1.0) * 0.5 * size).astype(np.int64), 0, size - 1)
     return row * size + col

@@ -20,8 +20,8 @@ PARTS: Mapping[str, Mapping[str, float]] = {
     "train": {"initialisation": 0.02, "training": 0.89},
     "refine": {"prune and densify": 0.24, "load photos": 0.01, "training": 0.56},
     "mesh": {
-        "depth": 0.05, "survey": 0.03, "filling": 0.03, "fusion": 0.02, "marching": 0.02, "clean": 0.04, "silhouettes": 0.16,
-        "denoising": 0.04, "photos": 0.37, "decimate": 0.19,
+        "depth": 0.05, "survey": 0.03, "filling": 0.03, "fusion": 0.02, "marching": 0.02, "clean": 0.05, "shape": 0.50,
+        "denoising": 0.04, "untangling": 0.06, "decimate": 0.15,
     },
     "bake fit": {
         "atlas": 0.02, "texels": 0.01, "occlusion": 0.06, "projection": 0.09, "light transport": 0.14, "trial fits of moving lights": 0.11,

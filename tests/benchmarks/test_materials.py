@@ -7,9 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 from PIL import Image
 
-from benchmarks.maps import _min_error, _true_values
+from benchmarks.maps import ReferencePoints, _min_error, barycentric
 from benchmarks.materials import ROW_SETTINGS, Row, main, markdown, score, truth_subset, write
 from gsbake.config.load import load_profile
 from gsbake.errors import UsageError
@@ -33,7 +34,9 @@ def test_true_values_are_sampled_at_the_point(tmp_path: Path) -> None:
     (tmp_path / "asset.glb").write_bytes(build_glb(mesh, GltfTextures(encode_png(base), encode_png(orm), None), "square", "test"))
     points = np.array([[0.9, 0.1, 0], [0.1, 0.9, 0], [0.6, 0.4, 0]])
     face = np.array([0, 1, 0])
-    found = _true_values(tmp_path / "asset.glb", face, points, mesh.position[mesh.faces[face]].astype(float))
+    share = barycentric(mesh.position[mesh.faces[face]].astype(float), points)
+    asset = trimesh.load(tmp_path / "asset.glb", force="mesh", process=False)
+    found = ReferencePoints(asset, face, share, np.eye(3)).values()
     at = ([3, 0, 2], [3, 0, 2])  # row from the top, column
     assert np.allclose(found[:, :3], decode(base[at] / 255), atol=1e-6)
     assert np.allclose(found[:, 3:], orm[at][:, 1:] / 255)

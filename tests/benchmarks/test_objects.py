@@ -13,7 +13,9 @@ import trimesh
 from benchmarks.csv_rows import read_rows, write_rows
 from benchmarks.objects.__main__ import Row, markdown
 from benchmarks.objects.entries import read_entries
-from benchmarks.objects.models import MODELS, Material, model_glb
+from benchmarks.objects.gauge import DIAL, ROTATION, gauge, gauge_material
+from benchmarks.objects.models import MODELS, model_glb
+from benchmarks.objects.parts import Material, turned
 from gsbake.errors import BadInputError
 from gsbake.imaging.srgb import decode
 
@@ -55,6 +57,46 @@ def test_models_have_valid_materials(name: str) -> None:
     assert material.roughness.min() >= 0.05 and material.roughness.max() <= 1
     assert material.metallic.min() >= 0 and material.metallic.max() <= 1
     assert mesh.is_winding_consistent and mesh.volume > 0
+
+
+def test_turned_surfaces_have_exact_normals() -> None:
+    """A cylinder with one rounded edge: straight legs are flat, and the arc has its radius and centre."""
+    mesh = turned([(0, 0, 0), (1, 0, 0), (1, 2, 0.3), (0, 2, 0)], sections=32)
+    normals, vertices = np.asarray(mesh.vertex_normals), np.asarray(mesh.vertices)
+    used = np.unique(mesh.faces)
+    radius, height = np.hypot(vertices[used, 0], vertices[used, 1]), vertices[used, 2]
+    arc = height > 1.7
+    outward = np.column_stack([vertices[used, :2] / np.maximum(radius, 1e-9)[:, None] * (radius - 0.7)[:, None], height - 1.7]) / 0.3
+    on_arc = arc & (radius > 0.7)
+    np.testing.assert_allclose(normals[used][on_arc], outward[on_arc], atol=1e-9)
+    cosine = (normals[mesh.faces].mean(1) * mesh.face_normals).sum(1)
+    assert on_arc.sum() >= 8 * 32 and cosine.min() > 0.97
+    assert trimesh.Trimesh(vertices, mesh.faces, process=True).is_watertight
+
+
+@pytest.mark.parametrize("name", ["mug", "bowl", "flower_pot", "box", "shoe"])
+def test_hollows_are_open(name: str) -> None:
+    """A ray from above ends deep in the object, on a surface that looks up."""
+    mesh = MODELS[name][0]()
+    low, high = mesh.bounds
+    start = np.array([[-0.55 if name == "shoe" else 0.0, 0.01, high[2] + 1]])
+    place, _, face = mesh.ray.intersects_location(start, [[0, 0, -1.0]])
+    first = int(np.argmax(place[:, 2]))
+    assert place[first, 2] < low[2] + 0.25 * (high[2] - low[2]) and mesh.face_normals[face[first], 2] > 0.9
+
+
+def test_the_dial_is_printed_and_set_back() -> None:
+    """Zero is marked black, paper is bright and glossy, the hub black; the metal rim stands .13 before the dial."""
+    zero = np.radians(225)
+    own = np.array(
+        [[0.78 * 0.57 * np.cos(zero), 0.78 * 0.57 * np.sin(zero), DIAL], [0.2, 0.0, DIAL], [0.64, 0, 0.42], [0, 0.02, DIAL + 0.05]]
+    )
+    material = gauge_material(own @ ROTATION.T)
+    assert material.base[0].max() < 0.05 and material.base[1].min() > 0.6 and material.base[3].max() < 0.05
+    assert material.roughness[1] == pytest.approx(0.12) and material.metallic.tolist() == [0, 0, 1, 0]
+    mesh = gauge()
+    front = (np.asarray(mesh.vertices) @ ROTATION)[:, 2].max()
+    assert front - DIAL == pytest.approx(0.13, abs=1e-6)
 
 
 def test_the_list_is_complete_and_reproducible(tmp_path: Path) -> None:

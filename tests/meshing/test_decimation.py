@@ -83,13 +83,13 @@ def test_smooth_surface_keeps_its_face_count(decimator: Decimator) -> None:
 @both_libraries
 def test_thin_features_raise_the_face_count(decimator: Decimator) -> None:
     vertices, faces = thin_rings()
-    target, bound = 4000 if decimator == "pymeshlab" else 2500, 0.5 * VOXEL
+    target, bound = 2000, 0.5 * VOXEL
     free = decimate_to_error_bound(vertices, faces, target, 4 * target, 0.0, decimator)
     assert free.deviation.quantile > bound and len(free.faces) <= target
     stops: list[int] = []
     bounded = decimate_to_error_bound(vertices, faces, target, 4 * target, bound, decimator, lambda: stops.append(1))
     assert bounded.deviation.quantile <= bound
-    assert 1.4 * target < len(bounded.faces) <= 4 * target
+    assert 1.2 * target < len(bounded.faces) <= 4 * target
     assert len(stops) == bounded.retries >= 1
     # Independent of the measure used by the bound: distances to the analytic tori, whose tessellation lies within 1 % of the tube.
     assert np.quantile(distance_to_rings(samples(bounded)), 0.999) < bound + 0.01 * TUBE
@@ -117,7 +117,7 @@ def test_retries_are_limited(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(decimation, "decimate", fixed)
     monkeypatch.setattr(decimation, "surface_deviation", lambda first, second: decimation.Deviation(1.01, 1.01))
     result = decimate_to_error_bound(*sphere(3), 100, 10**6, 1.0, "pymeshlab")
-    assert targets == [100, 150, 225, 338] and result.retries == MAX_RETRIES
+    assert targets == [100, 125, 157, 197] and result.retries == MAX_RETRIES
 
 
 def test_a_mesh_with_fewer_faces_is_unchanged() -> None:
@@ -146,3 +146,22 @@ def test_closed_meshes_stay_closed_and_manifold(decimator: Decimator) -> None:
     result = decimate_to_error_bound(np.asarray(mesh.vertices), np.asarray(mesh.faces, np.int32), 3000, 3000, 0.0, decimator)
     assert result.topology.watertight and len(result.faces) <= 3000
     assert trimesh.Trimesh(result.vertices, result.faces, process=False).is_winding_consistent
+
+
+@both_libraries
+def test_flat_faces_stay_flat_and_give_their_triangles_to_the_curved_part(decimator: Decimator) -> None:
+    """A finely meshed cube with a dome on top, 49 152 faces, to 800."""
+    box = trimesh.creation.box((1, 1, 1))
+    for _ in range(6):
+        box = box.subdivide()
+    vertices, faces = np.asarray(box.vertices).copy(), np.asarray(box.faces, np.int32)
+    radius = np.minimum(0.3, np.linalg.norm(vertices[:, :2], axis=1))
+    vertices[:, 2] += np.where(vertices[:, 2] > 0.49, 0.5 * np.sqrt(0.09 - radius**2), 0)
+    low = decimate(vertices, faces, 800, decimator)
+    assert surface_deviation((vertices, faces), low).quantile < 0.003
+    corners = low[0][low[1]]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    below = corners[..., 2].max(1) < 0.49
+    assert below.sum() < 250  # of 800, on more than four fifths of the area
+    assert np.degrees(np.arccos(np.minimum(1, np.abs(normals[below]).max(1)))).max() < 0.1

@@ -10,8 +10,9 @@ from gsbake.meshing import cleanup as clean
 from gsbake.meshing.depth_views import DepthView, depth_noise, distance_outside_mask
 from gsbake.meshing.hole_filling import minimise_area, sign_change_blocks, solve_laplace
 from gsbake.meshing.marching_cubes import extract_isosurface
-from gsbake.meshing.refinement.normals import NormalAccumulator, integrate_normals, vertex_normals
+from gsbake.meshing.refinement.normals import NormalAccumulator, integrate_normals
 from gsbake.meshing.resolution import choose_resolution, pixel_footprint
+from gsbake.shape_refinement.surface import Surface
 from gsbake.surfels.fields.imls import imls_field
 from gsbake.surfels.spacing import surfel_spacing
 from tests.meshing.scenes import camera_at, cameras_around, gradient, sphere, torus, trace
@@ -119,7 +120,7 @@ def test_imls_of_noisy_samples(shape) -> None:
     vertices, faces = extract_isosurface(lattice, imls_field(lattice, noisy, normals, 4 * CELL))
     assert np.abs(shape(vertices)).mean() < 0.15 * CELL
     assert clean.topology(vertices, faces).components == 1
-    assert ((vertex_normals(vertices, faces) * gradient(shape, vertices)).sum(1) > 0.9).mean() > 0.99
+    assert ((Surface(len(vertices), faces).normals(vertices) * gradient(shape, vertices)).sum(1) > 0.9).mean() > 0.99
 
 
 def test_imls_robust_pass_ignores_outliers() -> None:
@@ -150,7 +151,7 @@ def test_normal_integration_removes_bumps() -> None:
     moved = integrate_normals(vertices, faces, target, confidence, wavelength=15 * CELL, max_displacement=2 * CELL)
 
     def angle(v: np.ndarray) -> float:
-        return float(np.degrees(np.arccos(np.clip((vertex_normals(v, faces) * gradient(sphere, v)).sum(1), -1, 1))).mean())
+        return float(np.degrees(np.arccos(np.clip((Surface(len(v), faces).normals(v) * gradient(sphere, v)).sum(1), -1, 1))).mean())
 
     assert angle(moved) < 0.35 * angle(vertices)
     # A wave of the wavelength itself is halved.

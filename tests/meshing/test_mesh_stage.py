@@ -68,20 +68,20 @@ def test_torus_is_reconstructed(capture: Path, tmp_path: Path, field: str) -> No
     assert sorted(p.name for p in out.iterdir()) == ["dense.ply", "mesh.ply"]
 
 
-@pytest.mark.parametrize(("max_error", "max_faces"), [(0.5, 0), slow(0.5, 1300), slow(0.0, 0)])
+@pytest.mark.parametrize(("max_error", "max_faces"), [(0.5, 0), slow(0.5, 320), slow(0.0, 0)])
 def test_error_bound_raises_the_face_count(capture: Path, tmp_path: Path, max_error: float, max_faces: int) -> None:
     monitor = Recorder()
-    results = run(capture, tmp_path / "out", monitor, faces=1200, max_resolution=80, max_error=max_error, max_faces=max_faces)
+    results = run(capture, tmp_path / "out", monitor, faces=300, max_resolution=80, max_error=max_error, max_faces=max_faces)
     choice, evidence = monitor.decisions["decimation"]
     assert choice.startswith(f"{results['faces']} faces") and f"{results['decimation_deviation_cells']:.2f} voxels" in evidence
     if max_error == 0:
-        assert results["faces"] <= 1200 and results["decimation_deviation_cells"] > 0.5 and not monitor.warnings
+        assert results["faces"] <= 300 and results["decimation_deviation_cells"] > 0.5 and not monitor.warnings
     elif max_faces:
-        assert 1200 < results["faces"] <= 1300 and len(monitor.warnings) == 1
+        assert 300 < results["faces"] <= 320 and len(monitor.warnings) == 1
         assert f"{results['decimation_deviation_cells']:.2f} voxels" in monitor.warnings[0]
     else:
-        assert 1200 < results["faces"] <= 4800 and results["decimation_deviation_cells"] <= 0.5 and not monitor.warnings
-        assert "instead of 1200" in choice
+        assert 300 < results["faces"] <= 1200 and results["decimation_deviation_cells"] <= 0.5 and not monitor.warnings
+        assert "instead of 300" in choice
 
 
 def test_maximum_face_count() -> None:

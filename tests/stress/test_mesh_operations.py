@@ -9,12 +9,12 @@ from gsbake.geometry.raycast import RayCaster
 from gsbake.geometry.surface_distance import surface_distances
 from gsbake.meshing import cleanup as clean
 from gsbake.meshing.decimation import decimate_to_error_bound
-from gsbake.meshing.refinement.normals import NormalAccumulator, integrate_normals, unique_edges, vertex_normals
-from gsbake.meshing.refinement.photometric import refine_photometric
-from gsbake.meshing.refinement.photometric_measure import PhotometricViews
-from gsbake.meshing.refinement.silhouette import find_contour_points, refine_silhouettes
+from gsbake.meshing.refinement.normals import NormalAccumulator, integrate_normals
 from gsbake.meshing.repair import close_holes, repair
-from gsbake.mvs.pyramids import Photo
+from gsbake.shape_refinement.contour import find_contour_points
+from gsbake.shape_refinement.refine import Level, RefinementOptions, refine_shape
+from gsbake.shape_refinement.samples import Photo
+from gsbake.shape_refinement.surface import Surface
 from gsbake.texturing.atlas import make_atlas
 from gsbake.texturing.unwrapped_mesh import UnwrappedMesh
 from tests.stress.meshes import MESHES, sphere
@@ -53,7 +53,7 @@ def test_clean_up_and_smoothing(name: str) -> None:
     kept_vertices, kept, _ = clean.remove_small_components(vertices, faces, 0.02)
     assert_valid(kept_vertices, kept)
     assert_valid(clean.smooth(kept_vertices, kept, 3), kept)
-    normals = vertex_normals(kept_vertices, kept)
+    normals = Surface(len(kept_vertices), kept).normals(kept_vertices)
     assert np.isfinite(normals).all()
     for target in (normals, np.zeros_like(normals), np.full_like(normals, np.nan)):
         confidence = np.where(np.isfinite(target).all(1), 1.0, 0.0)
@@ -107,44 +107,31 @@ def masks(kind: str) -> list[np.ndarray]:
     ]
 
 
+PHOTOS = ("noise", "black", "equal", "clipped")
+
+
+def photos(kind: str) -> list[Photo]:
+    rng = np.random.default_rng(0)
+    values = {"noise": rng.random((SIZE, SIZE, 3)), "black": 0.0, "equal": 0.5, "clipped": 1.0}[kind]
+    grey = np.broadcast_to(values, (SIZE, SIZE, 3)).astype(np.float32)
+    return [Photo(camera, np.ascontiguousarray(grey), np.ones((SIZE, SIZE), np.float32)) for camera in CAMERAS]
+
+
 @on_every_mesh
-@pytest.mark.parametrize("kind", ["empty", "full", "half", "noise"])
-def test_silhouette_refinement(name: str, kind: str) -> None:
+@pytest.mark.parametrize(("kind", "mask"), [*((k, "half") for k in PHOTOS), *(("noise", m) for m in ("empty", "full", "noise", "none"))])
+def test_shape_refinement(name: str, kind: str, mask: str) -> None:
     vertices, faces = MESHES[name]()
-    result = refine_silhouettes(vertices, faces, lambda: zip(CAMERAS, masks(kind), strict=True), 2, 1)
-    assert_valid(result.vertices, faces)
+    given = None if mask == "none" else lambda: zip(CAMERAS, masks(mask), strict=True)
+    options = RefinementOptions(levels=(Level(16, 1, 1.0, False), Level(16, 2, 1.0)))
+    assert_valid(refine_shape(vertices, faces, lambda blur: photos(kind), given, 0.05, options=options).vertices, faces)
 
 
 def test_contour_points_of_a_camera_in_a_vertex() -> None:
     vertices, faces = sphere()
     camera = look_at(vertices[0], size=SIZE, focal=60)
-    points = find_contour_points(
-        RayCaster(vertices, faces, 1), vertex_normals(vertices, faces), unique_edges(faces), camera, masks("noise")[0]
-    )
+    surface = Surface(len(vertices), faces)
+    points = find_contour_points(RayCaster(vertices, faces, 1), surface.normals(vertices), surface.edges, camera, masks("noise")[0])
     assert np.isfinite(points.offset).all() and np.isfinite(points.pixel).all()
-
-
-def photometric_views(kind: str, depth: float) -> PhotometricViews:
-    rng = np.random.default_rng(0)
-    grey = {"noise": rng.integers(0, 256, (SIZE, SIZE)), "black": np.zeros((SIZE, SIZE)), "equal": np.full((SIZE, SIZE), 128)}[kind]
-    photos = [Photo(camera, grey.astype(np.uint8), np.ones((SIZE, SIZE), np.uint8)) for camera in CAMERAS]
-    stereo = np.full((SIZE, SIZE), depth, np.float32), np.ones((SIZE, SIZE), np.float32)
-    return PhotometricViews(CAMERAS, photos.__getitem__, lambda index: stereo, 10.0)
-
-
-@on_every_mesh
-@pytest.mark.parametrize("kind", ["noise", "black", "equal"])
-def test_photometric_refinement(name: str, kind: str) -> None:
-    vertices, faces = MESHES[name]()
-    result = refine_photometric(vertices, faces, photometric_views(kind, 2.3), 2, 1)
-    assert_valid(result.vertices, faces)
-    assert np.isfinite([result.consistent_share, result.median_displacement, result.ncc_before, result.ncc_after]).all()
-
-
-@pytest.mark.parametrize("depth", [np.nan, np.inf, 0.0, -1.0, 1e-30, 1e30])
-def test_photometric_refinement_with_hostile_depths(depth: float) -> None:
-    vertices, faces = sphere()
-    assert_valid(refine_photometric(vertices, faces, photometric_views("noise", depth), 1, 1).vertices, faces)
 
 
 @on_every_mesh

@@ -19,6 +19,7 @@ from gsbake.kernels.declaration import kernel
 from gsbake.kernels.threads import run_chunks
 from gsbake.meshing.cleanup import Faces, Vertices
 from gsbake.meshing.depth_views import DepthView, Floats
+from gsbake.shape_refinement.surface import Surface
 
 
 class NormalAccumulator:
@@ -47,23 +48,6 @@ class NormalAccumulator:
         return unit.astype(np.float64), agreement.astype(np.float64)
 
 
-def vertex_normals(vertices: Vertices, faces: Faces) -> NDArray[np.float64]:
-    """Area-weighted unit normals (v, 3)."""
-    corners = vertices[faces]
-    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    out = np.zeros_like(vertices)
-    for axis in range(3):
-        for corner in range(3):
-            out[:, axis] += np.bincount(faces[:, corner], cross[:, axis], minlength=len(vertices))
-    return np.asarray(out / np.maximum(np.linalg.norm(out, axis=1, keepdims=True), 1e-20))
-
-
-def unique_edges(faces: NDArray[Any]) -> NDArray[np.int64]:
-    """Each edge once (e, 2), the smaller vertex first."""
-    pairs = np.sort(np.asarray(faces)[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1).astype(np.int64)
-    return np.unique(pairs[:, 0] << 32 | pairs[:, 1])[:, None] >> np.array([32, 0]) & 0xFFFFFFFF
-
-
 def integrate_normals(
     vertices: Vertices,
     faces: Faces,
@@ -79,11 +63,12 @@ def integrate_normals(
     """
     if len(faces) == 0 or wavelength <= 0 or not np.ptp(vertices[np.unique(faces)], axis=0).any():
         return vertices
-    current = vertex_normals(vertices, faces)
+    surface = Surface(len(vertices), faces)
+    current = surface.normals(vertices)
     alignment = (current * target).sum(1)
     confidence = np.where(alignment > 0.3, confidence, 0.0)  # such a normal belongs to another surface
     normal = np.where((confidence > 0)[:, None], target, current)
-    a, b = unique_edges(faces).T
+    a, b = surface.edges.T
     mean_normal = normal[a] + normal[b]
     mean_normal /= np.maximum(np.linalg.norm(mean_normal, axis=1, keepdims=True), 1e-12)
     edge_vector = vertices[a] - vertices[b]

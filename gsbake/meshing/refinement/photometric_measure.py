@@ -22,11 +22,12 @@ from gsbake.geometry.cameras import Camera
 from gsbake.geometry.raycast import RayCaster
 from gsbake.kernels.threads import run_chunks
 from gsbake.meshing.cleanup import Faces, Vertices
-from gsbake.meshing.refinement.normals import unique_edges, vertex_normals
 from gsbake.meshing.refinement.photometric_kernel import measure_displacements
 from gsbake.mvs.ncc import RADIUS, SAMPLES, SamplingPattern
 from gsbake.mvs.pyramids import MatchingViews, Photo
 from gsbake.mvs.view_selection import select_views
+from gsbake.shape_refinement.surface import Surface
+from gsbake.shape_refinement.targets import Targets, vertex_rows
 
 Floats = NDArray[np.float32]
 Doubles = NDArray[np.float64]
@@ -46,6 +47,8 @@ MAX_STEPS = 1.5
 PIXELS_PER_POINT = 24.0
 #: Weighted mean squared distance of a patch's samples from its centre in square pixels; maximum random-walk steps.
 PATCH_VARIANCE, MAX_WALK_STEPS = 36.0, 200
+#: Residual in pixels beyond which a patch counts linearly: typical error of an inlier.
+OUTLIER = 0.6
 #: Minimum residual cost (aliasing, compression).
 NOISE_FLOOR = 0.02
 #: Maximum information per square pixel of one measurement.
@@ -65,40 +68,35 @@ class PhotometricViews:
 
 @dataclass(frozen=True)
 class MeasurementPlan:
-    """Constants of the refinement of one mesh: `faces`, `edges`, indices of the `measured_vertices`, median `pixel_size` on the surface,
+    """Constants of the refinement of one mesh: its `surface`, indices of the `measured_vertices`, median `pixel_size` on the surface,
     the photos paired with each photo, and `patch_share`, one vertex's share of a patch's area."""
 
-    faces: Faces
-    edges: Indices
+    surface: Surface
     measured_vertices: Indices
     pixel_size: float
     pairs: list[list[int]]
     patch_share: float
 
     @staticmethod
-    def make(vertices: Vertices, faces: Faces, cameras: Sequence[Camera]) -> MeasurementPlan:
+    def make(surface: Surface, vertices: Vertices, cameras: Sequence[Camera]) -> MeasurementPlan:
         """Plan for a mesh (unit frame, outward winding) and its cameras."""
-        area, count = surface_area(vertices, faces), len(vertices)
+        area, count = surface_area(vertices, surface.faces), len(vertices)
         pixel_size = float(np.median([np.linalg.norm(c.centre - vertices.mean(0)) / (0.5 * (c.fx + c.fy)) for c in cameras]))
         vertex_area = area / count / pixel_size**2
         sample = np.arange(0, count, max(1, count // PAIRING_POINTS))
-        pairs, _ = select_views(cameras, vertices[sample], vertex_normals(vertices, faces)[sample], NEIGHBOURS, NEIGHBOURS)
+        pairs, _ = select_views(cameras, vertices[sample], surface.normals(vertices)[sample], NEIGHBOURS, NEIGHBOURS)
         measured_vertices = np.arange(0, count, max(1, round(PIXELS_PER_POINT / vertex_area)))
-        return MeasurementPlan(
-            faces, unique_edges(faces), measured_vertices, pixel_size, pairs, min(vertex_area / (np.pi * RADIUS**2), 1.0)
-        )
+        return MeasurementPlan(surface, measured_vertices, pixel_size, pairs, min(vertex_area / (np.pi * RADIUS**2), 1.0))
 
 
 @dataclass(frozen=True)
 class Measurements:
-    """Measurements (m,), one per photo and visible vertex: `photo` and `vertex`; `displacement` along the normal in world units;
-    `information` per square pixel, 0 when invalid; mean `ncc` of the matching photos."""
+    """Measurements (m,), one per photo that sees a `vertex`: `displacement` along the normal in world units;
+    `information` per square pixel, 0 when invalid."""
 
-    photo: Indices
     vertex: Indices
     displacement: Doubles
     information: Doubles
-    ncc: Doubles
 
     def weights(self) -> Doubles:
         """Information (m,) times the majority at its vertex: the share of valid measurements minus that of invalid ones, or 0."""
@@ -106,12 +104,28 @@ class Measurements:
         useful = np.bincount(self.vertex, self.information > 0)
         return self.information * np.maximum(2 * useful / np.maximum(visible, 1) - 1, 0)[self.vertex]
 
-    def shared(self, other: Measurements) -> tuple[Indices, Indices]:
-        """Rows of the measurements with positive weight, and rows of `other` with the same photos and vertices."""
-        rows = np.flatnonzero(self.weights() > 0)
-        keys = [s.vertex << 32 | s.photo for s in (self, other)]
-        _, rows_self, rows_other = np.intersect1d(keys[0][rows], keys[1], assume_unique=True, return_indices=True)
-        return rows[rows_self], rows_other
+
+class PatchTargets:
+    """Measures patches at the vertices of a surface, for `refine_shape`; what does not change with the vertices is determined once."""
+
+    def __init__(self, views: PhotometricViews, threads: int) -> None:
+        self._views, self._threads = views, threads
+        self._plan: MeasurementPlan | None = None
+
+    def __call__(self, surface: Surface, vertices: Vertices) -> tuple[Targets, float]:
+        """Targets at the measured vertices, and the share of them at which most photos agree."""
+        if surface_area(vertices, surface.faces) == 0:
+            return Targets(vertex_rows(np.zeros(0, np.int64), len(vertices)), *np.zeros((3, 0))), 0.0
+        self._plan = plan = self._plan or MeasurementPlan.make(surface, vertices, self._views.cameras)
+        found = measure(vertices, plan, self._views, self._threads)
+        # Patches overlap: a measurement is weighted by the share of a patch that is not shared with others.
+        stride = -(-len(vertices) // len(plan.measured_vertices))
+        weight = found.weights() * min(stride * plan.patch_share, 1.0)
+        used = weight > 0
+        rows = vertex_rows(found.vertex[used], len(vertices))
+        outlier = np.full(int(used.sum()), OUTLIER * plan.pixel_size)
+        targets = Targets(rows, found.displacement[used], weight[used] / plan.pixel_size**2, outlier)
+        return targets, len(np.unique(found.vertex[used])) / len(plan.measured_vertices)
 
 
 def surface_area(vertices: Vertices, faces: Faces) -> float:
@@ -139,30 +153,29 @@ def patch_means(vertices: Vertices, edges: Indices, mean_squared_distance: float
 
 def measure(vertices: Vertices, plan: MeasurementPlan, views: PhotometricViews, threads: int) -> Measurements:
     """Measurements of every photo, with its paired photos, at the measured vertices."""
-    edges, measured_vertices = plan.edges, plan.measured_vertices
-    caster = RayCaster(vertices, plan.faces, threads)
+    edges, measured_vertices = plan.surface.edges, plan.measured_vertices
+    caster = RayCaster(vertices, plan.surface.faces, threads)
     means = patch_means(vertices, edges, PATCH_VARIANCE * plan.pixel_size**2)
-    points, normals = vertices[measured_vertices], vertex_normals(means, plan.faces)[measured_vertices]
+    points, normals = vertices[measured_vertices], plan.surface.normals(means)[measured_vertices]
     plane_offset = np.einsum("nk,nk->n", normals, means[measured_vertices] - points)
     ray_offset = 0.5 * float(np.linalg.norm(vertices[edges[:, 0]] - vertices[edges[:, 1]], axis=1).mean())
     visible = np.stack([caster.visible_from(camera, points, normals, MIN_COSINE, ray_offset) for camera in views.cameras])
     parts = [_measure_photo(index, others, visible, (points, normals, plane_offset), views) for index, others in enumerate(plan.pairs)]
-    photo = np.repeat(np.arange(len(parts)), [len(part[0]) for part in parts])
-    rows, displacement, information, ncc = (np.concatenate(column) for column in zip(*parts, strict=True))
-    return Measurements(photo, measured_vertices[rows], displacement, information, ncc)
+    rows, displacement, information = (np.concatenate(column) for column in zip(*parts, strict=True))
+    return Measurements(measured_vertices[rows], displacement, information)
 
 
 def _measure_photo(
     index: int, others: list[int], visible: NDArray[np.bool_], surface: tuple[Vertices, Vertices, Doubles], views: PhotometricViews
-) -> tuple[Indices, Doubles, Doubles, Doubles]:
-    """Rows of the points visible in photo `index` and one of the `others`, with displacement, information and NCC.
+) -> tuple[Indices, Doubles, Doubles]:
+    """Rows of the points visible in photo `index` and one of the `others`, with displacement and information.
 
     `surface` is points and normals (n, 3), and the offset (n,) along the normal of the mesh's mean over a patch at normal incidence.
     """
     camera = views.cameras[index]
     rows = np.flatnonzero(visible[index] & visible[others].any(0))
     if len(rows) == 0:
-        return rows, np.zeros(0), np.zeros(0), np.zeros(0)
+        return rows, np.zeros(0), np.zeros(0)
     points, normals, plane_offset = (part[rows] for part in surface)
     to_camera = camera.centre - points
     cosine = np.einsum("nk,nk->n", normals, to_camera) / np.linalg.norm(to_camera, axis=1)
@@ -183,7 +196,7 @@ def _measure_photo(
     information = np.minimum(SAMPLES / 2 * curvature / STEP_PIXELS**2 / (cost + NOISE_FLOOR), MAX_INFORMATION)
     valid = (np.abs(displacement) <= MAX_STEPS * steps) & (np.abs(oblique_offset) <= MAX_STEPS * steps)
     weight = _confidence(camera, points, views.depth(index), views.tolerance)
-    return rows, displacement.astype(np.float64), np.where(valid, information, 0.0) * weight, 1.0 - cost.astype(np.float64)
+    return rows, displacement.astype(np.float64), np.where(valid, information, 0.0) * weight
 
 
 def _confidence(camera: Camera, points: Vertices, stereo: tuple[Floats, Floats] | None, tolerance: float) -> Doubles:

@@ -1,32 +1,26 @@
-"""Silhouette refinement: moves vertices along their normals until the mesh's silhouettes agree with the masks.
+"""Contour points of a mesh in a photo, and how far the mask's boundary is from them.
 
-Surfels are rendered with a screen-space low-pass filter, so their silhouettes extend about a pixel beyond the discs and training moves the
-centres inward by as much; a mesh fused from their depths is too small. On a contour the normal is perpendicular to the viewing direction,
-so a displacement δ along it moves the silhouette by δ f / z pixels.
+A mesh fused from depths is too small: surfels are rendered with a screen-space low-pass filter, so their silhouettes extend about a pixel
+beyond the discs, and training moves the centres inward by as much. On a contour the normal is perpendicular to the viewing direction, so a
+displacement δ along it moves the silhouette by δ f / z pixels.
 
 Contour points are the zero crossings of n·v on the mesh's edges (Hertzmann, *Introduction to 3D non-photorealistic rendering*, SIGGRAPH
 1999 course) that lie on the outline of the mesh in that view; each is compared with the mask's half level along the contour's normal in
-the image. Displacements between them follow by least squares: (AᵀWA + λL) δ = AᵀW t with the umbrella operator L, Huber weights and a few
-Gauss-Newton rounds.
+the image.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.sparse as sparse
 from numpy.typing import NDArray
 
 from gsbake.geometry.cameras import Camera
 from gsbake.geometry.raycast import RayCaster
 from gsbake.imaging.sampling import bilinear_at_pixels
-from gsbake.meshing.refinement.laplacian import solve_screened_laplacian
-from gsbake.meshing.refinement.normals import unique_edges, vertex_normals
 
 Vertices = NDArray[np.float64]
-Faces = NDArray[np.int32]
 
 #: Distance in pixels to either side of a contour point in which the mask's boundary is searched.
 SEARCH_RADIUS = 5.0
@@ -34,10 +28,6 @@ SEARCH_RADIUS = 5.0
 SEARCH_STEPS = 4
 #: Offset in pixels of the two rays that test whether a contour point lies on the outline.
 OUTLINE_OFFSET = 1.0
-#: Huber threshold of residuals in pixels.
-HUBER_THRESHOLD = 0.7
-#: Distance over which a contour point's displacement is interpolated, as a share of the object's size.
-INFLUENCE_RADIUS = 0.012
 
 
 @dataclass(frozen=True)
@@ -53,17 +43,6 @@ class ContourPoints:
 
     def __len__(self) -> int:
         return len(self.start)
-
-
-@dataclass(frozen=True)
-class SilhouetteResult:
-    """The refined `vertices` (v, 3); median offset in pixels from the contour to the masks before and after; number of `contour_points`,
-    0 when too few."""
-
-    vertices: Vertices
-    offset_before: float
-    offset_after: float
-    contour_points: int
 
 
 def find_contour_points(
@@ -125,57 +104,3 @@ def _mask_boundary_offset(mask: NDArray[np.uint8], uv: NDArray[np.float64], dire
     height, width = mask.shape
     in_image = (x.min(1) >= 0) & (y.min(1) >= 0) & (x.max(1) <= width - 1) & (y.max(1) <= height - 1)
     return np.where(np.isfinite(cost[rows, nearest]) & in_image, crossing_position[rows, nearest], np.nan)
-
-
-def solve_displacements(contour: ContourPoints, edges: NDArray[np.int64], count: int, radius: float) -> NDArray[np.float64]:
-    """Smooth displacements (count,) along the vertex normals, in the unit frame, that move the contour points to the masks' boundaries.
-
-    `radius` is the interpolation distance in edges.
-    """
-    rows = np.arange(len(contour))
-    weight = np.where(np.abs(contour.offset) <= HUBER_THRESHOLD, 1.0, HUBER_THRESHOLD / np.maximum(np.abs(contour.offset), 1e-12))
-    interpolation = sparse.csr_matrix(
-        (
-            np.concatenate([1 - contour.fraction, contour.fraction]),
-            (np.concatenate([rows, rows]), np.concatenate([contour.start, contour.end])),
-        ),
-        shape=(len(contour), count),
-    )
-    density = max(len(contour) / count, 1e-6)
-    data = interpolation.T @ sparse.diags(weight) @ interpolation + 1e-6 * sparse.identity(count)
-    return solve_screened_laplacian(data, interpolation.T @ (weight * contour.offset * contour.pixel), edges, density * radius**2)
-
-
-def refine_silhouettes(
-    vertices: Vertices,
-    faces: Faces,
-    views: Callable[[], Iterable[tuple[Camera, NDArray[np.uint8]]]],
-    rounds: int,
-    threads: int,
-) -> SilhouetteResult:
-    """Refine the `vertices` (v, 3) of a mesh (unit frame, outward winding) against the masks.
-
-    `views` is called once per round and yields cameras with their masks (h, w), 0..255. With fewer than 100 contour points the mesh is
-    unchanged.
-    """
-    if len(faces) == 0:
-        return SilhouetteResult(vertices, float("nan"), float("nan"), 0)
-    edges = unique_edges(faces)
-    size = float(np.ptp(vertices, axis=0).max())
-    mean_edge = float(np.linalg.norm(vertices[edges[:, 0]] - vertices[edges[:, 1]], axis=1).mean())
-    before = after = float("nan")
-    count = 0
-    for iteration in range(rounds + 1):
-        caster, normals = RayCaster(vertices, faces, threads), vertex_normals(vertices, faces)
-        parts = [find_contour_points(caster, normals, edges, camera, mask) for camera, mask in views()]
-        contour = ContourPoints(
-            *(np.concatenate([getattr(part, name) for part in parts]) for name in ("start", "end", "fraction", "offset", "pixel"))
-        )
-        if len(contour) < 100:
-            break
-        after, count = float(np.median(contour.offset)), len(contour)
-        before = after if iteration == 0 else before
-        if iteration == rounds:
-            break
-        vertices = vertices + normals * solve_displacements(contour, edges, len(vertices), INFLUENCE_RADIUS * size / mean_edge)[:, None]
-    return SilhouetteResult(vertices, before, after, count)

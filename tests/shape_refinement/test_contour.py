@@ -1,18 +1,17 @@
-"""Silhouette refinement: a sphere of known size is recovered from a smaller one."""
+"""Contour points: a smaller sphere's distance from the masks, and its recovery from them alone."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import numpy as np
-import pytest
 import trimesh
 from numpy.typing import NDArray
 
 from gsbake.geometry.cameras import Camera
 from gsbake.geometry.raycast import RayCaster
-from gsbake.meshing.refinement.normals import unique_edges, vertex_normals
-from gsbake.meshing.refinement.silhouette import SEARCH_RADIUS, ContourPoints, find_contour_points, refine_silhouettes, solve_displacements
+from gsbake.shape_refinement.contour import find_contour_points
+from gsbake.shape_refinement.refine import pixel_size, refine_shape
+from gsbake.shape_refinement.samples import Photo
+from gsbake.shape_refinement.surface import Surface
 from tests.support.cameras import look_at
 
 Masked = tuple[Camera, NDArray[np.uint8]]
@@ -39,8 +38,12 @@ def masks(mesh: trimesh.Trimesh, cameras: list[Camera], supersampling: int = 4) 
     return out
 
 
-def each(views: list[Masked]) -> Iterator[Masked]:
-    yield from views
+def refined(mesh: trimesh.Trimesh, views: list[Masked]) -> np.ndarray:
+    """The vertices after refinement by masks alone: the photos are grey."""
+    photos = [Photo(camera, np.full((*mask.shape, 3), 0.5, np.float32), mask.astype(np.float32) / 255) for camera, mask in views]
+    vertices, faces = np.array(mesh.vertices), np.ascontiguousarray(mesh.faces, np.int32)
+    pixel = pixel_size(vertices, [camera for camera, _ in views])
+    return refine_shape(vertices, faces, lambda blur: photos, lambda: views, pixel).vertices
 
 
 def sphere(radius: float) -> trimesh.Trimesh:
@@ -50,7 +53,7 @@ def sphere(radius: float) -> trimesh.Trimesh:
 def test_offset_of_a_smaller_sphere_equals_the_analytic_one() -> None:
     camera, mask = masks(sphere(0.5), ring(1), supersampling=8)[0]
     small = sphere(0.48)
-    edges = unique_edges(small.faces)
+    edges = Surface(len(small.vertices), np.asarray(small.faces, np.int32)).edges
     contour = find_contour_points(RayCaster(small.vertices, small.faces, 1), np.asarray(small.vertex_normals), edges, camera, mask)
     # A sphere of radius r at distance d shows a disc of tan(asin(r / d)); off the axis it is a slightly longer ellipse.
     expected = camera.fx * (np.tan(np.arcsin(0.5 / 4)) - np.tan(np.arcsin(0.48 / 4)))
@@ -60,25 +63,16 @@ def test_offset_of_a_smaller_sphere_equals_the_analytic_one() -> None:
 
 
 def test_sphere_is_recovered() -> None:
-    views = masks(sphere(0.5), ring(12))
-    small = sphere(0.48)
-    result = refine_silhouettes(np.asarray(small.vertices), np.asarray(small.faces, np.int32), lambda: each(views), 3, 1)
-    radius = np.linalg.norm(result.vertices, axis=1)
-    assert result.offset_before > 1.5
-    assert abs(result.offset_after) < 0.1
-    assert abs(radius.mean() - 0.5) < 0.001
-    assert radius.std() < 0.001
+    radius = np.linalg.norm(refined(sphere(0.48), masks(sphere(0.5), ring(12))), axis=1)
+    assert abs(radius.mean() - 0.5) < 0.002
+    assert radius.std() < 0.002
 
 
-def test_true_mesh_and_mesh_without_masks_are_unchanged() -> None:
+def test_true_mesh_and_mesh_without_masks_stay() -> None:
     views = masks(sphere(0.5), ring(8))
-    true = sphere(0.5)
-    result = refine_silhouettes(np.asarray(true.vertices), np.asarray(true.faces, np.int32), lambda: each(views), 2, 1)
-    assert np.abs(np.linalg.norm(result.vertices, axis=1) - 0.5).max() < 0.003  # a quarter of a pixel
+    assert np.abs(np.linalg.norm(refined(sphere(0.5), views), axis=1) - 0.5).max() < 0.003  # a quarter of a pixel
     empty = [(camera, np.zeros_like(mask)) for camera, mask in views]
-    unchanged = refine_silhouettes(np.asarray(true.vertices), np.asarray(true.faces, np.int32), lambda: each(empty), 2, 1)
-    assert unchanged.contour_points == 0
-    assert np.array_equal(unchanged.vertices, true.vertices)
+    assert np.abs(refined(sphere(0.5), empty) - sphere(0.5).vertices).max() < 1e-6
 
 
 def test_interior_contours_are_ignored() -> None:
@@ -87,19 +81,8 @@ def test_interior_contours_are_ignored() -> None:
     small.apply_translation(0.7 * camera.centre / np.linalg.norm(camera.centre))
     both = trimesh.util.concatenate([ball, small])
     ((_, mask),) = masks(both, [camera])
-    normals = vertex_normals(np.asarray(both.vertices), np.asarray(both.faces))
-    contour = find_contour_points(RayCaster(both.vertices, both.faces, 1), normals, unique_edges(both.faces), camera, mask)
+    surface = Surface(len(both.vertices), np.asarray(both.faces, np.int32))
+    normals = surface.normals(np.asarray(both.vertices))
+    contour = find_contour_points(RayCaster(both.vertices, both.faces, 1), normals, surface.edges, camera, mask)
     assert len(contour) > 50
     assert contour.start.max() < len(ball.vertices)
-
-
-def test_displacements_are_interpolated_and_robust_to_an_outlier() -> None:
-    count = 101
-    edges = np.stack([np.arange(count - 1), np.arange(1, count)], 1).astype(np.int64)
-    at = np.arange(0, count, 2)
-    offset = np.full(len(at), 0.5)
-    offset[10] = SEARCH_RADIUS
-    contour = ContourPoints(at, at, np.zeros(len(at)), offset, np.full(len(at), 0.01))
-    moved = solve_displacements(contour, edges, count, radius=3.0)
-    assert moved == pytest.approx(np.full(count, 0.005), rel=0.6)
-    assert moved[60:] == pytest.approx(np.full(41, 0.005), rel=0.01)
