@@ -161,6 +161,8 @@ class _Extraction:
             vertices = denoise(vertices, faces, self.options.mesh.denoising_iterations)
         with self.monitor.part("untangling"):
             vertices, faces = untangle(vertices, faces, start)
+            vertices, faces, cut_off = cleanup.remove_small_components(vertices, faces, self.options.mesh.min_component)
+            dropped += cut_off
         write_mesh(self.out / "dense.ply", vertices, faces)
         self.monitor.check_stop()
         with self.monitor.part("decimate"):

@@ -13,7 +13,7 @@ import trimesh
 
 from gsbake.config.schema import Mesh
 from gsbake.errors import BadInputError
-from gsbake.geometry.cameras import CameraSet
+from gsbake.geometry.cameras import Array, CameraSet
 from gsbake.meshing.extract import MeshOptions, extract_mesh
 from gsbake.surfels.model import create
 from tests.meshing.scenes import cameras_around, gradient, torus, trace
@@ -135,3 +135,16 @@ def test_no_surfels_is_bad_input(capture: Path, tmp_path: Path) -> None:
     far.save(capture / "far" / "surfels.safetensors")
     with pytest.raises(BadInputError, match="surfels"):
         run(capture, tmp_path / "out", surfels="far")
+
+
+def test_what_untangling_cuts_off_is_removed(capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    cut_off = trimesh.creation.icosphere(subdivisions=1, radius=0.02)
+
+    def cutting(vertices: Array, faces: Any, start: Array | None = None, rings: int = 4) -> tuple[Array, Any]:
+        if start is None:
+            return vertices, faces
+        return np.concatenate([vertices, cut_off.vertices]), np.concatenate([faces, cut_off.faces + len(vertices)]).astype(np.int32)
+
+    monkeypatch.setattr("gsbake.meshing.extract.untangle", cutting)
+    results = run(capture, tmp_path / "out", faces=1000, max_resolution=40)
+    assert results["components"] == 1 and results["dropped_components"] > 0
