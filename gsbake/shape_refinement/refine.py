@@ -161,7 +161,9 @@ class _Refinement:
         photos: Sequence[Photo] = ()
         blur = -1.0
         for level in options.levels:
-            photos, blur = photos if level.blur == blur else load_photos(level.blur), level.blur
+            if level.blur != blur:
+                photos = ()  # frees the last ones: all photos are most of the memory
+                photos, blur = load_photos(level.blur), level.blur
             centres = np.stack([photo.camera.centre for photo in photos])
             robust = np.ones((count, len(photos)), np.float32) if robust is None else robust
             light = light.resampled(level.light) if light.size != level.light else light

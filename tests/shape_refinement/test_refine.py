@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import weakref
 from dataclasses import replace
 
 import numpy as np
@@ -151,3 +152,17 @@ def test_a_stop_request_ends_a_step(ball: Ball, at: int) -> None:
             on_step=lambda text, vertices: steps.append(text),
         )  # fmt: skip
     assert len(steps) == at // 13
+
+
+def test_one_blur_of_the_photos_is_in_memory(ball: Ball) -> None:
+    loaded: list[weakref.ref[Photo]] = []
+    alive: list[int] = []
+
+    def load(blur: float) -> list[Photo]:
+        alive.append(sum(photo() is not None for photo in loaded))
+        photos = ball.photos(0.7, 0.3)
+        loaded.extend(weakref.ref(photo) for photo in photos)
+        return photos
+
+    refine_shape(ball.vertices, ball.surface.faces, load, None, 0.014, options=OPTIONS)
+    assert alive == [0, 0]
