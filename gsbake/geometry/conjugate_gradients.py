@@ -32,7 +32,10 @@ def conjugate_gradients(matrix: Any, right: Doubles, tolerance: float, iteration
         square = _dot(residual, scaled)
         direction = scaled + (square / before) * direction if before else scaled
         image = matrix @ direction
-        length = square / _dot(direction, image)
+        curvature = _dot(direction, image)
+        if curvature <= 0:  # singular, or too small for double precision
+            break
+        length = square / curvature
         solution, residual, before = solution + length * direction, residual - length * image, square
     return solution
 

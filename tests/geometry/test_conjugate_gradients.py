@@ -36,6 +36,7 @@ def test_ends_at_the_tolerance() -> None:
     assert 1e-4 < np.linalg.norm(right - matrix @ found) / np.linalg.norm(right) <= 1e-2
     assert not conjugate_gradients(matrix, np.zeros(300), 1e-2, 300).any()
     assert len(conjugate_gradients(*system(2), 1e-2, 0)) == 2
+    assert not conjugate_gradients(sparse.csr_matrix((2, 2)), np.ones(2), 1e-2, 10).any()  # singular
 
 
 def test_threads_of_blas_do_not_matter() -> None:
