@@ -7,6 +7,8 @@ collapses in passes of rising error instead of a queue, boundaries kept. It does
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from gsbake.errors import UsageError
@@ -42,7 +44,8 @@ def decimate(vertices: Vertices, faces: Faces, target: int, decimator: Decimator
     return low_vertices / scale, low_faces
 
 
-def _pymeshlab(vertices: Vertices, faces: Faces, target: int) -> tuple[Vertices, Faces]:
+def _mesh_set(vertices: Vertices, faces: Faces) -> Any:
+    """A MeshSet of pymeshlab with this mesh."""
     try:
         import pymeshlab
     except ImportError as error:  # installed, but a system library is missing
@@ -51,6 +54,11 @@ def _pymeshlab(vertices: Vertices, faces: Faces, target: int) -> tuple[Vertices,
         ) from error
     meshes = pymeshlab.MeshSet(verbose=False)
     meshes.add_mesh(pymeshlab.Mesh(np.ascontiguousarray(vertices, np.float64), np.ascontiguousarray(faces, np.int32)))
+    return meshes
+
+
+def _pymeshlab(vertices: Vertices, faces: Faces, target: int) -> tuple[Vertices, Faces]:
+    meshes = _mesh_set(vertices, faces)
     meshes.meshing_decimation_quadric_edge_collapse(
         targetfacenum=int(target),
         qualitythr=0.3,
@@ -78,16 +86,17 @@ def _fast_simplification(vertices: Vertices, faces: Faces, target: int) -> tuple
     return remove_unused_vertices(np.asarray(out[0], np.float64), np.asarray(out[1], np.int32))
 
 
-def remesh(vertices: Vertices, faces: Faces, edge: float, decimator: Decimator) -> tuple[Vertices, Faces]:
-    """The surface with edges of about the length `edge`, by pymeshlab; the mesh itself where that is not installed (Botsch & Kobbelt, *A
-    remeshing approach to multiresolution modeling*, SGP 2004)."""
-    if decimator != "pymeshlab" or len(faces) == 0 or not edge > 0:
+def remesh(vertices: Vertices, faces: Faces, edge: float, most: int, decimator: Decimator) -> tuple[Vertices, Faces]:
+    """The surface with edges of about the length `edge`, by pymeshlab (Botsch & Kobbelt, *A remeshing approach to multiresolution
+    modeling*, SGP 2004); where that is not installed the mesh itself, decimated to about `most` vertices where it has more."""
+    if len(faces) == 0 or not edge > 0:
         return vertices, faces
+    if decimator != "pymeshlab":
+        return (vertices, faces) if len(vertices) <= most else decimate(vertices, faces, max(4, 2 * most), decimator)
+    scale = 1 / edge
+    meshes = _mesh_set(vertices * scale, faces)
     import pymeshlab
 
-    scale = 1 / edge
-    meshes = pymeshlab.MeshSet(verbose=False)
-    meshes.add_mesh(pymeshlab.Mesh(np.ascontiguousarray(vertices * scale, np.float64), np.ascontiguousarray(faces, np.int32)))
     meshes.meshing_isotropic_explicit_remeshing(
         iterations=3, targetlen=pymeshlab.PureValue(1.0), adaptive=False, checksurfdist=False, featuredeg=40
     )

@@ -297,30 +297,29 @@ class _Extraction:
     def _refine_shape(self, vertices: Doubles, faces: Faces, cell: float) -> tuple[Doubles, dict[str, float]]:
         """Refine the vertices by the masks and photos, on a coarser mesh; also results for the manifest."""
         settings, monitor, posed = self.options.mesh, self.monitor, self.posed
+        if len(faces) == 0:
+            return vertices, {}
         if not settings.refinement_vertices:
             monitor.decide("shape refinement", "skipped", "set by the profile")
             return vertices, {}
         test = set(test_photos(len(posed), self.options.holdout))
-        chosen = [index for index in range(len(posed)) if index not in test]
-        chosen = chosen[:: -(-len(chosen) // MAX_REFINEMENT_PHOTOS)]
+        chosen = evenly([index for index in range(len(posed)) if index not in test], MAX_REFINEMENT_PHOTOS)
         size, decimator = self.options.stereo_size, resolve_decimator(settings.decimator)
         cameras = [posed.cameras.cameras[index].downscaled_to(size) for index in chosen]
         pixel = pixel_size(vertices, cameras)
         edge = proxy_edge(vertices, faces, pixel, settings.refinement_vertices)
-        coarse, coarse_faces = remesh(vertices, faces, edge, decimator)
+        coarse, coarse_faces = remesh(vertices, faces, edge, settings.refinement_vertices, decimator)
         if len(coarse_faces) == 0:
             return vertices, {}
         result = refine_shape(
-            coarse, coarse_faces, lambda blur: load_photos(posed, chosen, size, blur),
+            coarse, coarse_faces, lambda blur: load_photos(posed, chosen, size, blur, monitor.check_stop),
             (lambda: (posed.mask(index) for index in chosen)) if posed.has_masks else None,
             pixel, self._patches(chosen, cameras, STEREO_TOLERANCE * cell), seed=self.seed, threads=self.threads, monitor=monitor,
         )  # fmt: skip
         before, fine = Surface(len(coarse), coarse_faces), Surface(len(vertices), faces)
         move = transfer_displacements(vertices, fine.normals(vertices), coarse, before.normals(coarse), result.vertices)
         figures = result.figures
-        evidence = (
-            f"{len(coarse)} vertices in {len(chosen)} photos; {100 * figures['confirmed']:.0f} % of the surface match in most photos"
-        )
+        evidence = f"{len(coarse)} vertices in {len(chosen)} photos; {100 * figures['confirmed']:.0f} % of the surface match in most photos"
         if "explained" in figures:
             evidence += f"; reflections explain {100 * figures['explained']:.0f} % of what changes between photos"
         if "contour_after" in figures:
@@ -369,6 +368,12 @@ class _Extraction:
             "decimation_deviation_cells": deviation,
             "decimation_error_cells": result.deviation.maximum / cell,
         }
+
+
+def evenly(indices: list[int], most: int) -> list[int]:
+    """At most `most` of the indices, evenly spread."""
+    count = min(len(indices), most)
+    return [indices[k * len(indices) // count] for k in range(count)]
 
 
 def _noise(cache: DepthViewCache) -> float:

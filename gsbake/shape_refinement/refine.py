@@ -96,6 +96,7 @@ def refine_shape(
     run = _Refinement(Surface(len(vertices), faces), np.array(vertices, np.float64), masks, pixel, options, seed, threads, monitor, on_step)
     if run.follow_targets(measure_patches) < options.confirmed:
         run.follow_photos(load_photos)
+    run.contour()
     moved = float(np.linalg.norm(run.current - vertices, axis=1).mean() / pixel)
     return Refined(run.current, run.figures | {"moved_pixels": moved})
 
@@ -119,9 +120,15 @@ class _Refinement:
         """Targets of the contour points, where there are masks."""
         if self.masks is None:
             return []
-        targets, offset = contour_targets(self.surface, self.current, self.masks(), self.threads)
+        targets, offset = contour_targets(self.surface, self.current, self._checked(self.masks()), self.threads)
         self.figures = {"contour_before": offset} | self.figures | {"contour_after": offset}
         return [targets]
+
+    def _checked(self, masks: Iterable[Mask]) -> Iterable[Mask]:
+        """The masks, with a check for a stop request before each."""
+        for mask in masks:
+            self.monitor.check_stop()
+            yield mask
 
     def move(self, text: str, displacement: Doubles) -> None:
         """Move the vertices along their normals by `displacement` (v,)."""
@@ -154,7 +161,9 @@ class _Refinement:
         photos: Sequence[Photo] = ()
         blur = -1.0
         for level in options.levels:
-            photos, blur = photos if level.blur == blur else load_photos(level.blur), level.blur
+            if level.blur != blur:
+                photos = ()  # frees the last ones: all photos are most of the memory
+                photos, blur = load_photos(level.blur), level.blur
             centres = np.stack([photo.camera.centre for photo in photos])
             robust = np.ones((count, len(photos)), np.float32) if robust is None else robust
             light = light.resampled(level.light) if light.size != level.light else light
@@ -163,7 +172,10 @@ class _Refinement:
                 geometry = Geometry(self.current, surface.normals(self.current), centres)
                 samples = sample_photos(geometry.vertices, geometry.normals, surface.faces, photos)
                 chosen = choose_light_vertices(samples, self.seed)
+                if len(chosen) == 0:  # nothing tells reflections from colour
+                    return
                 for _ in range(options.alternations if index else options.first_alternations):
+                    self.monitor.check_stop()
                     light = fit_light(geometry, samples, robust, appearance, light, chosen)
                     appearance = fit_appearance(surface, geometry, samples, robust, light)
                 appearance = appearance.at_least(variance)

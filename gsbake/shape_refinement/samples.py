@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -41,10 +41,14 @@ class VertexSamples:
     weight: Floats
 
 
-def load_photos(posed: PosedPhotos, indices: Sequence[int], max_size: int, blur: float) -> list[Photo]:
-    """These photos, the longer side at most `max_size` pixels, blurred by a Gaussian of `blur` pixels that does not cross the masks."""
+def load_photos(
+    posed: PosedPhotos, indices: Sequence[int], max_size: int, blur: float, check_stop: Callable[[], None] = lambda: None
+) -> list[Photo]:
+    """These photos, the longer side at most `max_size` pixels, blurred by a Gaussian of `blur` pixels that does not cross the masks;
+    `check_stop` is called before each."""
     photos = []
     for index in indices:
+        check_stop()
         view = posed.view(index, max_size)
         rgb = decode_bytes(view.rgb).astype(np.float32)
         mask = np.ones(rgb.shape[:2], np.float32) if view.mask is None else np.asarray(view.mask / np.float32(255), np.float32)

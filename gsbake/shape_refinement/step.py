@@ -14,8 +14,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy import sparse
-from scipy.sparse.linalg import LinearOperator, cg
 
+from gsbake.geometry.conjugate_gradients import conjugate_gradients
 from gsbake.kernels.threads import run_chunks
 from gsbake.shape_refinement.appearance import Appearance, Geometry
 from gsbake.shape_refinement.reflection_kernel import gauss_newton_rows
@@ -109,9 +109,7 @@ def solve_step(
             diagonal += move
             right -= move * total + surface.umbrella.T @ (curvature * (surface.umbrella @ total))
     matrix = (matrix + surface.stiffness(hat @ tensor @ hat.transpose(0, 2, 1)) + sparse.diags(diagonal)).tocsr()
-    inverse = 1 / np.maximum(matrix.diagonal(), 1e-30)
-    solution, _ = cg(matrix, right, rtol=1e-2, maxiter=150, M=LinearOperator(matrix.shape, matvec=lambda x: inverse * x.ravel()))
-    return np.clip(solution, -options.most * pixel, options.most * pixel)
+    return np.clip(conjugate_gradients(matrix, right, 1e-2, 150), -options.most * pixel, options.most * pixel)
 
 
 def _reflection_system(surface: Surface, photos: PhotoRows) -> tuple[Doubles, Doubles]:

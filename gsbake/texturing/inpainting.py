@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_matrix, csr_matrix, diags
 from scipy.sparse.csgraph import connected_components
-from scipy.sparse.linalg import cg
 
+from gsbake.geometry.conjugate_gradients import conjugate_gradients
 from gsbake.texturing.texels import Texels
 
 Floats = NDArray[np.float32]
@@ -88,9 +88,8 @@ def inpaint_surface(values: NDArray[Any], observed: NDArray[np.bool_], texels: T
         laplacian = csr_matrix(diags(np.asarray(adjacency.sum(1)).ravel()) - adjacency)
         inner = laplacian[unknown][:, unknown]
         right = -(laplacian[unknown][:, np.flatnonzero(known)] @ vertex[known])
-        precondition = diags(1 / np.maximum(inner.diagonal(), 1e-12))
         for k in range(columns):
-            vertex[unknown, k] = cg(inner, right[:, k], x0=vertex[unknown, k], rtol=1e-4, maxiter=2000, M=precondition)[0]
+            vertex[unknown, k] = conjugate_gradients(inner, right[:, k], 1e-4, 2000, vertex[unknown, k])
     smooth = np.einsum("nk,nkc->nc", texels.bary, vertex[triangles[texels.face]]).astype(np.float32)
     # Vertices of coarse triangles miss detail that the texels around the gap have: their residual is interpolated in the texture.
     where = texels.image(observed.astype(np.float32))[..., 0] > 0

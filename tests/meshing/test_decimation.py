@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import sys
+from collections.abc import Callable
 from dataclasses import astuple, replace
+from typing import Any
 
 import numpy as np
 import pytest
 import trimesh
 
+from gsbake.errors import UsageError
 from gsbake.meshing import cleanup as clean
+from gsbake.meshing.cleanup import topology
 from gsbake.meshing.decimation import MAX_RETRIES, DecimatedMesh, Deviation, decimate_to_error_bound, surface_deviation
 from gsbake.meshing.decimator_choice import Decimator
-from gsbake.meshing.decimators import decimate
+from gsbake.meshing.decimators import decimate, remesh
 
 Mesh = tuple[np.ndarray, np.ndarray]
 #: Radius of the rings and of their tubes; one voxel is a tenth of a tube's radius.
@@ -165,3 +170,17 @@ def test_flat_faces_stay_flat_and_give_their_triangles_to_the_curved_part(decima
     below = corners[..., 2].max(1) < 0.49
     assert below.sum() < 250  # of 800, on more than four fifths of the area
     assert np.degrees(np.arccos(np.minimum(1, np.abs(normals[below]).max(1)))).max() < 0.1
+
+
+def test_remeshed_has_at_most_so_many_vertices_without_pymeshlab() -> None:
+    vertices, faces = sphere(4)
+    coarse, coarse_faces = remesh(vertices, faces, 0.1, 300, "fast-simplification")
+    assert 150 < len(coarse) <= 310 and topology(coarse, coarse_faces).watertight
+    assert remesh(vertices, faces, 0.1, 10_000, "fast-simplification")[0] is vertices
+
+
+@pytest.mark.parametrize("work", [lambda mesh: remesh(*mesh, 0.1, 300, "pymeshlab"), lambda mesh: decimate(*mesh, 300, "pymeshlab")])
+def test_pymeshlab_that_does_not_load_is_one_sentence(monkeypatch: pytest.MonkeyPatch, work: Callable[[Any], Any]) -> None:
+    monkeypatch.setitem(sys.modules, "pymeshlab", None)
+    with pytest.raises(UsageError, match="pymeshlab does not load"):
+        work(sphere(4))

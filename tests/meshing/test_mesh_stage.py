@@ -14,7 +14,7 @@ import trimesh
 from gsbake.config.schema import Mesh
 from gsbake.errors import BadInputError
 from gsbake.geometry.cameras import Array, CameraSet
-from gsbake.meshing.extract import MeshOptions, extract_mesh
+from gsbake.meshing.extract import MeshOptions, evenly, extract_mesh
 from gsbake.surfels.model import create
 from tests.meshing.scenes import cameras_around, gradient, torus, trace
 from tests.support.recorder import Recorder
@@ -148,3 +148,9 @@ def test_what_untangling_cuts_off_is_removed(capture: Path, tmp_path: Path, monk
     monkeypatch.setattr("gsbake.meshing.extract.untangle", cutting)
     results = run(capture, tmp_path / "out", faces=1000, max_resolution=40)
     assert results["components"] == 1 and results["dropped_components"] > 0
+
+
+def test_photos_are_spread_evenly() -> None:
+    """One photo more than there may be drops one, not every second."""
+    assert evenly(list(range(97)), 96) == list(range(96))
+    assert evenly([1, 3, 5, 7, 9, 11], 3) == [1, 5, 9] and evenly([4, 5], 96) == [4, 5] and evenly([], 96) == []

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import weakref
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from gsbake.errors import InterruptedRun
 from gsbake.kernels.threads import configure
+from gsbake.monitor import SilentMonitor
 from gsbake.shape_refinement.refine import Level, RefinementOptions, pixel_size, refine_shape
 from gsbake.shape_refinement.samples import Photo
+from gsbake.shape_refinement.targets import contour_targets
 from tests.shape_refinement.conftest import Ball
 
 OPTIONS = RefinementOptions(levels=(Level(16, 2, 1.0), Level(24, 3, 0.7)))
@@ -105,3 +109,60 @@ def test_a_thin_wall_keeps_its_sides_apart(ball: Ball) -> None:
     found = refine_shape(np.concatenate([bumps(ball, 0.004), inner]), faces, lambda blur: photos, None, 0.014, options=OPTIONS).vertices
     outside, inside = (np.linalg.norm(part, axis=1) for part in np.split(found, 2))
     assert (outside - inside).min() > 0.005
+
+
+def test_too_few_photos_for_reflections_leave_them_out(ball: Ball) -> None:
+    """No place is seen by enough photos to tell reflections from colour: normals would get worse by degrees."""
+    photos = ball.photos(0.7, 0.3)[:3]
+    given = [(p.camera, (255 * p.mask).astype(np.uint8)) for p in photos]
+    start = bumps(ball, 0.004)
+    found = refine_shape(start, ball.surface.faces, lambda blur: photos, lambda: given, 0.014, options=OPTIONS)
+    assert "explained" not in found.figures
+    assert tilt(ball, found.vertices) < 1.4 * tilt(ball, start)
+
+
+def test_contours_after_are_those_of_the_refined_mesh(ball: Ball) -> None:
+    photos = ball.photos(0.7, 0.3)
+    given = [(p.camera, (255 * p.mask).astype(np.uint8)) for p in photos]
+    found = refine_shape(0.98 * ball.vertices, ball.surface.faces, lambda blur: photos, lambda: given, 0.014, options=OPTIONS)
+    assert found.figures["contour_before"] == contour_targets(ball.surface, 0.98 * ball.vertices, given, 2)[1]
+    assert found.figures["contour_after"] == contour_targets(ball.surface, found.vertices, given, 2)[1]
+
+
+class _Stopping(SilentMonitor):
+    """Stops at the check number `at`."""
+
+    def __init__(self, at: int) -> None:
+        self.at = at
+
+    def check_stop(self) -> None:
+        self.at -= 1
+        if self.at == 0:
+            raise InterruptedRun("stop")
+
+
+@pytest.mark.parametrize("at", [3, 14, 41])  # within the first masks, the second ones, and the first light
+def test_a_stop_request_ends_a_step(ball: Ball, at: int) -> None:
+    photos = ball.photos(0.7, 0.3)
+    given = [(p.camera, (255 * p.mask).astype(np.uint8)) for p in photos]
+    steps: list[str] = []
+    with pytest.raises(InterruptedRun):
+        refine_shape(
+            ball.vertices, ball.surface.faces, lambda blur: photos, lambda: given, 0.014, options=OPTIONS, monitor=_Stopping(at),
+            on_step=lambda text, vertices: steps.append(text),
+        )  # fmt: skip
+    assert len(steps) == at // 13
+
+
+def test_one_blur_of_the_photos_is_in_memory(ball: Ball) -> None:
+    loaded: list[weakref.ref[Photo]] = []
+    alive: list[int] = []
+
+    def load(blur: float) -> list[Photo]:
+        alive.append(sum(photo() is not None for photo in loaded))
+        photos = ball.photos(0.7, 0.3)
+        loaded.extend(weakref.ref(photo) for photo in photos)
+        return photos
+
+    refine_shape(ball.vertices, ball.surface.faces, load, None, 0.014, options=OPTIONS)
+    assert alive == [0, 0]

@@ -10,7 +10,9 @@ from gsbake.geometry.surface_distance import surface_distances
 from gsbake.meshing import cleanup as clean
 from gsbake.meshing.decimation import decimate_to_error_bound
 from gsbake.meshing.refinement.normals import NormalAccumulator, integrate_normals
+from gsbake.meshing.refinement.photometric_measure import PatchTargets, PhotometricViews
 from gsbake.meshing.repair import close_holes, repair
+from gsbake.mvs.pyramids import Photo as StereoPhoto
 from gsbake.shape_refinement.contour import find_contour_points
 from gsbake.shape_refinement.refine import Level, RefinementOptions, refine_shape
 from gsbake.shape_refinement.samples import Photo
@@ -124,6 +126,19 @@ def test_shape_refinement(name: str, kind: str, mask: str) -> None:
     given = None if mask == "none" else lambda: zip(CAMERAS, masks(mask), strict=True)
     options = RefinementOptions(levels=(Level(16, 1, 1.0, False), Level(16, 2, 1.0)))
     assert_valid(refine_shape(vertices, faces, lambda blur: photos(kind), given, 0.05, options=options).vertices, faces)
+
+
+@pytest.mark.parametrize("depth", [2.3, np.nan, np.inf, 0.0, -1.0, 1e-30, 1e30])
+def test_patches_with_hostile_depths(depth: float) -> None:
+    vertices, faces = sphere()
+    grey = np.random.default_rng(0).integers(0, 256, (SIZE, SIZE)).astype(np.uint8)
+    given = [StereoPhoto(camera, grey, np.ones((SIZE, SIZE), np.uint8)) for camera in CAMERAS]
+    stereo = np.full((SIZE, SIZE), depth, np.float32), np.ones((SIZE, SIZE), np.float32)
+    measured = PatchTargets(PhotometricViews(CAMERAS, given.__getitem__, lambda index: stereo, 10.0), 1)
+    options = RefinementOptions(levels=(Level(16, 1, 1.0),))
+    found = refine_shape(vertices, faces, lambda blur: photos("noise"), None, 0.05, measured, options)
+    assert_valid(found.vertices, faces)
+    assert np.isfinite(list(found.figures.values())).all()
 
 
 def test_contour_points_of_a_camera_in_a_vertex() -> None:

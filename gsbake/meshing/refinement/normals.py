@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
-from scipy.sparse.linalg import cg
 
+from gsbake.geometry.conjugate_gradients import conjugate_gradients
 from gsbake.kernels.declaration import kernel
 from gsbake.kernels.threads import run_chunks
 from gsbake.meshing.cleanup import Faces, Vertices
@@ -87,14 +87,14 @@ def integrate_normals(
     )
     weighted = sparse.diags(edge_weight) @ gradient
     system = (sparse.identity(n) + gradient.T @ weighted).tocsr()
-    scale = sparse.diags(1 / system.diagonal())
-    displacement, _ = cg(system, -(weighted.T @ residual), rtol=1e-3, maxiter=200, M=scale)
+    displacement = conjugate_gradients(system, -(weighted.T @ residual), 1e-3, 200)
     return vertices + np.clip(displacement, -max_displacement, max_displacement)[:, None] * normal
 
 
 @kernel(
     "i8, i8, f4[:, ::1], f4[:, ::1], f4[::1], f4[:, ::1], f4[:, ::1], f4[:, :, ::1], f4, f4[:, ::1], f4[::1]",
-    nogil=True, error_model="numpy",
+    nogil=True,
+    error_model="numpy",
 )
 def _accumulate(
     start: int,
