@@ -28,9 +28,6 @@ Ints = NDArray[np.int64]
 
 #: Faces per cluster handed to xatlas. 30 000 faces, one core: 7.9 s as one mesh, 2.4 s in clusters of a thousand, with fewer charts.
 CLUSTER_FACES = 1000
-#: Weight of the deviation from a chart's mean normal beside its outline's straightness, for xatlas. With its own, 2, four meshes of 30 000
-#: faces got 1 to 34 % more charts, with as much stretch or more; small changes of a mesh change its charts by more than that.
-NORMAL_DEVIATION_WEIGHT = 1.0
 #: Above this mean dihedral angle (radians) a surface counts as noisy and is smoothed, for charting only.
 NOISY_DIHEDRAL = 0.2
 #: Laplacian steps of that smoothing.
@@ -144,13 +141,11 @@ def _chart(points: Floats, faces: Ints) -> tuple[Ints, Floats, Ints]:
         used, inverse = np.unique(faces[mine], return_inverse=True)
         atlas.add_mesh(points[used].astype(np.float32), inverse.reshape(-1, 3).astype(np.uint32))
         parts.append((mine, used))
-    growing = xatlas.ChartOptions()
-    growing.normal_deviation_weight = NORMAL_DEVIATION_WEIGHT
     options = xatlas.PackOptions()
     options.rotate_charts = options.rotate_charts_to_axis = False
     options.resolution = 1024  # arbitrary: charts are packed again
     options.blockAlign = True
-    atlas.generate(growing, options)
+    atlas.generate(xatlas.ChartOptions(), options)
     source, coordinates, corner = [], [], np.zeros_like(faces)
     count = 0
     for i, (mine, used) in enumerate(parts):
