@@ -162,8 +162,8 @@ def test_untextured_and_mirroring_spheres_are_unchanged(surface: str, error: flo
     vertices, _, seen = sphere(error)
     found, _ = refined(surface, error)
     moved = np.linalg.norm(found - vertices, axis=1)[seen] / PIXEL
-    assert np.median(moved) < 0.05
-    assert moved.max() < 0.3
+    assert np.median(moved) < 0.02
+    assert moved.max() < 0.2
 
 
 def test_nothing_is_measured_without_stereo_or_surface() -> None:
