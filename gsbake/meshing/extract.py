@@ -322,6 +322,8 @@ class _Extraction:
         evidence = f"{len(coarse)} vertices in {len(chosen)} photos; {100 * figures['confirmed']:.0f} % of the surface match in most photos"
         if "explained" in figures:
             evidence += f"; reflections explain {100 * figures['explained']:.0f} % of what changes between photos"
+        elif "predicted" in figures:
+            evidence += f"; no reflections: fitted to other photos they predict {100 * figures['predicted']:.0f} % of what changes"
         if "contour_after" in figures:
             evidence += f"; contours {figures['contour_before']:+.2f} px from the masks before, {figures['contour_after']:+.2f} px after"
         monitor.decide("shape refinement", f"mean displacement {figures['moved_pixels']:.2f} px", evidence)

@@ -31,6 +31,8 @@ LIGHT_VIEWS, LIGHT_VERTICES = 4, 8_000
 LIGHT_SMOOTHNESS, LIGHT_PULL = 0.02, 1e-3
 #: Iterations of conjugate gradients, and the reduction of the squared residual that ends them.
 LIGHT_ITERATIONS, LIGHT_TOLERANCE = 12, 1e-4
+#: Every so many photos one is predicted from the others.
+VALIDATION_EVERY = 4
 #: Reflectance at the start.
 FIRST_REFLECTANCE = 0.3
 #: Chunks of vertices whose sums are added in order: they do not depend on the number of threads.
@@ -79,9 +81,7 @@ class Geometry:
 def fit_appearance(surface: Surface, geometry: Geometry, samples: VertexSamples, robust: Floats, light: ReflectionMap) -> Appearance:
     """The appearance under `light`, with weights `robust` (v, photos) of the samples beside their own."""
     count = surface.count
-    moments = np.zeros((count, 7 + 9 * KIND_COUNT), np.float32)
-    fixed = (geometry.vertices, geometry.normals, geometry.centres, samples.colour, samples.weight, robust, light.tables(), moments)
-    run_chunks(lambda start, stop: measure_moments(start, stop, *fixed), count)
+    moments = _moments(geometry, samples, robust, light)
     mean, kinds = moments[:, 1:4], moments[:, 7:].reshape(count, KIND_COUNT, 3, 3)
     brightness = mean.mean(1)
     importance = (1 / (brightness + BLACK) ** 2)[:, None]
@@ -106,6 +106,39 @@ def fit_appearance(surface: Surface, geometry: Geometry, samples: VertexSamples,
         np.asarray(brightness, np.float32),
         1 - float(least.sum(dtype=float)) / total if total > 0 else 0.0,
     )
+
+
+def _moments(geometry: Geometry, samples: VertexSamples, robust: Floats, light: ReflectionMap) -> Floats:
+    """What `measure_moments` fills (v, 7 + 9 · KIND_COUNT)."""
+    moments = np.zeros((len(geometry.vertices), 7 + 9 * KIND_COUNT), np.float32)
+    fixed = (geometry.vertices, geometry.normals, geometry.centres, samples.colour, samples.weight, robust, light.tables(), moments)
+    run_chunks(lambda start, stop: measure_moments(start, stop, *fixed), len(moments))
+    return moments
+
+
+def predicted_share(
+    surface: Surface, geometry: Geometry, samples: VertexSamples, light: ReflectionMap, rows: NDArray[np.int64], alternations: int
+) -> float:
+    """Share of the variance between every fourth photo that light and appearance fitted to the other photos explain, at most 1.
+
+    It is near 0 or below where the light does not stay where it is with respect to the object, as on a turntable: a map of it then fits the
+    photos that it is fitted to, and no others.
+    """
+    photos = samples.weight.shape[1]
+    held = np.broadcast_to(np.arange(photos) % VALIDATION_EVERY == 1, (surface.count, photos))
+    fitted, tested = (np.ascontiguousarray(part, np.float32) for part in (~held, held))
+    appearance = Appearance.initial(surface.count)
+    for _ in range(alternations):
+        light = fit_light(geometry, samples, fitted, appearance, light, rows)
+        appearance = fit_appearance(surface, geometry, samples, fitted, light)
+    moments = _moments(geometry, samples, tested, light)
+    variance = moments[:, 4:7].astype(float)
+    chosen = moments[:, 7:].reshape(len(moments), KIND_COUNT, 3, 3)[np.arange(len(moments)), appearance.kind].astype(float)
+    scale = appearance.reflectance.astype(float)
+    left = variance - 2 * scale * chosen[:, 2] + scale**2 * chosen[:, 1]
+    weight = appearance.importance.astype(float)
+    total = float((weight * variance.sum(1)).sum())
+    return 1 - float((weight * left.sum(1)).sum()) / total if total > 0 else 0.0
 
 
 def fit_light(

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from gsbake.geometry.cameras import Camera
 from gsbake.monitor import SILENT, Monitor
-from gsbake.shape_refinement.appearance import Appearance, Geometry, choose_light_vertices, fit_appearance, fit_light
+from gsbake.shape_refinement.appearance import Appearance, Geometry, choose_light_vertices, fit_appearance, fit_light, predicted_share
 from gsbake.shape_refinement.reflection_map import ReflectionMap
 from gsbake.shape_refinement.samples import Doubles, Floats, Photo, sample_photos
 from gsbake.shape_refinement.step import PhotoRows, StepOptions, measure_rows, solve_step
@@ -52,6 +52,8 @@ class RefinementOptions:
     first_steps: int = 3
     first: StepOptions = field(default_factory=lambda: StepOptions(curvature=6.0, slope=8.0, move=3.0))
     confirmed: float = 0.2
+    #: Least share of what changes between held-out photos that reflections fitted to the others must predict.
+    predicted: float = 0.05
     levels: tuple[Level, ...] = (
         Level(16, 2, 2.0, held=False), Level(16, 2, 2.0), Level(24, 4, 1.4), Level(32, 6, 0.8), Level(48, 3, 0.6),
     )  # fmt: skip
@@ -174,6 +176,10 @@ class _Refinement:
                 chosen = choose_light_vertices(samples, self.seed)
                 if len(chosen) == 0:  # nothing tells reflections from colour
                     return
+                if "predicted" not in self.figures:
+                    self.figures["predicted"] = predicted_share(surface, geometry, samples, light, chosen, options.first_alternations)
+                    if self.figures["predicted"] < options.predicted:
+                        return
                 for _ in range(options.alternations if index else options.first_alternations):
                     self.monitor.check_stop()
                     light = fit_light(geometry, samples, robust, appearance, light, chosen)
