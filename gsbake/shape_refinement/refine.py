@@ -1,8 +1,8 @@
 """The whole refinement: silhouettes and patches first; then, where the photos' patches confirm little, parallax and reflections.
 
-Masks are offset by the same amount everywhere, and surfels by as much: the first phase moves the surface as a whole, smoothly. Where photos
-correlate at most places the surface is diffuse and textured, and that is all. Elsewhere reflections are what the photos know of the shape:
-coarse light and blurred photos first, then finer ones, a few Gauss–Newton steps each.
+Masks are offset by the same amount everywhere, and surfels by as much: the first phase moves the surface as a whole, smoothly. Where
+patches of the photos confirm enough of it, that is all. Elsewhere reflections are what the photos know of the shape: coarse light and
+blurred photos first, then finer ones, a few Gauss–Newton steps each.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class RefinementOptions:
     #: Steps of the first phase and their weights; share of confirmed vertices from which on there is no second phase.
     first_steps: int = 3
     first: StepOptions = field(default_factory=lambda: StepOptions(curvature=6.0, slope=8.0, move=3.0))
-    confirmed: float = 0.2
+    confirmed: float = 0.07
     #: Least share of what changes between held-out photos that reflections fitted to the others must predict.
     predicted: float = 0.05
     levels: tuple[Level, ...] = (
