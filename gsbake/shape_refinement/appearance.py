@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from gsbake.kernels.threads import run_chunks
 from gsbake.shading.octahedral import border_indices
-from gsbake.shape_refinement.reflection_kernel import KIND_COUNT, apply_light, locate_reflections, measure_moments
+from gsbake.shape_refinement.reflection_kernel import KIND_COUNT, LOBE_COUNT, apply_light, locate_reflections, measure_moments
 from gsbake.shape_refinement.reflection_map import ReflectionMap, laplacian
 from gsbake.shape_refinement.samples import Doubles, Floats, VertexSamples
 from gsbake.shape_refinement.surface import Surface
@@ -168,7 +168,7 @@ def fit_light(
         run_chunks(add, _CHUNKS)
         return _fold(out.sum(0), size)
 
-    zero = np.zeros((len(light.blurred()), size + 2, size + 2, 3), np.float32)
+    zero = np.zeros((LOBE_COUNT, size + 2, size + 2, 3), np.float32)
     right = light.gathered(normal_equations(zero, samples.colour))
 
     def data(radiance: Floats) -> Floats:

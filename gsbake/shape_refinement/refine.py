@@ -19,7 +19,7 @@ from gsbake.shape_refinement.appearance import Appearance, Geometry, choose_ligh
 from gsbake.shape_refinement.reflection_map import ReflectionMap
 from gsbake.shape_refinement.samples import Doubles, Floats, Photo, sample_photos
 from gsbake.shape_refinement.step import PhotoRows, StepOptions, measure_rows, solve_step
-from gsbake.shape_refinement.surface import Surface
+from gsbake.shape_refinement.surface import Surface, surface_area
 from gsbake.shape_refinement.targets import Targets, contour_targets
 
 Faces = NDArray[np.int32]
@@ -203,6 +203,5 @@ def pixel_size(vertices: Doubles, cameras: Sequence[Camera]) -> float:
 
 def proxy_edge(vertices: Doubles, faces: Faces, pixel: float, most: int) -> float:
     """Length of the edges of a mesh for refinement: EDGE_PIXELS, longer where that makes more than about `most` vertices."""
-    a, b, c = (vertices[faces[:, k]] for k in range(3))
-    area = float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()) / 2
-    return max(EDGE_PIXELS * pixel, (2 * area / (np.sqrt(3) * most)) ** 0.5)  # a vertex has two triangles of √3/4 edge²
+    per_vertex = surface_area(vertices, faces) / most  # two triangles of √3/4 edge²
+    return max(EDGE_PIXELS * pixel, (2 * per_vertex / np.sqrt(3)) ** 0.5)

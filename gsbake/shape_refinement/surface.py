@@ -137,6 +137,12 @@ def _average_rows(starts: Any, neighbours: Any, values: Any, out: Any, start: in
     average(start, stop, starts, neighbours, values, out)
 
 
+def surface_area(vertices: Doubles, faces: Faces) -> float:
+    """Area of a mesh of `vertices` (v, 3) and `faces` (f, 3)."""
+    corners = vertices[faces]
+    return 0.5 * float(np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum())
+
+
 def tangents(normals: Doubles) -> Doubles:
     """Two unit tangents (v, 2, 3) of each normal."""
     axis = np.where(np.abs(normals[:, :1]) < 0.7, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])

@@ -28,6 +28,11 @@ class Targets:
     information: Doubles
     outlier: Doubles
 
+    @staticmethod
+    def none(count: int) -> Targets:
+        """No target for a mesh of `count` vertices."""
+        return Targets(vertex_rows(np.zeros(0, np.int64), count), *np.zeros((3, 0)))
+
     def moved(self, displacement: Doubles) -> Targets:
         """What is left after the vertices moved by `displacement` (v,)."""
         return replace(self, target=self.target - self.rows @ displacement)
@@ -49,7 +54,7 @@ def contour_targets(
     caster, normals = RayCaster(vertices, surface.faces, threads), surface.normals(vertices)
     parts = [find_contour_points(caster, normals, surface.edges, camera, mask) for camera, mask in masks if mask is not None]
     if not parts:
-        return Targets(vertex_rows(np.zeros(0, np.int64), surface.count), *np.zeros((3, 0))), 0.0
+        return Targets.none(surface.count), 0.0
     start, end = (np.concatenate([getattr(part, name) for part in parts]) for name in ("start", "end"))
     fraction, offset, pixel = (np.concatenate([getattr(part, name) for part in parts]) for name in ("fraction", "offset", "pixel"))
     count = len(offset)

@@ -93,8 +93,7 @@ def integrate_normals(
 
 @kernel(
     "i8, i8, f4[:, ::1], f4[:, ::1], f4[::1], f4[:, ::1], f4[:, ::1], f4[:, :, ::1], f4, f4[:, ::1], f4[::1]",
-    nogil=True,
-    error_model="numpy",
+    nogil=True, error_model="numpy",
 )
 def _accumulate(
     start: int,

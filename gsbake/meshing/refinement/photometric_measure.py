@@ -21,12 +21,12 @@ from numpy.typing import NDArray
 from gsbake.geometry.cameras import Camera
 from gsbake.geometry.raycast import RayCaster
 from gsbake.kernels.threads import run_chunks
-from gsbake.meshing.cleanup import Faces, Vertices
+from gsbake.meshing.cleanup import Vertices
 from gsbake.meshing.refinement.photometric_kernel import measure_displacements
 from gsbake.mvs.ncc import RADIUS, SAMPLES, SamplingPattern
 from gsbake.mvs.pyramids import MatchingViews, Photo
 from gsbake.mvs.view_selection import select_views
-from gsbake.shape_refinement.surface import Surface
+from gsbake.shape_refinement.surface import Surface, surface_area
 from gsbake.shape_refinement.targets import Targets, vertex_rows
 
 Floats = NDArray[np.float32]
@@ -115,7 +115,7 @@ class PatchTargets:
     def __call__(self, surface: Surface, vertices: Vertices) -> tuple[Targets, float]:
         """Targets at the measured vertices, and the share of them at which most photos agree."""
         if surface_area(vertices, surface.faces) == 0:
-            return Targets(vertex_rows(np.zeros(0, np.int64), len(vertices)), *np.zeros((3, 0))), 0.0
+            return Targets.none(surface.count), 0.0
         self._plan = plan = self._plan or MeasurementPlan.make(surface, vertices, self._views.cameras)
         found = measure(vertices, plan, self._views, self._threads)
         # Patches overlap: a measurement is weighted by the share of a patch that is not shared with others.
@@ -128,21 +128,13 @@ class PatchTargets:
         return targets, len(np.unique(found.vertex[used])) / len(plan.measured_vertices)
 
 
-def surface_area(vertices: Vertices, faces: Faces) -> float:
-    """Area of a mesh."""
-    corners = vertices[faces]
-    return 0.5 * float(np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum())
-
-
-def patch_means(vertices: Vertices, edges: Indices, mean_squared_distance: float) -> Vertices:
+def patch_means(vertices: Vertices, surface: Surface, mean_squared_distance: float) -> Vertices:
     """Mean (v, 3) of the surface around each vertex, weighted with variance `mean_squared_distance` (world units²).
 
     A random walk from a vertex to one of its n neighbours or itself with equal probability adds n / (n + 1) of the mean squared edge
     per step.
     """
-    count = len(vertices)
-    adjacency = sparse.csr_matrix((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(count, count))
-    transition = adjacency + adjacency.T + sparse.identity(count)
+    edges, transition = surface.edges, surface.adjacency + sparse.identity(surface.count)
     row_sums = np.asarray(transition.sum(1)).ravel()
     transition = sparse.diags(1 / row_sums) @ transition
     variance_per_step = float(((vertices[edges[:, 0]] - vertices[edges[:, 1]]) ** 2).sum(1).mean() * (1 - 1 / row_sums.mean()))
@@ -153,12 +145,12 @@ def patch_means(vertices: Vertices, edges: Indices, mean_squared_distance: float
 
 def measure(vertices: Vertices, plan: MeasurementPlan, views: PhotometricViews, threads: int) -> Measurements:
     """Measurements of every photo, with its paired photos, at the measured vertices."""
-    edges, measured_vertices = plan.surface.edges, plan.measured_vertices
-    caster = RayCaster(vertices, plan.surface.faces, threads)
-    means = patch_means(vertices, edges, PATCH_VARIANCE * plan.pixel_size**2)
-    points, normals = vertices[measured_vertices], plan.surface.normals(means)[measured_vertices]
+    surface, measured_vertices = plan.surface, plan.measured_vertices
+    caster = RayCaster(vertices, surface.faces, threads)
+    means = patch_means(vertices, surface, PATCH_VARIANCE * plan.pixel_size**2)
+    points, normals = vertices[measured_vertices], surface.normals(means)[measured_vertices]
     plane_offset = np.einsum("nk,nk->n", normals, means[measured_vertices] - points)
-    ray_offset = 0.5 * float(np.linalg.norm(vertices[edges[:, 0]] - vertices[edges[:, 1]], axis=1).mean())
+    ray_offset = 0.5 * surface.mean_edge(vertices)
     visible = np.stack([caster.visible_from(camera, points, normals, MIN_COSINE, ray_offset) for camera in views.cameras])
     parts = [_measure_photo(index, others, visible, (points, normals, plane_offset), views) for index, others in enumerate(plan.pairs)]
     rows, displacement, information = (np.concatenate(column) for column in zip(*parts, strict=True))
