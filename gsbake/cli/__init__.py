@@ -17,7 +17,7 @@ _standard_format = warnings.formatwarning
 
 
 def main() -> None:
-    """Entry point of `gsbake`: exits with a documented code (0, 2, 42, 75; 1 for an internal error) and one sentence on stderr."""
+    """Entry point of `gsbake`: exits with a documented code (0, 2, 3, 42, 75; 1 for an internal error) and one sentence on stderr."""
     from gsbake.errors import GsbakeError, InterruptedRun
 
     def interrupted(number: int, frame: FrameType | None) -> None:

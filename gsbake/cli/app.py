@@ -30,6 +30,7 @@ from gsbake.cli.options import (
     PosesOption,
     ProfileOption,
     QuietOption,
+    RequireOption,
     SeedOption,
     SetOption,
     StoreOption,
@@ -50,8 +51,8 @@ app = typer.Typer(
     cls=PanelGroup,
     help="Photos in, relightable game-ready asset out.",
     epilog=(
-        "Exit codes: 0 done, 2 wrong usage, 42 bad input (do not retry), 75 interrupted, out of memory or disk full (the same command "
-        "resumes), 1 internal error."
+        "Exit codes: 0 done, 2 wrong usage, 3 figures worse than required, 42 bad input (do not retry), 75 interrupted, out of memory or "
+        "disk full (the same command resumes), 1 internal error."
     ),
     no_args_is_help=True,
     rich_markup_mode=None,  # plain help takes a third of the time
@@ -102,6 +103,7 @@ def _pipeline_command(until: str | None) -> Callable[..., None]:
         overwrite: OverwriteOption = False,
         dry_run: DryRunOption = False,
         view: ViewOption = False,
+        require: RequireOption = None,
         masks: MasksOption = None,
         invert_masks: InvertOption = False,
         poses: PosesOption = None,
@@ -124,7 +126,7 @@ def _pipeline_command(until: str | None) -> Callable[..., None]:
             photos=photos, out=out, profile=profile, overrides=settings,
             masks=masks.folder if masks else None, poses=poses, device=device.value, threads=threads, seed=seed,
             dry_run=dry_run, quiet=quiet, verbose=verbose, as_json=as_json, store=store, view=view,
-            overwrite=overwrite, moved=moved,
+            overwrite=overwrite, moved=moved, require=tuple(bound for group in require or () for bound in group),
         )  # fmt: skip
         run_pipeline(options, until)
 

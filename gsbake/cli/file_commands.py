@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
+from gsbake.cli.gates import COMPARED, bounds_parser
 from gsbake.cli.options import JsonOption, QuietOption, ReplaceFileOption, given_path
 from gsbake.cli.panels import Panel, command
 
@@ -41,6 +42,16 @@ def compare_command(
         Path | None,
         typer.Option("--sheet", parser=given_path, metavar="PNG", help="Write renders of both and their difference.", show_default=False),
     ] = None,
+    fail_under: Annotated[
+        list[Any] | None,
+        typer.Option(
+            "--fail-under",
+            parser=bounds_parser(COMPARED),
+            metavar="KEY=VALUE,...",
+            show_default=False,
+            help="End with exit code 3 where a figure of --json is worse, as in render_psnr=30,chamfer=0.002. Repeatable.",
+        ),
+    ] = None,
     light: LightOption = "studio",
     views: Annotated[int, typer.Option("--views", min=1, max=64, help="Number of cameras.")] = 4,
     size: Annotated[int, typer.Option("--size", min=16, max=2048, help="Edge of the renders in pixels.")] = 384,
@@ -50,7 +61,8 @@ def compare_command(
     """Compare two glTF files: surfaces, normals, textures and renders."""
     from gsbake.cli.file_tools import compare
 
-    compare(first, second, truth, sheet, light, views, size, as_json, overwrite)
+    bounds = [bound for group in fail_under or () for bound in group]
+    compare(first, second, truth, sheet, bounds, light, views, size, as_json, overwrite)
 
 
 @command(file_app, "render", Panel.FILES)

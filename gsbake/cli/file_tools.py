@@ -6,8 +6,9 @@ from pathlib import Path
 from typing import Any
 
 from gsbake.atomic import write_atomic
+from gsbake.cli.gates import COMPARED, check_bounds, end_at_gate, gate_document
 from gsbake.cli.output import cell, print_json, print_table, print_text
-from gsbake.errors import BadInputError
+from gsbake.errors import BadInputError, UsageError
 from gsbake.text import number, size
 
 
@@ -47,18 +48,21 @@ def compare(
     second: Path,
     truth: Path | None,
     sheet: Path | None,
+    bounds: list[tuple[str, float]],
     light: str,
     views: int,
     pixels: int,
     as_json: bool,
     overwrite: bool,
 ) -> None:
-    """Print figures of two files; write the sheet of their renders and differences."""
+    """Print figures of two files; write the sheet of their renders and differences; end with an exit code of its own outside `bounds`."""
     from gsbake.imaging.png import encode_png
     from gsbake.viewing.compare import compare_files
     from gsbake.viewing.lights import light_files, load_light
     from gsbake.viewing.turntable import check_output
 
+    if truth is None and any(key.startswith("truth.") for key, _ in bounds):
+        raise UsageError("--fail-under names a distance from the true mesh: give that with --truth.")
     if sheet is not None:
         inputs = [first, second, *([truth] if truth else []), *light_files(light, first.parent)]
         check_output(sheet, inputs, overwrite=overwrite, what="The sheet", suffixes=(".png",))
@@ -69,9 +73,18 @@ def compare(
         except OSError as error:
             raise BadInputError(f"'{sheet}' cannot be written: {error.strerror}.") from error
         figures["sheet"] = str(sheet)
+    values = figures["surface"] | figures["images"]
+    if truth is not None:
+        values |= {f"truth.{key}": value for key, value in figures["truth"]["surfaces"][1].items()}
+    worse = check_bounds(bounds, values, COMPARED)
     if as_json:
-        print_json(figures)
-        return
+        print_json(figures | gate_document(worse))
+    else:
+        _print_comparison(figures, truth, sheet)
+    end_at_gate(worse)
+
+
+def _print_comparison(figures: dict[str, Any], truth: Path | None, sheet: Path | None) -> None:
     rows: list[tuple[Any, ...]] = [(key, _figure(value)) for key, value in (figures["surface"] | figures["images"]).items()]
     print_table(("first and second file", "value"), rows)
     if truth is not None:

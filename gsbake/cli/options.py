@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from gsbake.cli.gates import REPORTED, Bounds, bounds_parser
 from gsbake.cli.panels import COMMON_OPTIONS, PHOTO_OPTIONS
 
 if TYPE_CHECKING:
@@ -206,6 +207,13 @@ InvertOption = Annotated[bool, typer.Option("--invert-masks", help="Masks are wh
 ViewOption = Annotated[
     bool, typer.Option("--view", help="Serve a page on this machine that shows the run: render, curves, decisions, time left.")
 ]
+RequireOption = Annotated[
+    list[Any] | None,
+    typer.Option(
+        "--require", parser=bounds_parser(REPORTED), metavar="KEY=VALUE,...", show_default=False,
+        help="End with exit code 3 where a figure of report.json is worse, as in psnr=22,ssim=0.8,bytes=8e6. Repeatable.",
+    ),
+]  # fmt: skip
 DeviceOption = Annotated[Device, typer.Option("--device", help="Device of the kernels.", rich_help_panel=COMMON_OPTIONS)]
 ThreadsOption = Annotated[
     int,
@@ -266,6 +274,7 @@ class Options:
     view: bool = False
     overwrite: bool = False
     moved: bool = False
+    require: Bounds = ()
 
     def session(self, observer: Observer | None = None) -> Session:
         """Session of the run that the options describe; nothing is written."""

@@ -9,10 +9,12 @@ from typing import Any
 
 from gsbake.api import Result, Session
 from gsbake.cli.display import choose_display, close_display
+from gsbake.cli.gates import REPORTED, check_bounds, end_at_gate, gate_document
 from gsbake.cli.inspect import plan_document, print_plan
 from gsbake.cli.kernels import compiling
 from gsbake.cli.options import Options
 from gsbake.cli.output import print_json, print_text
+from gsbake.errors import UsageError
 from gsbake.live.server import LiveView
 from gsbake.live.state import LiveState
 from gsbake.pipeline.plan import StageState
@@ -22,6 +24,8 @@ from gsbake.timing.expectations import Expectations
 
 def run_pipeline(options: Options, until: str | None) -> None:
     """Bring the stages up to `until` (None: all) up to date and print a summary."""
+    if options.require and until not in (None, "report"):
+        raise UsageError("--require checks the report's figures: use it with `gsbake run` or `gsbake report`.")
     start = time.perf_counter()
     display = choose_display(quiet=options.quiet, verbose=options.verbose, as_json=options.as_json)
     state = LiveState(display) if options.view else None
@@ -43,11 +47,13 @@ def run_pipeline(options: Options, until: str | None) -> None:
     finally:
         close_display(display)
     seconds = time.perf_counter() - start
+    worse = check_bounds(options.require, result.results("report"), REPORTED) if options.require else []
     if options.as_json:
-        print_json(_document(result, seconds))
+        print_json(_document(result, seconds) | gate_document(worse))
     elif not options.quiet:
         for name, text in summary_lines(result, seconds):
             print_text(f"{name:<9} {text}")
+    end_at_gate(worse)
 
 
 @contextmanager
@@ -95,7 +101,6 @@ def _document(result: Result, seconds: float) -> dict[str, Any]:
         "seconds": round(seconds, 3),
         "stages": [_stage(state) for state in result.stages],
         "files": {name: str(path) for name, path in result.files.items()},
-        "exit_code": 0,
     }
 
 

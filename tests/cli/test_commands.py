@@ -27,7 +27,7 @@ def test_run_publishes_the_results_and_caches_the_stages(run: Run, capture: Path
     lines = end.out.splitlines()
     assert [line.split()[1] for line in lines[:4]] == ["ingest:", "mesh:", "export:", "report:"]  # one line a stage
     assert lines[1].endswith("faces 30 000") and "all used" not in end.out
-    assert [line.split()[0] for line in lines[4:]] == ["Asset", "Warnings", "Report", "Time"]
+    assert [line.split()[0] for line in lines[4:]] == ["Asset", "Quality", "Warnings", "Report", "Time"]
     assert lines[4].split()[1] == "out/tankard/asset.glb"
     verbose = run("run", capture, "--out", "other", "-v").out
     assert "mesh: Meshing (not run yet)" in verbose and "ingest: skip.redundant_photos: all used (none twice)" in verbose
@@ -177,6 +177,10 @@ def test_replace_in_a_read_only_folder(
         (["run", "tankard", "--set", "train.holdout=1"], 42, "--set: train.holdout = 1 is invalid: it would hold out every photo; set 0"),
         (["run", "tankard", "--set", "loss.mask="], 42, "loss.mask = '' is not a number"),
         (["run", "tankard", "--set", "export.copyright=\udcff"], 2, "--set takes text, but 'export.copyright=\\udcff' is not valid UTF-8"),
+        (["run", "tankard", "--require", "psnr"], 2, "'psnr' is not KEY=VALUE"),
+        (["run", "tankard", "--require", "psnr=good"], 2, "'good' is not a number"),
+        (["run", "tankard", "--require", "chamfer=1"], 2, "no figure 'chamfer'; choose from psnr"),
+        (["mesh", "tankard", "--require", "psnr=22"], 2, "use it with `gsbake run`"),
         (["run", "tankard", "--fast"], 2, "No such option: --fast"),
         (["run", "tankard", "--seed", "x"], 2, "'--seed'"),
         (["bakery"], 2, "No such command 'bakery'"),
@@ -214,6 +218,16 @@ def test_internal_error_is_one_sentence_with_a_saved_traceback(run: Run, monkeyp
     saved = Path(end.err.split("'")[-2])
     assert "Traceback" in saved.read_text()
     saved.unlink()
+
+
+def test_a_run_worse_than_required_is_published_and_ends_with_a_code_of_its_own(run: Run, capture: Path, tmp_path: Path) -> None:
+    assert run("run", capture, "--require", "psnr=21.5, bytes=1e6", "--require", "ssim=.9").code == 0
+    end = run("run", capture, "--out", "o", "--require", "psnr=22,ssim=.5,bytes=999999,exposed_psnr=1")
+    assert end.code == 3 and (tmp_path / "o" / "report.html").exists() and "Quality" in end.out
+    worse = ("psnr is 21.5, not at least 22", "bytes is 1000000, not at most 999999", "exposed_psnr is none, not at least 1")
+    assert end.err.splitlines()[-1] == f"gsbake: Worse than required: {'; '.join(worse)}."
+    cached = run("report", "--out", "o", "--require", "psnr=22", "--json")
+    assert cached.code == 3 and cached.json["exit_code"] == 3 and "psnr is 21.5" in cached.json["error"] and cached.json["stages"]
 
 
 def test_invert_masks_is_a_setting(run: Run, capture: Path, tmp_path: Path) -> None:

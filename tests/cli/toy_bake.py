@@ -53,7 +53,7 @@ def _report(ctx: Context) -> dict[str, Any]:
     if (ctx.inputs["export"] / "asset.glb").read_text().endswith(" 666"):
         raise BadInputError("There is no report on such a mesh.")
     (ctx.out / "report.html").write_text("<html>")
-    return {}
+    return {"psnr": 21.5, "ssim": 0.9, "exposed_psnr": None, "compared": 3, "bytes": 10**6}
 
 
 def _targets(ctx: Context) -> dict[str, Any]:

@@ -31,6 +31,11 @@ FILES = {
     "report": ("report.html",),
     "targets": ("asset_web.glb", "targets.json"),
 }
+#: Figures of the stages whose figures commands read.
+RESULTS: dict[str, dict[str, Any]] = {
+    "poses": {"doubtful_masks": ["a"]},
+    "report": {"psnr": 25.0, "ssim": 0.9, "bytes": 10**6, "compared": 1},
+}
 
 
 def _toy(name: str) -> Callable[[Context], dict[str, Any]]:
@@ -44,7 +49,7 @@ def _toy(name: str) -> Callable[[Context], dict[str, Any]]:
                 write_png(ctx.out / file, np.full((6, 8), 255, np.uint8))
             else:
                 (ctx.out / file).write_text(f"{head}{name} {file}")
-        return {"doubtful_masks": ["a"]} if name == "poses" else {}
+        return RESULTS.get(name, {})
 
     return run
 

@@ -12,6 +12,7 @@ import pytest
 from PIL import Image
 
 from gsbake.cli import main
+from gsbake.cli.gates import COMPARED
 from gsbake.gltf.scene import open_scene
 from gsbake.viewing.lights import load_light
 from gsbake.viewing.render import SceneRenderer
@@ -46,6 +47,26 @@ def test_compare_measures_a_known_difference(
     assert call(monkeypatch, "compare", ball, ball, "--truth", ball, "--views", 1, "--size", 64, "--json") == 0
     same = json.loads(capsys.readouterr().out)
     assert same["surface"]["chamfer"] < 1e-6 and same["truth"]["surfaces"][0]["chamfer"] < 1e-6
+
+
+def test_a_figure_worse_than_its_bound_is_an_exit_code(
+    ball: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """More is better for some figures, less for others; every figure can have a bound, and all is printed as without one."""
+    other = write_ball(tmp_path / "other.glb", (60, 160, 60), radius=1.01)
+    command = ("compare", ball, other, "--truth", ball, "--views", 1, "--size", 64, "--json", "--fail-under")
+    assert call(monkeypatch, *command, "base_color_psnr=20,chamfer=0.01,truth.chamfer=0.01") == 0
+    end = capsys.readouterr()
+    figures = json.loads(end.out)
+    assert end.err == "" and figures["exit_code"] == 0
+    truth = {f"truth.{key}" for key in figures["truth"]["surfaces"][1]}
+    assert set(COMPARED) == {*figures["surface"], *figures["images"], *truth}
+    assert call(monkeypatch, *command, "base_color_psnr=40,chamfer=0.01", "--fail-under", "truth.chamfer=0.001") == 3
+    end = capsys.readouterr()
+    found = json.loads(end.out)
+    assert found["exit_code"] == 3 and found["images"] == figures["images"]
+    assert end.err.count("\n") == 1 and end.err.endswith(f"{found['error']}\n") and " chamfer" not in end.err
+    assert "base_color_psnr is 26" in end.err and "not at least 40; truth.chamfer is 0.00" in end.err and "not at most 0.001." in end.err
 
 
 @pytest.mark.parametrize("name", ["turn.png", "turn.webp", "turn.mp4"])
@@ -90,6 +111,8 @@ def test_alpha_lets_what_lies_behind_through(tmp_path: Path) -> None:
         (["render", "BALL", "--turntable", "x.png", "--light", "moon"], 2, "neither"),
         (["render", "BALL", "--turntable", "x.png", "--light", "hdr"], 2, "no light.hdr"),
         (["compare", "BALL", "README.md"], 42, "README.md"),
+        (["compare", "BALL", "BALL", "--fail-under", "psnr=3"], 2, "no figure 'psnr'; choose from chamfer"),
+        (["compare", "BALL", "BALL", "--fail-under", "truth.chamfer=1"], 2, "give that with --truth"),
     ],
 )
 def test_errors_are_one_sentence(
