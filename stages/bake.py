@@ -28,14 +28,14 @@ FIT_KERNELS = (
 
 STAGE = Stage(
     name="bake",
-    version=46,
+    version=47,
     title="Textures",
     run=run,
     summary="{charts} charts, {texels} texels, {fit_psnr:dB} on test photos",
     needs=("poses", "refine", "mesh"),
     settings=(
-        "bake.*", "light.size", "train.max_size", "train.holdout", "skip.exposure_equalisation", "skip.normal_map", "skip.specular",
-        "skip.metallic_map", "skip.roughness_map",
+        "bake.*", "light.size", "train.max_size", "train.holdout", "export.max_triangles", "skip.exposure_equalisation", "skip.normal_map",
+        "skip.specular", "skip.metallic_map", "skip.roughness_map",
     ),
     uses_device=True,
     seeded=True,

@@ -20,7 +20,9 @@ from gsbake.imaging.exr import write_exr
 from gsbake.kernels.threads import configure
 from gsbake.materials.delighting import find_irradiance, remove_shading
 from gsbake.materials.fitting import RAY_OFFSET, SMOOTHING_RADIUS, FitSettings, fit_materials
+from gsbake.meshing.repair import repair_foreign
 from gsbake.monitor import SILENT, Monitor, Rule, decide_skip
+from gsbake.text import number
 from gsbake.texturing.atlas import make_atlas
 from gsbake.texturing.inpainting import fill_empty_texels, inpaint_surface
 from gsbake.texturing.normal_map import DenseSamples, normal_map, sample_dense_mesh, vertex_normals
@@ -37,17 +39,22 @@ Floats = NDArray[np.float32]
 DELIGHT_SIZE = 128
 #: Share of the surface that no photo observed, above which a warning is given.
 MAX_UNOBSERVED = 0.25
+#: Maximum boundary edges of a hole that the mesh's repair closes again.
+MAX_HOLE_EDGES = 400
+#: Share of the texture under charts, below which a warning is given.
+MIN_FILL = 0.35
 
 
 @dataclass(frozen=True)
 class BakeOptions:
     """Settings of the bake; `train_size` and `holdout` are those of training, `light_size` the edge of the environment map's faces in
-    texels, the rest are rules of [skip]."""
+    texels, `max_triangles` the limit of the exported asset, the rest are rules of [skip]."""
 
     bake: Bake = Bake()
     train_size: int = 512
     holdout: int = 8
     light_size: int = 32
+    max_triangles: int = 100_000
     exposure_equalisation: Rule = "auto"
     specular: Rule = "auto"
     normal_map: Rule = "auto"
@@ -59,7 +66,8 @@ class BakeOptions:
         """Those in the `settings` of a profile, or in the part of them that the stage declares."""
         skip = settings.skip
         rules = skip.exposure_equalisation, skip.specular, skip.normal_map, skip.metallic_map, skip.roughness_map
-        return cls(settings.bake, settings.train.max_size, settings.train.holdout, settings.light.size, *rules)
+        sizes = settings.train.max_size, settings.train.holdout, settings.light.size, settings.export.max_triangles
+        return cls(settings.bake, *sizes, *rules)
 
 
 def bake_textures(
@@ -77,7 +85,7 @@ def bake_textures(
 
     Written: `mesh.safetensors` (the unwrapped mesh with its tangent frames), `base_color.exr`, `orm.exr`, `coverage.exr`, where needed
     `normal.exr` and `emissive.exr`, with materials `light.safetensors`, where the light moves `light_motion.json`. Raises BadInputError
-    when the mesh is damaged, does not fit the atlas, or is visible in no photo.
+    when the mesh is damaged, has too many triangles, does not fit the atlas, or is visible in no photo.
     """
     return _Baking(PosedPhotos.open(poses, surfels), surfels, mesh, out, options or BakeOptions(), seed, threads, monitor).run()
 
@@ -113,7 +121,8 @@ class _Baking:
             raise BadInputError(
                 'bake: bake.materials is "surfels", but the surfels have none; set surfels.shading to "pbr" or bake.materials to "fit".'
             )
-        vertices, faces = self._read("mesh.ply")
+        with monitor.part("repair"):
+            vertices, faces = self._mesh()
         surface = self._unwrap(vertices, faces)
         monitor.check_stop()
         with monitor.part("normals"):
@@ -138,14 +147,36 @@ class _Baking:
         except ValueError as error:
             raise BadInputError(f"{error}; run the mesh stage again or replace the file.") from error
 
+    def _mesh(self) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+        """Vertices and faces of the low-poly mesh, which may come from another program, without its faults."""
+        vertices, faces = self._read("mesh.ply")
+        found = repair_foreign(vertices, faces.astype(np.int32), MAX_HOLE_EDGES)
+        if found.joined:
+            self.monitor.decide("mesh", "vertices joined", f"{found.joined} of {len(vertices)} lay at the place of another")
+        if found.faults:
+            self.monitor.warn(f"bake: the mesh was repaired; left out were {found.faults}.")
+        most = self.options.max_triangles
+        if len(found.faces) > most:
+            raise BadInputError(
+                f"bake: the mesh has {number(len(found.faces))} triangles, but export.max_triangles allows {number(most)}; decimate it and "
+                f"give it as mesh.ply, this one as dense.ply, whose details become the normal map, or raise the limit."
+            )
+        return found.vertices, found.faces.astype(np.int64)
+
     def _unwrap(self, vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> UnwrappedMesh:
         """The low-poly mesh unwrapped into charts, with its texels."""
         size = self.options.bake.size
         with self.monitor.part("atlas"):
+            self.monitor.progress(0, len(faces), "unwrapping")
             try:
                 atlas = make_atlas(vertices, faces, size)
             except ValueError as error:
                 raise BadInputError(f"bake: {error}.") from error
+        if atlas.fill < MIN_FILL:
+            self.monitor.warn(
+                f"bake: {number(atlas.charts)} charts use {atlas.fill:.0%} of the texture, the rest is padding; raise bake.size, or join "
+                "the mesh's pieces."
+            )
         with self.monitor.part("texels"):
             surface = UnwrappedMesh.of(vertices, faces, atlas, size, self.threads)
         return surface

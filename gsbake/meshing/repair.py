@@ -1,11 +1,13 @@
 """Repair of a mesh's topology: duplicate and degenerate faces, non-manifold edges and vertices, holes.
 
 Holes are triangulated with least area by dynamic programming (Barequet & Sharir, *Filling gaps in the boundary of a polyhedron*, CAGD
-1995). Non-manifold edges lose their smallest faces; non-manifold vertices are split, one vertex per fan of faces (Guéziec et al., *Cutting
-and stitching*, IEEE TVCG 2001).
+1995). Non-manifold edges lose faces with a free edge, else their smallest; non-manifold vertices are split, one vertex per fan of faces
+(Guéziec et al., *Cutting and stitching*, IEEE TVCG 2001).
 """
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +28,67 @@ def repair(vertices: Vertices, faces: Faces) -> tuple[Vertices, Faces]:
     faces = _remove_duplicate_faces(faces)
     faces = _remove_non_manifold_faces(vertices, faces)
     return split_non_manifold_vertices(*remove_unused_vertices(vertices, faces))
+
+
+@dataclass(frozen=True)
+class Repaired:
+    """A mesh of another program after `repair_foreign`: `vertices` (v, 3) and `faces` (f, 3), and what was wrong with it.
+
+    `joined` vertices at the place of others, `double` faces, faces `without_area`, edges with more than two faces (`non_manifold`), faces
+    `cut` there and `filled` in the holes that this left.
+    """
+
+    vertices: Vertices
+    faces: Faces
+    joined: int
+    without_area: int
+    double: int
+    non_manifold: int = 0
+    cut: int = 0
+    filled: int = 0
+
+    @property
+    def faults(self) -> str:
+        """What was left out and added, for a person; empty where nothing was but vertices at one place."""
+        parts = []
+        if self.without_area:
+            parts.append(f"{self.without_area} faces without area")
+        if self.double:
+            parts.append(f"{self.double} double faces")
+        if self.cut:
+            parts.append(f"{self.cut} faces at {self.non_manifold} edges that had more than two (holes closed with {self.filled})")
+        return ", ".join(parts)
+
+
+def repair_foreign(vertices: Vertices, faces: Faces, max_hole_edges: int) -> Repaired:
+    """What `repair` does, only where it is needed, and with the holes of at most `max_hole_edges` edges closed that it leaves.
+
+    Openings of the mesh stay open. A mesh without faults is returned as it is.
+    """
+    merged_vertices, merged = _merge_vertices(vertices)
+    joined = len(vertices) - len(merged_vertices)
+    clean = _remove_degenerate_faces(merged_vertices, merged[faces])
+    single = _remove_duplicate_faces(clean)
+    border, non_manifold = _edges_of(merged_vertices, single)
+    without_area, double = len(faces) - len(clean), len(clean) - len(single)
+    if not non_manifold:
+        mesh = remove_unused_vertices(merged_vertices, single) if joined or without_area or double else (vertices, faces)
+        return Repaired(*mesh, joined, without_area, double)
+    manifold = _remove_non_manifold_faces(merged_vertices, single)
+    holes = _boundary(merged_vertices, manifold)
+    holes = holes[~np.isin(np.sort(holes, axis=1) @ np.array([len(merged_vertices), 1]), border)]
+    used = np.unique(edge_keys(merged_vertices, manifold))
+    patches = [fill_hole(merged_vertices, loop, used) for loop in boundary_loops(holes) if len(loop) <= max_hole_edges]
+    whole = np.concatenate([manifold, *patches]).astype(np.int32)
+    final = split_non_manifold_vertices(*remove_unused_vertices(merged_vertices, whole))
+    cut, filled = len(single) - len(manifold), len(whole) - len(manifold)
+    return Repaired(*final, joined, without_area, double, non_manifold, cut, filled)
+
+
+def _edges_of(vertices: Vertices, faces: Faces) -> tuple[NDArray[np.int64], int]:
+    """Keys of the edges with one face, and the number of those with more than two."""
+    keys, counts = np.unique(edge_keys(vertices, faces), return_counts=True)
+    return keys[counts == 1], int((counts > 2).sum())
 
 
 def close_holes(vertices: Vertices, faces: Faces, max_edges: int) -> tuple[Vertices, Faces]:
@@ -103,7 +166,10 @@ def _remove_duplicate_faces(faces: Faces) -> Faces:
 
 
 def _remove_non_manifold_faces(vertices: Vertices, faces: Faces) -> Faces:
-    """Remove the smallest face of each edge with more than two faces, of the direction that has more of them, until there is none."""
+    """Remove a face of each edge with more than two faces, of the direction that has more of them, until there is none.
+
+    It is one with a free edge, whose loss opens nothing, else the smallest.
+    """
     while len(faces):
         keys = edge_keys(vertices, faces)
         _, edge, counts = np.unique(keys, return_inverse=True, return_counts=True)
@@ -112,11 +178,12 @@ def _remove_non_manifold_faces(vertices: Vertices, faces: Faces) -> Faces:
         excess = (counts[edge] > 2) & (direction * np.bincount(edge, direction)[edge] >= 0)
         if not excess.any():
             break
+        closed = np.all(counts[edge].reshape(-1, 3) > 1, axis=1)
         face, edge = np.repeat(np.arange(len(faces)), 3)[excess], edge[excess]
-        order = np.lexsort((face, _doubled_areas(vertices, faces)[face], edge))
-        smallest = np.unique(edge[order], return_index=True)[1]
+        order = np.lexsort((face, _doubled_areas(vertices, faces)[face], closed[face], edge))
+        worst = np.unique(edge[order], return_index=True)[1]
         keep = np.ones(len(faces), np.bool_)
-        keep[face[order[smallest]]] = False
+        keep[face[order[worst]]] = False
         faces = faces[keep]
     return faces
 
@@ -138,8 +205,9 @@ def boundary_loops(edges: NDArray[np.int64]) -> list[NDArray[np.int64]]:
     """Vertices of each closed loop of directed `edges` (n, 2), of which at most one leaves each vertex."""
     following = dict(edges.tolist())
     loops = []
-    while following:
-        first = min(following)
+    for first in sorted(following):
+        if first not in following:
+            continue
         loop, vertex = [first], following.pop(first)
         while vertex != first and vertex in following:
             loop.append(vertex)

@@ -28,6 +28,10 @@ Ints = NDArray[np.int64]
 
 #: Faces per cluster handed to xatlas. 30 000 faces, one core: 7.9 s as one mesh, 2.4 s in clusters of a thousand, with fewer charts.
 CLUSTER_FACES = 1000
+#: Most faces clustered at once: the time of k-means grows with its square. Larger meshes are halved along their longest side first.
+KMEANS_FACES = 1 << 16
+#: Largest share of the texture that padding takes; more charts than that allows get less padding than they ask for, at least MIN_PADDING.
+PADDING_SHARE, MIN_PADDING = 0.25, 2
 #: Above this mean dihedral angle (radians) a surface counts as noisy and is smoothed, for charting only.
 NOISY_DIHEDRAL = 0.2
 #: Laplacian steps of that smoothing.
@@ -70,24 +74,25 @@ def signed_areas(uv: NDArray[Any], faces: NDArray[Any]) -> Floats:
 def make_atlas(vertices: NDArray[Any], faces: NDArray[Any], size: int, padding: int | None = None) -> Atlas:
     """Unwrap a mesh: `vertices` (v, 3) in any unit, `faces` (f, 3), onto a texture of `size` texels.
 
-    `padding` texels are left between charts (default: size / 128). Raises ValueError when the mesh has no area or its charts cannot fit.
+    `padding` texels are left between charts (default: size / 128), fewer where so many charts would be mostly padding. Raises ValueError
+    when the mesh has no area or its charts cannot fit.
     """
     triangles = np.asarray(faces, np.int64)
     points = _normalised(np.asarray(vertices, np.float64), triangles)
-    gap = max(2, size // 128) if padding is None else padding
+    wanted = max(MIN_PADDING, size // 128) if padding is None else padding
     source, uv, corner = _chart(_smoothed_when_noisy(points, triangles), triangles)
     chart = _islands(len(uv), corner)
     uv = _normalise_charts(points, triangles, uv, corner, chart)
     if not np.abs(signed_areas(uv, corner)).sum() > 0:
         raise ValueError(f"the triangles of the mesh are too thin to unwrap; {_REPLACE}")
-    packed = pack(uv, corner, chart, size, gap)
+    packed = pack(uv, corner, chart, size, _padding(chart, size, wanted))
     for alone in (False, True, True):
         folded = overlapping_faces(packed.uv / size, corner, CHECK_SIZE)
         if not folded.any():
             break
         source, uv, corner = _detach(source, uv, corner, folded, alone)
         chart = _islands(len(uv), corner)
-        packed = pack(uv, corner, chart, size, gap)
+        packed = pack(uv, corner, chart, size, _padding(chart, size, wanted))
     final = packed.uv / size
     fill = float(np.abs(signed_areas(final, corner)).sum())
     final[:, 1] = 1 - final[:, 1]
@@ -107,6 +112,11 @@ def _normalised(points: Floats, faces: Ints) -> Floats:
     if np.linalg.norm(centre) > diagonal:
         points = points - centre
     return np.asarray(points * 2.0 ** np.round(np.log2(DIAGONAL) - np.log2(diagonal)))
+
+
+def _padding(chart: Ints, size: int, wanted: int) -> int:
+    """Texels between charts: the `wanted` ones, fewer where they would take more than `PADDING_SHARE` of the texture."""
+    return min(wanted, max(MIN_PADDING, int(np.sqrt(PADDING_SHARE / (int(chart.max()) + 1)) * size)))
 
 
 def _islands(count: int, corner: Ints) -> Ints:
@@ -159,11 +169,18 @@ def _chart(points: Floats, faces: Ints) -> tuple[Ints, Floats, Ints]:
 
 def _clusters(centres: Floats) -> Ints:
     """Compact cluster of each face (f,), about `CLUSTER_FACES` faces each."""
+    if len(centres) > KMEANS_FACES:
+        axis = int(np.ptp(centres, axis=0).argmax())
+        order = np.argsort(centres[:, axis], kind="stable")
+        label, count = np.empty(len(centres), np.int64), 0
+        for half in np.array_split(order, 2):
+            label[half] = count + _clusters(centres[half])
+            count = int(label[half].max()) + 1
+        return label
     count = round(len(centres) / CLUSTER_FACES)
     if count < 2:
         return np.zeros(len(centres), np.int64)
-    label: Ints = kmeans2(centres, count, iter=8, minit="++", rng=np.random.default_rng(0), missing="warn")[1].astype(np.int64)
-    return label
+    return np.asarray(kmeans2(centres, count, iter=8, minit="++", rng=np.random.default_rng(0), missing="warn")[1], np.int64)
 
 
 def _normalise_charts(points: Floats, faces: Ints, uv: Floats, corner: Ints, chart: Ints) -> Floats:

@@ -3,7 +3,7 @@
 Charts are drawn conservatively on a coarse grid, grown by half the padding, and placed one by one, largest first, at the lowest free
 position of the square in the best of four right-angle rotations. The scale is then searched so that all charts just fit. Rotations only:
 a mirrored chart would turn the handedness of its tangent frame. Occupied cells are bits of 64-bit words, so that a whole row of a chart
-is tested at once.
+is tested at once. More than `MANY_CHARTS` would take minutes so, and are mostly padding anyway: their boxes stand on shelves.
 
 Lévy et al., *Least squares conformal maps for automatic texture atlas generation*, SIGGRAPH 2002 (packing of chart outlines on a bitmap).
 """
@@ -28,6 +28,10 @@ CELLS = (256, 512)
 FIRST_FILL = 0.6
 #: The search for the scale ends when it is known to this factor.
 SCALE_STEP = 1.012
+#: Charts above which boxes are packed instead of outlines: 8 400 charts take 35 s by their outlines.
+MANY_CHARTS = 2000
+#: Smallest scale of boxes that is tried, as a share of that at which the longest fills the square.
+MIN_SCALE = 1e-6
 
 
 @dataclass(frozen=True)
@@ -224,9 +228,56 @@ def _search(
         else:
             scale = scale * step if best is not None else scale / step
             step = min(step**1.3, 2.0)
-    raise ValueError(
-        f"{len(charts)} charts with {padding} texels of padding do not fit a texture of {size} texels; raise bake.size or lower mesh.faces"
+    raise _does_not_fit(len(charts), size, padding)
+
+
+def _does_not_fit(charts: int, size: int, padding: float) -> ValueError:
+    return ValueError(
+        f"{charts} charts with {padding} texels of padding do not fit a texture of {size} texels; raise bake.size, lower mesh.faces "
+        "or join the mesh's pieces"
     )
+
+
+def _stand_on_shelves(boxes: Floats, size: int) -> Floats | None:
+    """Lowest corners (n, 2) of boxes (n, 2), the tallest first, from left to right and shelf by shelf; None where they do not fit."""
+    ends, heights = np.cumsum(boxes[:, 0]), boxes[:, 1]
+    corners, first, y = np.empty_like(boxes), 0, 0.0
+    while first < len(boxes):
+        start = ends[first] - boxes[first, 0]
+        last = int(np.searchsorted(ends, start + size, side="right"))
+        if last == first or y + heights[first] > size:
+            return None
+        corners[first:last, 0], corners[first:last, 1] = ends[first:last] - boxes[first:last, 0] - start, y
+        first, y = last, y + heights[first]
+    return corners
+
+
+def _search_on_shelves(charts: list[tuple[Floats, Ints]], extents: Floats, size: int, padding: float) -> tuple[list[Floats], float]:
+    """The largest scale found at which the boxes of all charts, of `extents` (n, 2), stand on shelves; the coordinates there, and it.
+
+    Each chart lies on its longer side.
+    """
+    lying = np.sort(extents, axis=1)[:, ::-1]
+    order = np.argsort(-lying[:, 1], kind="stable")
+    high = (size - padding) / max(lying.max(), 1e-30)
+    low = MIN_SCALE * high
+    corners = _stand_on_shelves(low * lying[order] + padding, size)
+    if corners is None:
+        raise _does_not_fit(len(charts), size, padding)
+    while high / low > SCALE_STEP:
+        scale = float(np.sqrt(low * high))
+        found = _stand_on_shelves(scale * lying[order] + padding, size)
+        if found is None:
+            high = scale
+        else:
+            low, corners = scale, found
+    placed: list[Floats] = [np.zeros((0, 2))] * len(charts)
+    for c, corner in zip(order, corners, strict=True):
+        uv = low * (charts[c][0] - charts[c][0].min(0))
+        if extents[c, 1] > extents[c, 0]:  # a quarter turn, not a mirroring
+            uv = np.stack([uv[:, 1], low * extents[c, 0] - uv[:, 0]], 1)
+        placed[c] = uv + corner + padding / 2
+    return placed, low
 
 
 def pack(uv: Floats, faces: Ints, chart: Ints, size: int, padding: float) -> Packed:
@@ -244,15 +295,25 @@ def pack(uv: Floats, faces: Ints, chart: Ints, size: int, padding: float) -> Pac
         charts.append((np.ascontiguousarray(uv[used]), np.ascontiguousarray(inverse.reshape(-1, 3), np.int64)))
         members.append(used)
     extents = np.array([np.ptp(c[0], axis=0) for c in charts])
+    if len(charts) > MANY_CHARTS:
+        best, scale = _search_on_shelves(charts, extents, size, padding)
+    else:
+        best, scale = _search_outlines(charts, extents, uv[faces], size, padding)
+    out = np.zeros_like(uv)
+    for used, coordinates in zip(members, best, strict=True):
+        out[used] = coordinates
+    return Packed(out, scale)
+
+
+def _search_outlines(
+    charts: list[tuple[Floats, Ints]], extents: Floats, corners: Floats, size: int, padding: float
+) -> tuple[list[Floats], float]:
+    """Texel coordinates of all charts packed by their outlines, and the scale; `corners` (f, 3, 2) of all triangles."""
     order = np.lexsort((np.arange(len(charts)), -extents.max(1)))
-    corners = uv[faces]
     e1, e2 = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     area = 0.5 * np.abs(e1[:, 0] * e2[:, 1] - e1[:, 1] * e2[:, 0]).sum()
     scale = min(size * np.sqrt(FIRST_FILL / max(area, 1e-30)), (size - padding) / max(extents.max(), 1e-30))
     best, scale = _search(charts, order, scale, 1.1, size, padding, min(CELLS[0], size))
     if size > CELLS[0]:
         best, scale = _search(charts, order, scale * 1.02, 1.02, size, padding, min(CELLS[1], size))
-    out = np.zeros_like(uv)
-    for used, coordinates in zip(members, best, strict=True):
-        out[used] = coordinates
-    return Packed(out, scale)
+    return best, scale

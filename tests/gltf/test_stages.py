@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 from gsbake.config.schema import Bake, Export, Scale
 from gsbake.errors import BadInputError
 from gsbake.geometry.cameras import Camera, CameraSet, Similarity
-from gsbake.geometry.ply import write_mesh
+from gsbake.geometry.ply import read_mesh, write_mesh
 from gsbake.geometry.tangents import frame_to_world
 from gsbake.gltf.export import ExportOptions, export_asset
 from gsbake.gltf.read import GltfAsset, read_glb
@@ -249,6 +249,30 @@ def test_an_earlier_export_is_overwritten(run: Path, tmp_path: Path) -> None:
 def test_an_asset_over_the_triangle_limit_fails(run: Path, tmp_path: Path) -> None:
     with pytest.raises(BadInputError, match="triangle count"):
         export(run, tmp_path / "export", max_triangles=1000)
+
+
+def test_a_rough_mesh_is_repaired_and_said_to_be(run: Path, tmp_path: Path) -> None:
+    """The run's mesh as loose triangles with some of them twice: the same textures, and a warning."""
+    vertices, faces = read_mesh(run / "mesh/mesh.ply")
+    (tmp_path / "mesh").mkdir()
+    again = np.concatenate([faces, faces[:5]])
+    write_mesh(tmp_path / "mesh/mesh.ply", vertices[again].reshape(-1, 3), np.arange(3 * len(again)).reshape(-1, 3))
+    (tmp_path / "mesh/dense.ply").write_bytes((run / "mesh/dense.ply").read_bytes())
+    monitor = Recorder()
+    (tmp_path / "bake").mkdir()
+    options = BakeOptions(Bake(size=SIZE, occlusion_rays=0), holdout=0, max_triangles=len(faces))
+    result = bake_textures(run / "poses", run / "refine", tmp_path / "mesh", tmp_path / "bake", options, monitor=monitor)
+    assert result["faces"] == len(faces) and result["detail_share"] > 0.99 and result["fill"] > 0.45
+    assert monitor.warnings == ["bake: the mesh was repaired; left out were 5 double faces."]
+    assert monitor.line("mesh") == f"vertices joined ({3 * len(again) - len(vertices)} of {3 * len(again)} lay at the place of another)"
+
+
+def test_a_mesh_over_the_triangle_limit_is_refused_before_anything_is_baked(run: Path, tmp_path: Path) -> None:
+    options = BakeOptions(Bake(size=SIZE), max_triangles=1279)
+    monitor = Recorder()
+    with pytest.raises(BadInputError, match="the mesh has 1 280 triangles, but export.max_triangles allows 1 279; decimate it"):
+        bake_textures(run / "poses", run / "refine", run / "mesh", tmp_path, options, monitor=monitor)
+    assert list(monitor.parts) == ["repair"]
 
 
 def test_a_damaged_mesh_is_reported(run: Path, tmp_path: Path) -> None:

@@ -7,7 +7,7 @@ import pytest
 import trimesh
 
 from gsbake.meshing.cleanup import topology
-from gsbake.meshing.repair import close_holes, repair, split_non_manifold_vertices
+from gsbake.meshing.repair import close_holes, repair, repair_foreign, split_non_manifold_vertices
 
 Mesh = tuple[np.ndarray, np.ndarray]
 
@@ -92,6 +92,52 @@ def test_touching_spheres_get_vertices_of_their_own() -> None:
         fixed = close_holes(*repair(both[0], joined), 20)
         assert is_solid(fixed)
         assert trimesh.Trimesh(*fixed, process=True).is_watertight  # also for a program that merges vertices at equal positions
+
+
+def with_fins(mesh: Mesh, count: int) -> Mesh:
+    """The mesh with a triangle that stands on each of its first `count` edges."""
+    vertices, faces = mesh
+    edges = np.unique(np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0)[:count]
+    fins = np.column_stack([edges, len(vertices) + np.arange(count)])
+    return np.concatenate([vertices, 1.02 * vertices[edges].mean(1)]), np.concatenate([faces, fins]).astype(np.int32)
+
+
+def test_rough_meshes_of_other_programs_lose_their_faults_and_nothing_else() -> None:
+    """A quarter of all edges with a third face, faces without area, double faces, vertices at one place: what is left is the sphere."""
+    vertices, faces = sphere()
+    soup = vertices[faces].reshape(-1, 3), np.arange(3 * len(faces)).reshape(-1, 3).astype(np.int32)
+    joined = repair_foreign(*soup, 100)
+    assert joined.joined == len(soup[0]) - len(vertices) and joined.faults == "" and is_solid((joined.vertices, joined.faces))
+    rough, rough_faces = with_fins((vertices, faces), 3 * len(faces) // 8)
+    flat = np.column_stack([faces[:200, 0], faces[:200, 1], faces[:200, 1]])
+    found = repair_foreign(rough, np.concatenate([rough_faces, flat, faces[:7]]).astype(np.int32), 100)
+    assert np.array_equal(found.faces, faces) and np.array_equal(found.vertices, vertices)
+    assert (found.without_area, found.double, found.cut, found.filled) == (200, 7, 480, 0)
+    assert found.faults == "200 faces without area, 7 double faces, 480 faces at 480 edges that had more than two (holes closed with 0)"
+
+
+def test_holes_of_the_repair_are_closed_and_openings_stay() -> None:
+    """Two spheres that share an edge, one of them open at the other end."""
+    vertices, faces = sphere(2)
+    n = len(vertices)
+    second = faces[vertices[faces].mean(1)[:, 2] < 0.6] + n
+    low = faces[vertices[faces].mean(1)[:, 2].argmin()][:2]
+    for vertex in low:
+        second[second == vertex + n] = vertex
+    both = np.concatenate([vertices, vertices]) * [1, 1, 0.999], np.concatenate([faces, second]).astype(np.int32)
+    both[0][n:] -= [0, 0, 2.5]  # the shared edge is drawn long; what counts is how faces are joined
+    before = topology(*both)
+    assert before.non_manifold_edges == 1 and before.border_edges > 10
+    found = repair_foreign(*both, 100)
+    after = topology(found.vertices, found.faces)
+    assert after.non_manifold_edges == 0 and after.border_edges == before.border_edges and found.cut == found.filled > 0
+
+
+def test_a_mesh_without_faults_is_the_same_mesh() -> None:
+    vertices, faces = sphere(2)
+    opened = faces[vertices[faces].mean(1)[:, 2] < 0.3]
+    found = repair_foreign(vertices, opened, 100)
+    assert found.vertices is vertices and found.faces is opened and found.faults == ""
 
 
 @pytest.mark.parametrize("faces", [np.zeros((0, 3), np.int32), np.array([[0, 0, 0]], np.int32), np.array([[0, 1, 2]] * 3, np.int32)])

@@ -7,7 +7,9 @@ import pytest
 import trimesh
 from scipy.ndimage import distance_transform_edt
 
-from gsbake.texturing.atlas import Atlas, _detach, _islands, make_atlas
+from gsbake.texturing import atlas as atlas_module
+from gsbake.texturing import packing
+from gsbake.texturing.atlas import Atlas, _clusters, _detach, _islands, make_atlas
 from gsbake.texturing.packing import pack
 from gsbake.texturing.texels import overlapping, overlapping_faces, rasterise
 
@@ -64,7 +66,10 @@ def test_atlas_is_deterministic(bumpy: tuple[np.ndarray, np.ndarray], atlas: Atl
     assert np.array_equal(again.uv, atlas.uv) and np.array_equal(again.faces, atlas.faces)
 
 
-def test_packing_keeps_shape_and_handedness() -> None:
+@pytest.mark.parametrize("many", [2000, 10])
+def test_packing_keeps_shape_and_handedness(monkeypatch: pytest.MonkeyPatch, many: int) -> None:
+    """By outlines, and as boxes on shelves."""
+    monkeypatch.setattr(packing, "MANY_CHARTS", many)
     rng = np.random.default_rng(3)
     triangles = rng.uniform(0, 1, (40, 3, 2))
     flip = np.linalg.det(np.stack([triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]], 1)) < 0
@@ -79,6 +84,36 @@ def test_packing_keeps_shape_and_handedness() -> None:
     assert (np.linalg.det(np.stack([out[:, 1] - out[:, 0], out[:, 2] - out[:, 0]], 1)) > 0).all()
     assert packed.uv.min() >= 1 - 1e-9 and packed.uv.max() <= 255 + 1e-9
     assert overlapping(packed.uv / 256, faces, 1024) == 0
+
+
+def pieces(count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Separate icosahedra on a sphere."""
+    piece = trimesh.creation.icosahedron()
+    places = np.random.default_rng(0).normal(size=(count, 3))
+    places /= np.linalg.norm(places, axis=1, keepdims=True)
+    vertices = (places[:, None] + 0.01 * np.asarray(piece.vertices)).reshape(-1, 3)
+    return vertices, (np.arange(count)[:, None, None] * len(piece.vertices) + piece.faces).reshape(-1, 3)
+
+
+def test_thousands_of_pieces_are_unwrapped_with_less_padding() -> None:
+    """Their padding would not fit the texture; what cannot fit with any is one sentence."""
+    vertices, faces = pieces(1000)
+    found = make_atlas(vertices, faces, 512)
+    assert found.charts > packing.MANY_CHARTS and found.charts * 4**2 > 0.25 * 512**2
+    assert overlapping(found.uv, found.faces, 2048) == 0 and (turn(found.uv, found.faces) > 0).all()
+    assert np.array_equal(found.source[found.faces], faces) and found.fill > 0.15
+    with pytest.raises(ValueError, match="charts with 2 texels of padding do not fit a texture of 128 texels; .* join the mesh's pieces"):
+        make_atlas(vertices, faces, 128)
+
+
+def test_clusters_of_large_meshes_are_those_of_their_halves(monkeypatch: pytest.MonkeyPatch) -> None:
+    centres = np.random.default_rng(0).random((9000, 3)) * [4, 1, 1]
+    whole = _clusters(centres)
+    monkeypatch.setattr(atlas_module, "KMEANS_FACES", 5000)
+    halves = _clusters(centres)
+    assert np.array_equal(np.unique(halves), np.arange(halves.max() + 1)) and abs(int(halves.max()) - int(whole.max())) <= 1
+    left, right = (set(halves[side]) for side in (centres[:, 0] < np.median(centres[:, 0]), centres[:, 0] > np.median(centres[:, 0])))
+    assert left.isdisjoint(right)
 
 
 def test_empty_mesh_is_refused() -> None:

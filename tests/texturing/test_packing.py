@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from gsbake.texturing import packing
 from gsbake.texturing.packing import _bits, _fill, _longest_run, _place, pack
 
 CELLS = 96
@@ -41,8 +42,10 @@ def test_charts_lie_where_trying_all_places_puts_them(seed: int) -> None:
     assert [_longest_run(row, CELLS, 0) for row in _bits(taken.astype(np.uint8))] == longest.tolist()
 
 
-def test_many_equal_charts_do_not_overlap_and_fill_the_square() -> None:
-    """Equal bitmaps, for which searches start where the one before ended."""
+@pytest.mark.parametrize("many", [2000, 100])
+def test_many_equal_charts_do_not_overlap_and_fill_the_square(monkeypatch: pytest.MonkeyPatch, many: int) -> None:
+    """Equal bitmaps, for which searches start where the one before ended; and boxes on shelves."""
+    monkeypatch.setattr(packing, "MANY_CHARTS", many)
     side = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], float)
     count = 150
     uv = np.concatenate([side * (1.0 if k % 3 else 0.5) for k in range(count)])
