@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import enum
 from collections.abc import Iterable, Iterator
-from typing import Any, get_args
+from typing import Any, get_args, get_origin
 
 import typer
 from mkdocs.config.defaults import MkDocsConfig
@@ -44,6 +44,8 @@ def _allowed(field: FieldInfo) -> str:
     """The values a setting takes, in words."""
     if field.annotation is bool:
         return "true or false"
+    if get_origin(field.annotation) is tuple:
+        return "a list"
     choices = [c for c in get_args(field.annotation) if not isinstance(c, type)]
     words = [str(inner) for c in choices for inner in (get_args(c) or (c,))]
     if words:

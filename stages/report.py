@@ -17,7 +17,7 @@ def run(ctx: Context) -> dict[str, Any]:
 
 STAGE = Stage(
     name="report",
-    version=10,
+    version=11,
     title="Report",
     run=run,
     summary="{psnr:dB} and SSIM {ssim} over {compared} photos",

@@ -23,7 +23,7 @@ from gsbake.capture.masks.hull_correction import apply_correction, correct_by_hu
 from gsbake.capture.masks.support_plane import plane_masks
 from gsbake.capture.photos.redundancy import find_redundant_photos
 from gsbake.capture.photos.undistortion import intrinsics_key, pinhole_camera, remap_tables, resample
-from gsbake.capture.posed_photos import PosedPhotos
+from gsbake.capture.posed_photos import REGION, PosedPhotos
 from gsbake.capture.poses.normalisation import BoundingSphere, bounding_sphere_from_masks, bounding_sphere_from_views
 from gsbake.capture.sfm.feature_masks import FeatureMasks
 from gsbake.capture.sfm.solve import PoseSolver
@@ -31,6 +31,7 @@ from gsbake.config.schema import Poses
 from gsbake.errors import BadInputError
 from gsbake.geometry.cameras import Camera, CameraSet
 from gsbake.geometry.ply import read_cloud, write_cloud
+from gsbake.geometry.region import Region
 from gsbake.imaging.png import read_grey, write_png
 from gsbake.monitor import SILENT, Monitor, Rule, decide_skip
 from gsbake.text import shortlist
@@ -69,10 +70,10 @@ def estimate_poses(
     """Estimate the cameras of the photos in the artifact folder `ingest`, write the posed capture into `out`; return the figures.
 
     Written: `cameras.json` (`CameraSet`, unit frame), `photos/`, `masks/` (pinhole), `points.ply` (tie points, unit frame; may be absent),
-    `photo_masks/` (masks that were guessed, as the photos show them), `photo_cameras.json` (cameras of the photos before undistortion,
-    world frame), `sparse/` (COLMAP binary model, input frame). `scratch` holds the database of COLMAP, from which an interrupted run
-    resumes; `cache` keeps features and matches, which a run with more photos uses again. Raises BadInputError when too few photos register,
-    or required poses are missing.
+    `region.json` (the box outside of which nothing is baked, where there is one), `photo_masks/` (masks that were guessed, as the photos
+    show them), `photo_cameras.json` (cameras of the photos before undistortion, world frame), `sparse/` (COLMAP binary model, input frame).
+    `scratch` holds the database of COLMAP, from which an interrupted run resumes; `cache` keeps features and matches, which a run with more
+    photos uses again. Raises BadInputError when too few photos register, required poses are missing, or the region lies in no photo.
     """
     if scratch is None:
         with tempfile.TemporaryDirectory(prefix="gsbake-poses-") as folder:
@@ -108,9 +109,12 @@ class _Estimation:
             automatic = self._write_automatic_masks(entries, solved.cameras, points)
         with monitor.part("undistortion"):
             pinholes = self._undistort(solved.cameras)
+        region = self._region(given)
         with monitor.part("normalisation"):
+            if region is not None:
+                points, colours = self._cut(region, pinholes, points, colours)
             masks = self._hull_masks(pinholes)
-            sphere = self._bounding_sphere(pinholes, masks, points)
+            sphere = self._bounding_sphere(pinholes, masks, points, region)
         to_world = sphere.similarity()
         to_unit = to_world.inverse()
         origin = "given" if given else "solved"
@@ -125,6 +129,9 @@ class _Estimation:
         CameraSet(tuple(cameras), to_world, origin, epipolar_px=solved.figures.get("epipolar_px")).save(self.out / "cameras.json")
         if (solver.folder / "sparse").exists():
             shutil.copytree(solver.folder / "sparse", self.out / "sparse")
+        if region is None:
+            cube = Region(sphere.centre, np.full(3, 2 * sphere.radius), np.eye(3))
+            monitor.decide("region", "none", f"the object fits into {json.dumps(_rounded(cube))}, a file for --region to start from")
         monitor.decide("unit frame", f"radius {sphere.radius:.4g} in world units", sphere.evidence)
         centre = sphere.centre.tolist()
         return {"poses": origin, **solved.figures, **automatic, "dropped_photos": dropped, "centre": centre, "radius": sphere.radius}
@@ -139,6 +146,35 @@ class _Estimation:
         evidence = f"{count}; set by the profile" if source != "auto" else count
         self.monitor.decide("pose source", "given" if use else "structure from motion", evidence)
         return use
+
+    def _region(self, given: bool) -> Region | None:
+        """The box to be baked, in the cameras' frame, which is written; None where there is none."""
+        settings, file = self.options.poses, self.ingest / "poses" / REGION
+        if settings.region == "none":
+            return None
+        if settings.region_box:
+            region, source = Region.of(settings.region_box, "poses.region_box"), "set by --region"
+        elif given and file.exists():
+            region, source = Region.read(file), "from the file of the cameras"
+        else:
+            return None
+        (self.out / REGION).write_bytes(json.dumps(region.document, indent=1).encode())
+        self.monitor.decide("region", source, json.dumps(_rounded(region)))
+        return region
+
+    def _cut(self, region: Region, cameras: Sequence[Camera], points: Any, colours: Any) -> tuple[Any, Any]:
+        """Take what lies outside the region from the masks; the tie points and their colours inside it."""
+        shown = 0
+        for camera in cameras:
+            box = region.silhouette(camera)
+            shown += bool(box.any())
+            path = self.out / "masks" / f"{camera.name}.png"
+            if path.exists():
+                write_png(path, np.minimum(read_grey(path), box))
+        if not shown:
+            raise BadInputError("poses: the region lies in no photo; its box is in the frame of the cameras (photo_cameras.json).")
+        inside = None if points is None else region.contains(points)
+        return (None, None) if inside is None else (points[inside], None if colours is None else colours[inside])
 
     def _write_automatic_masks(self, entries: Sequence[dict[str, Any]], cameras: Sequence[Camera], points: Any) -> dict[str, Any]:
         """Write `photo_masks/`: guesses corrected by agreement between photos, as the photos show them; returns the figures.
@@ -257,14 +293,19 @@ class _Estimation:
         cv2.setNumThreads(self.threads)
         return [posed.mask(i, HULL_MASK_SIZE) for i in range(len(cameras))]
 
-    def _bounding_sphere(self, cameras: Sequence[Camera], masks: Sequence[tuple[Camera, Any]], points: Any) -> BoundingSphere:
-        """Bounding sphere of the object: from the visual hull when half of the photos have masks, else from the cameras' views."""
+    def _bounding_sphere(
+        self, cameras: Sequence[Camera], masks: Sequence[tuple[Camera, Any]], points: Any, region: Region | None
+    ) -> BoundingSphere:
+        """Bounding sphere of the object: from the visual hull when half of the photos have masks, else the region's, else from the
+        cameras' views."""
         masked = [(camera, mask) for camera, mask in masks if mask is not None]
         if len(masked) >= max(3, 0.5 * len(cameras)):
             sphere = bounding_sphere_from_masks([c for c, _ in masked], [m for _, m in masked])
             if sphere is not None:
                 return sphere
             self.monitor.warn("The visual hull of the masks is empty; check that white is the object (else set ingest.invert_masks).")
+        if region is not None:
+            return BoundingSphere(region.centre, float(np.linalg.norm(region.size)) / 2, "the region")
         return bounding_sphere_from_views(cameras, points)
 
     def _complete_masks(self, masks: Sequence[tuple[Camera, Any]], cloud: Any) -> None:
@@ -309,6 +350,11 @@ class _Estimation:
             for sub in ("photos", "masks"):
                 (self.out / sub / f"{name}.png").unlink(missing_ok=True)
         return [c for c in cameras if c.name not in set(names)], names
+
+
+def _rounded(region: Region) -> dict[str, Any]:
+    """The region's document with five significant digits, for a line of text."""
+    return {key: [float(f"{x:.5g}") for x in value] if key != "rotation" else value for key, value in region.document.items()}
 
 
 def _read_rgb(path: Path) -> NDArray[np.uint8]:

@@ -23,6 +23,7 @@ from gsbake.capture.photos.quality import find_blurred, find_near_duplicates
 from gsbake.capture.photos.reader_pool import ReaderPool
 from gsbake.capture.photos.sharpness import detect_oversampling
 from gsbake.capture.photos.video_process import extract_frames
+from gsbake.capture.posed_photos import REGION
 from gsbake.capture.poses.frames import GivenPoses, PhotoSize
 from gsbake.capture.poses.given import read_poses
 from gsbake.capture.sources import is_video, list_photos
@@ -63,7 +64,8 @@ def ingest(
 
     Written: `photos/<name>.png` and `masks/<name>.png` (8-bit), `guesses/<name>.png` where masks are guessed, `photos.json` (metadata of
     each photo, and the skipped files), and with known `poses` (a file or folder that `read_poses` reads) `poses/cameras.json` and
-    `poses/points.ply`. Raises BadInputError when too few photos are usable, or required masks are missing.
+    `poses/points.ply`, `poses/region.json` where the file has one. Raises BadInputError when too few photos are usable, or required masks
+    are missing.
     """
     run = _Ingestion(photos, out, options or IngestOptions(), masks, poses, threads, monitor)
     return run.run()
@@ -271,6 +273,8 @@ class _Ingestion:
             folder = self.out / "poses"
             folder.mkdir()
             CameraSet(tuple(cameras)).save(folder / "cameras.json")
+            if given.region is not None:
+                (folder / REGION).write_bytes(json.dumps(given.region.document).encode())
             if given.points is not None:
                 write_cloud(folder / "points.ply", given.points, given.colours if given.colours is not None else given.points * 0)
         without = [photo.entry["name"] for relative, photo in self.read.items() if relative not in given.cameras]

@@ -12,8 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsbake.geometry.cameras import Camera, CameraSet
+from gsbake.geometry.region import Region
 
 Bytes = NDArray[np.uint8]
+
+#: File of the box outside of which nothing is baked, in the cameras' frame.
+REGION = "region.json"
 
 
 @dataclass(frozen=True)
@@ -49,6 +53,12 @@ class PosedPhotos:
     def has_masks(self) -> bool:
         """Whether every photo has a mask."""
         return all(self._mask_file(c).exists() for c in self.cameras.cameras)
+
+    @property
+    def region(self) -> Region | None:
+        """The box outside of which nothing is baked, in the unit frame; None without one."""
+        path = self.folder / REGION
+        return Region.read(path).moved(self.cameras.to_world.inverse()) if path.exists() else None
 
     def view(self, index: int, max_size: int | None = None) -> View:
         """Photo, mask and camera `index`, the longer side at most `max_size` pixels (area filter)."""

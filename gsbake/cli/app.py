@@ -30,6 +30,7 @@ from gsbake.cli.options import (
     PosesOption,
     ProfileOption,
     QuietOption,
+    RegionOption,
     RequireOption,
     SeedOption,
     SetOption,
@@ -108,6 +109,7 @@ def _pipeline_command(until: str | None) -> Callable[..., None]:
         invert_masks: InvertOption = False,
         poses: PosesOption = None,
         moved: MovedOption = False,
+        region: RegionOption = None,
         known_distances: KnownDistanceOption = None,
         marker_size: MarkerSizeOption = None,
         device: DeviceOption = Device.auto,
@@ -121,7 +123,8 @@ def _pipeline_command(until: str | None) -> Callable[..., None]:
         from gsbake.cli.run import run_pipeline
 
         mask_settings = (*(masks.settings if masks else ()), *(INVERTED if invert_masks else ()))
-        settings = [*(overrides or []), *mask_settings, *scale_settings(known_distances, marker_size), *target_settings(targets, levels)]
+        photo_settings = (*mask_settings, *(region or ()), *scale_settings(known_distances, marker_size))
+        settings = [*(overrides or []), *photo_settings, *target_settings(targets, levels)]
         options = Options(
             photos=photos, out=out, profile=profile, overrides=settings,
             masks=masks.folder if masks else None, poses=poses, device=device.value, threads=threads, seed=seed,

@@ -99,6 +99,15 @@ def scale_settings(known_distances: list[str] | None, marker_size: float | None)
     return (*distances, *(() if marker_size is None else (f"scale.marker_size={marker_size!r}",)))
 
 
+def given_region(text: str) -> tuple[str, ...]:
+    """Settings of the region that an argument names: the box of a file, "auto" or "none"."""
+    if text in ("auto", "none"):
+        return (f"poses.region={text}", "poses.region_box=[]")
+    from gsbake.geometry.region import Region
+
+    return ("poses.region=auto", f"poses.region_box={json.dumps(Region.read(given_path(text)).numbers)}")
+
+
 def given_targets(text: str) -> tuple[str, ...]:
     """The targets of a list with commas."""
     from gsbake.config.targets import parse_target
@@ -177,6 +186,13 @@ MarkerSizeOption = Annotated[
         rich_help_panel=PHOTO_OPTIONS,
     ),
 ]
+RegionOption = Annotated[
+    Any,
+    typer.Option(
+        "--region", parser=given_region, metavar="auto|none|FILE", show_default=False, rich_help_panel=PHOTO_OPTIONS,
+        help="Box that is baked, in the cameras' frame: JSON with centre, size and rotation. auto: that of Metashape's file; none: none.",
+    ),
+]  # fmt: skip
 TargetOption = Annotated[
     list[Any] | None,
     typer.Option(

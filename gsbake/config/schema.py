@@ -80,6 +80,8 @@ class Poses(Section):
         "auto", description="Detect features inside the masks only. auto: where cameras from whole photos contradict the masks. Unless false, a background that stands while the object turns is left out."
     )
     max_size: int = Field(1600, ge=64, le=16_384, description="Longer side in pixels of the photos in which features are detected.")
+    region: Literal["auto", "none"] = Field("auto", description="auto: what lies outside the box of poses.region_box, or else of Metashape's cameras, is not baked; none: no box.")
+    region_box: tuple[float, ...] = Field((), max_length=15, description="Box that is baked, in the cameras' frame: centre, size, rotation by rows; --region takes it from a file.")
     fine_features: bool | Literal["auto"] = Field(
         "auto", description="Also detect features in photos upsampled by 2 (5 times the time). auto: only where features are few or photos fail to register."
     )

@@ -178,10 +178,15 @@ class _Extraction:
         }
 
     def _samples(self) -> OrientedPoints:
-        """The surfels as oriented points; raises BadInputError below ten."""
+        """The surfels inside the region as oriented points; raises BadInputError below ten."""
         samples = oriented_points(self.renderer.surfels)
+        if (region := self.posed.region) is not None:
+            inside = region.contains(samples.points)
+            samples = OrientedPoints(samples.points[inside], samples.normals[inside], samples.weights[inside])
         if len(samples.points) < 10:
-            raise BadInputError("mesh: fewer than ten surfels lie inside the unit sphere; training failed, see its figures in the report.")
+            raise BadInputError(
+                "mesh: fewer than ten surfels lie inside the unit sphere and the region; training failed, see its figures in the report."
+            )
         return samples
 
     def _choose_resolution(self, points: Doubles) -> tuple[Doubles, Doubles, Resolution]:
@@ -231,7 +236,10 @@ class _Extraction:
     ) -> SparseTsdf:  # fmt: skip
         """The distance field, from depth maps or from the surfels' SDF samples."""
         monitor, empty_outside = self.monitor, self.posed.has_masks or support is not None
-        field = SparseTsdf(lower, upper, resolution.cell, truncation, ball=BALL_RADIUS, empty_outside=empty_outside, support=support)
+        field = SparseTsdf(
+            lower, upper, resolution.cell, truncation, ball=BALL_RADIUS, empty_outside=empty_outside, support=support,
+            region=self.posed.region,
+        )  # fmt: skip
         source = self.options.mesh.field
         trained = self.trained_field if source == "trained" else SamplesField(self.renderer.surfels, None)
         with monitor.part("survey"):

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from gsbake.geometry.region import Region
 from gsbake.geometry.sparse_lattice import EDGE, BlockLattice
 from gsbake.kernels.threads import run_chunks
 from gsbake.meshing.depth_views import DepthView, Floats
@@ -98,8 +99,8 @@ class SparseTsdf:
     """TSDF over the box `lower`..`upper` (3,) with sample spacing `cell` and truncation distance `truncation` (same units).
 
     `ball` is the radius around the origin that contains the object. With `empty_outside` (there are masks or a support plane) all outside
-    the ball is free space and the surface is closed inside it; without, the surface is cut open there. All below the cut of `support` is
-    free space.
+    the ball is free space and the surface is closed inside it; without, the surface is cut open there. All below the cut of `support` and
+    outside the `region` is free space.
     """
 
     def __init__(
@@ -111,12 +112,13 @@ class SparseTsdf:
         ball: float | None = None,
         empty_outside: bool = True,
         support: SupportPlane | None = None,
+        region: Region | None = None,
     ) -> None:
         self.lattice = BlockLattice(lower, upper, cell)
         self.truncation = float(truncation)
         self.ball = ball
         self.empty_outside = empty_outside
-        self.support = support
+        self.support, self.region = support, region
         self.ratio = max(4, -(-max(self.lattice.samples) // COARSE_SAMPLES))
         coarse_cell = self.ratio * cell
         extent = np.array(self.lattice.samples) * cell
@@ -125,7 +127,8 @@ class SparseTsdf:
         self.coarse_field = TsdfBlocks(coarse, max(self.truncation, 2 * coarse_cell))
         self._marked = np.zeros(self.lattice.shape, np.bool_)
         self.near_share = 1.0  # share of the blocks near the surface, set by `allocate`
-        self._filled: Floats | None = None
+        self._filled: Floats | None = None  # the coarse field, and the same with the region's outside empty
+        self._closed: Floats | None = None
         self._fused: TsdfBlocks | None = None
 
     @property
@@ -168,9 +171,11 @@ class SparseTsdf:
         solve_laplace(field.lattice, field.values, unknown, longest, rate)
         blocks = sign_change_blocks(field.lattice, field.values, unknown)
         minimise_area(field.lattice, field.values, unknown, blocks, longest // 4, rate, AREA_ROUNDS)
-        filled = field.lattice.dense(field.values)
-        self._filled = filled
-        self._mark_crossings(filled)
+        self._filled = self._closed = field.lattice.dense(field.values)
+        if self.region is not None:  # after the filling, whose least area would draw the cut inwards
+            outside = np.clip(SIGN_SLOPE * self._region_distance(field.lattice, slice(None), field.truncation), -1, 1)
+            self._closed = field.lattice.dense(np.maximum(field.values, outside))
+        self._mark_crossings(self._closed)
         near_surface = self._marked & self._blocks_in_ball()
         self.near_share = float(near_surface.mean())
         self.lattice.allocate(near_surface | all_blocks)
@@ -205,8 +210,8 @@ class SparseTsdf:
 
     def mesh(self, close: bool = True) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
         """Zero set as `vertices` (v, 3), `faces` (f, 3), outward winding; `close` fills holes. Call it once, at the end."""
-        fused, filled = self._fused, self._filled
-        if fused is None or filled is None:
+        fused, filled, closed = self._fused, self._filled, self._closed
+        if fused is None or filled is None or closed is None:
             raise RuntimeError("call fuse_coarse, allocate and integrate before mesh")
         fused.reject_weak_free_space()
         unknown = fused.observed == 0
@@ -220,11 +225,11 @@ class SparseTsdf:
             fused.values[fused.observed == OBSERVED_BY_MASK] = np.maximum(fused.values[fused.observed == OBSERVED_BY_MASK], 0.5)
             unknown_near_surface = np.flatnonzero((unknown & (np.abs(fused.values) < 1)).any(axis=(1, 2, 3)))
             minimise_area(self.lattice, fused.values, unknown, unknown_near_surface, SEAM_SWEEPS, 1.5, SEAM_ROUNDS)
-            self._apply_support_cut()
-            vertices, faces = extract_isosurface(self.lattice, fused.values, filled, float(self.ratio), scale)
+            self._apply_cuts()
+            vertices, faces = extract_isosurface(self.lattice, fused.values, closed, float(self.ratio), scale)
         else:
             fused.values[(fused.observed & OBSERVED_BY_DEPTH) == 0] = np.nan
-            self._apply_support_cut()
+            self._apply_cuts()
             vertices, faces = extract_isosurface(self.lattice, fused.values)
         if self.ball is not None and not self.empty_outside:
             keep = (np.linalg.norm(vertices, axis=1) <= self.ball)[faces].all(1)
@@ -238,15 +243,20 @@ class SparseTsdf:
         height = self.support.height(lattice.positions(rows)) - self.support.cut
         return np.clip(-height / truncation, -1, 1).astype(np.float32)
 
-    def _apply_support_cut(self) -> None:
-        """Set the fine samples below the support's cut to free space; the object ends there in a flat face."""
+    def _region_distance(self, lattice: BlockLattice, rows: slice, truncation: float) -> Floats:
+        """Distance (n, 8, 8, 8) of the samples of some blocks to the region, as `_support_distance`."""
+        assert self.region is not None
+        return np.clip(self.region.distance(lattice.positions(rows)) / truncation, -1, 1).astype(np.float32)
+
+    def _apply_cuts(self) -> None:
+        """Set the fine samples below the support's cut and outside the region to free space; the object ends there in flat faces."""
         assert self._fused is not None
-        if self.support is None:
-            return
+        cuts = [self._support_distance] * (self.support is not None) + [self._region_distance] * (self.region is not None)
         step = 1024  # blocks; all positions at once would need more memory than the field
         for start in range(0, len(self.lattice), step):
             rows = slice(start, start + step)
-            self._fused.values[rows] = np.maximum(self._fused.values[rows], self._support_distance(self.lattice, rows, self.truncation))
+            for cut in cuts:
+                self._fused.values[rows] = np.maximum(self._fused.values[rows], cut(self.lattice, rows, self.truncation))
 
     def _outside_ball(self, lattice: BlockLattice) -> NDArray[np.bool_]:
         """Samples outside the ball, and the outermost layer of the box."""

@@ -6,6 +6,7 @@ hull, while a true concavity is connected to its boundary. Tiny isolated compone
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -64,15 +65,15 @@ def find_outliers(cloud: StereoCloud, hull: Hull | None) -> OutlierComponents:
     return OutlierComponents(drop[label], cell, int(drop[point_label].sum()))
 
 
-def remove_outliers(one: DepthMap, outliers: OutlierComponents) -> DepthMap:
-    """The depth map without outlier pixels."""
+def without_points(one: DepthMap, wrong: Callable[[Array], NDArray[np.bool_]]) -> DepthMap:
+    """The depth map without the pixels whose points are `wrong`."""
     depth = one.depth()
     row, column = np.nonzero(depth > 0)
-    if outliers.points == 0 or not len(row):
+    if not len(row):
         return one
     camera, z = one.camera, depth[row, column].astype(np.float64)
     local = np.stack([(column + 0.5 - camera.cx) / camera.fx * z, (row + 0.5 - camera.cy) / camera.fy * z, z], 1)
-    bad = outliers.contains((local - camera.t) @ camera.R)
+    bad = wrong((local - camera.t) @ camera.R)
     confidence, views = one.confidence.copy(), one.views.copy()
     confidence[row[bad], column[bad]] = 0
     views[row[bad], column[bad]] = 0

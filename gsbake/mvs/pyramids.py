@@ -39,7 +39,8 @@ class Photo:
 
 
 def load_photo(posed: PosedPhotos, index: int, max_size: int) -> Photo:
-    """Photo `index` of a capture with the longer side at most `max_size`; without a mask all pixels are inside."""
+    """Photo `index` of a capture with the longer side at most `max_size`; without a mask all pixels are inside, but for those that
+    do not show the region."""
     view = posed.view(index, max_size)
     grey = cv2.cvtColor(view.rgb, cv2.COLOR_RGB2GRAY)
     if view.mask is None:
@@ -47,6 +48,8 @@ def load_photo(posed: PosedPhotos, index: int, max_size: int) -> Photo:
     else:
         box = np.ones((2 * MASK_DILATION + 1, 2 * MASK_DILATION + 1), np.uint8)
         inside = np.asarray(cv2.dilate((view.mask > 127).astype(np.uint8), box), np.uint8)
+    if (region := posed.region) is not None:
+        inside &= region.silhouette(view.camera) // np.uint8(255)
     return Photo(view.camera, np.asarray(grey, np.uint8), inside)
 
 

@@ -19,7 +19,7 @@ from gsbake.monitor import SILENT, Monitor
 from gsbake.mvs.depth_maps import DepthMap
 from gsbake.mvs.matching import StereoRun
 from gsbake.mvs.mirror_images import without_mirror_images
-from gsbake.mvs.outliers import find_outliers, remove_outliers
+from gsbake.mvs.outliers import find_outliers, without_points
 from gsbake.mvs.point_cloud import StereoCloud
 from gsbake.mvs.pyramids import single_threaded_opencv
 
@@ -119,14 +119,16 @@ def _without_mirror_images(maps: list[DepthMap], hull: Hull, softness: NDArray[n
 
 
 def _fuse(run: StereoRun, maps: list[DepthMap], hull: Hull | None, monitor: Monitor) -> tuple[StereoCloud, list[DepthMap]]:
-    """The fused cloud and the depth maps, without outlier components."""
+    """The fused cloud and the depth maps, without what lies outside the region, and without outlier components."""
     cloud = run.fuse(maps)
+    if (region := run.posed.region) is not None:
+        cloud, maps = cloud.select(region.contains(cloud.points)), [without_points(one, lambda p: region.distance(p) > 0) for one in maps]
     outliers = find_outliers(cloud, hull)
     if not outliers.points:
         return cloud, maps
     evidence = "components too small, or isolated and deep inside the hull (mirror images)"
     monitor.decide("outlier components", f"{outliers.points} points removed", evidence)
-    return cloud.select(~outliers.contains(cloud.points)), [remove_outliers(one, outliers) for one in maps]
+    return cloud.select(~outliers.contains(cloud.points)), [without_points(one, outliers.contains) for one in maps]
 
 
 def _carve(run: StereoRun, softness: NDArray[np.float32], out: Path, monitor: Monitor) -> None:

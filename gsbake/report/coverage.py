@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from gsbake.errors import BadInputError
 from gsbake.geometry.cameras import Camera
 from gsbake.geometry.raycast import RayCaster
+from gsbake.geometry.region import EDGES, Region
 from gsbake.imaging.exr import read_exr
 from gsbake.report.render import Asset
 
@@ -105,9 +106,11 @@ def in_words(direction: Array) -> str:
 
 
 def map_json(
-    asset: Asset, cameras: Sequence[Camera], points: SurfacePoints | None, psnr: dict[str, float], proposed: Sequence[tuple[Array, float]]
-) -> str:
-    """What the page draws, as JSON: the surface, unseen parts of it, cameras with their PSNR, weak ones, and proposed directions."""
+    asset: Asset, cameras: Sequence[Camera], points: SurfacePoints | None, psnr: dict[str, float], proposed: Sequence[tuple[Array, float]],
+    region: Region | None = None,
+) -> str:  # fmt: skip
+    """What the page draws, as JSON: the surface, unseen parts of it, cameras with their PSNR, weak ones, proposed directions, and the edges
+    of the region."""
     mean = sum(psnr.values()) / len(psnr) if psnr else 0.0
     centre, radius = asset.centre, max(asset.radius, 1e-30)
 
@@ -123,5 +126,6 @@ def map_json(
         towards = [round(float(x), 4) for x in camera.view_direction]
         views.append({"name": camera.name, "at": place(camera.centre), "to": towards, "psnr": value, "weak": weak})
     new = [{"at": [round(2.5 * float(x), 4) for x in d], "share": round(share, 3)} for d, share in proposed]
-    text = json.dumps({"surface": surface, "cameras": views, "proposed": new}, separators=(",", ":"))
+    box = [] if region is None else [[place(region.corners[end]) for end in edge] for edge in EDGES]
+    text = json.dumps({"surface": surface, "cameras": views, "proposed": new, "region": box}, separators=(",", ":"))
     return text.replace("<", "\\u003c")  # a photo's name must not close the script element

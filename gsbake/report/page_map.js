@@ -38,6 +38,16 @@
       c.stroke();
       dot(p, (camera.weak ? 9 : 6) * ratio);
     }
+    c.strokeStyle = colour("--soft");
+    c.lineWidth = ratio;
+    for (const [a, b] of data.region) {
+      const [p, q] = [project(a), project(b)];
+      c.beginPath();
+      c.moveTo(p[0], p[1]);
+      c.lineTo(q[0], q[1]);
+      c.stroke();
+    }
+    c.lineWidth = 1.5 * ratio;
     c.strokeStyle = c.fillStyle = colour("--warn");
     c.font = `${12 * ratio}px sans-serif`;
     data.proposed.forEach((place, k) => {

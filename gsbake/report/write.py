@@ -26,6 +26,7 @@ from gsbake.report.quality import select_views
 from gsbake.report.render import Asset, Renderer
 from gsbake.report.sheets import map_panels
 from gsbake.shading.light_motion import LightMotion
+from gsbake.targets.build import frame_between
 from gsbake.text import number
 
 #: Bytes of the page, which mail and messengers still take; the asset's images in it are stored in fewer where it would exceed them.
@@ -134,7 +135,8 @@ class _ReportWriter:
             proposed = () if points is None else coverage.proposals(points, renderer.caster, asset.radius)
             by_name = {s.name: s.metrics.psnr for s in scored}
             named = [replace(camera, name=own.name) for camera, own in zip(cameras, posed.cameras.cameras, strict=True)]
-            drawn = coverage.map_json(asset, named, points, by_name, proposed)
+            region = None if posed.region is None else posed.region.moved(frame_between(posed.cameras.cameras, tuple(cameras)))
+            drawn = coverage.map_json(asset, named, points, by_name, proposed, region)
             places = tuple(f"{coverage.in_words(d)} ({share:.0%} of it)" for d, share in proposed)
         panoramas = () if learnt is None else (compose.panorama(learnt),)
         return _Renders(asset, posed, scored, held, learnt is not None, relit, lights, panoramas, drawn, places)

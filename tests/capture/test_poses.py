@@ -112,6 +112,53 @@ def test_the_same_bytes_with_any_number_of_threads(tmp_path: Path, runner: Runne
     assert digests[0] == digests[1] and digests[0] == digests[2]
 
 
+def metashape(folder: Path, cameras: list[Camera], region: str) -> None:
+    """The file that Metashape writes of these cameras."""
+    c = cameras[0]
+    inner = f'<resolution width="{c.width}" height="{c.height}"/><f>{c.fx}</f><cx>{c.cx - c.width / 2}</cx><cy>{c.cy - c.height / 2}</cy>'
+    entries = []
+    for camera in cameras:
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = camera.R.T, camera.centre
+        text = " ".join(map(repr, pose.ravel().tolist()))
+        entries.append(f'<camera label="{camera.name}" sensor_id="0"><transform>{text}</transform></camera>')
+    (folder / "cameras.xml").write_text(
+        f'<document version="1.5.0"><chunk><sensors><sensor id="0" type="frame"><calibration type="frame" class="adjusted">{inner}'
+        f"</calibration></sensor></sensors><cameras>{''.join(entries)}</cameras>{region}</chunk></document>"
+    )
+
+
+@pytest.mark.parametrize("masked", [True, False])
+def test_only_the_region_is_kept(tmp_path: Path, runner: Runner, masked: bool) -> None:
+    """Metashape's region around the board's right half: masks show no more of it, tie points lie in it, and it gives the frame."""
+    true = board_capture(tmp_path / "cap")
+    metashape(tmp_path / "cap", true, "<region><center>.5 0 .4</center><size>1 2 .3</size><R>1 0 0 0 1 0 0 0 1</R></region>")
+    if masked:
+        (tmp_path / "cap/masks").mkdir()
+        for camera in true:
+            Image.fromarray(np.full((camera.height, camera.width), 255, np.uint8)).save(tmp_path / "cap/masks" / f"{camera.name}.png")
+    runner.ingest(tmp_path / "cap", poses=tmp_path / "cap/cameras.xml")
+    results, done = runner.poses(max_features=1000)
+    posed = PosedPhotos.open(done.out)
+    region, to_world = posed.region, posed.cameras.to_world
+    assert region is not None and done.decisions["region"][0] == "from the file of the cameras"
+    assert json.loads((done.out / "region.json").read_text())["size"] == [1, 2, 0.3]
+    cloud = posed.points()
+    assert cloud is not None and region.contains(cloud[0]).all() and 0 <= to_world.apply(cloud[0])[:, 0].min() < 0.2
+    _, mask = posed.mask(3)
+    if masked:
+        assert mask is not None and np.array_equal(mask, region.silhouette(posed.cameras.cameras[3])) and 0 < (mask > 0).mean() < 0.6
+    else:
+        assert mask is None and np.allclose(results["centre"], [0.5, 0, 0.4]) and results["radius"] == pytest.approx(np.sqrt(5.09) / 2)
+    box = (0.5, 0.0, 0.4, 0.5, 0.5, 0.5, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
+    _, other = runner.poses(out="by hand", max_features=1000, region_box=box)
+    assert other.decisions["region"][0] == "set by --region" and '"size": [0.5, 0.5, 0.5]' in other.decisions["region"][1]
+    _, whole = runner.poses(out="whole", max_features=1000, region="none")
+    assert not (whole.out / "region.json").exists() and whole.decisions["region"][0] == "none"
+    with pytest.raises(BadInputError, match="the region lies in no photo"):
+        runner.poses(out="beside", max_features=1000, region_box=(50.0, *box[1:]))
+
+
 def test_given_poses_keep_their_frame_and_points_are_triangulated(tmp_path: Path, runner: Runner) -> None:
     true = board_capture(tmp_path / "cap")
     transforms(tmp_path / "cap", true)

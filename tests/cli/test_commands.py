@@ -236,6 +236,22 @@ def test_invert_masks_is_a_setting(run: Run, capture: Path, tmp_path: Path) -> N
     assert next((tmp_path / "o").glob("stages/ingest/*/photos.json")).read_text().endswith("TrueTrue")
 
 
+def test_the_region_is_a_setting(run: Run, capture: Path, tmp_path: Path) -> None:
+    (tmp_path / "box.json").write_text('{"centre": [0, 1, 2], "size": [1, 2, 3]}')
+
+    def stored(*words: object) -> list[str]:
+        assert run("run", capture, "--out", "o", *words).code == 0
+        found: list[str] = json.loads((tmp_path / "o" / "project.json").read_text())["overrides"]
+        return found
+
+    box = "poses.region_box=[0.0, 1.0, 2.0, 1.0, 2.0, 3.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]"
+    assert stored("--region", "box.json") == ["poses.region=auto", box]
+    assert stored("--region", "none") == ["poses.region=none", "poses.region_box=[]"]
+    (tmp_path / "box.json").write_text('{"centre": [0, 1, 2]}')
+    end = run("run", capture, "--region", "box.json")
+    assert end.code == 42 and end.err.count("\n") == 1 and "'box.json' is no region" in end.err
+
+
 def test_masks_none_and_auto_are_settings(run: Run, capture: Path, tmp_path: Path) -> None:
     (tmp_path / "none").mkdir()
     for choice, setting in (("none", "ignore"), ("auto", "auto")):

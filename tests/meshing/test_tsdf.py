@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from gsbake.geometry.region import Region
 from gsbake.meshing import cleanup as clean
 from gsbake.meshing.depth_views import DepthView
 from gsbake.meshing.tsdf import SparseTsdf
@@ -27,8 +28,8 @@ def views_of(shape: Shape, cameras: list, noise: float = 0.0, masks: bool = True
     return out
 
 
-def fuse(views: list[DepthView], cell: float = CELL, close: bool = True, empty_outside: bool = True) -> tuple:
-    field = SparseTsdf([-1.1] * 3, [1.1] * 3, cell, 4 * cell, ball=1.05, empty_outside=empty_outside)
+def fuse(views: list[DepthView], cell: float = CELL, close: bool = True, empty_outside: bool = True, region: Region | None = None) -> tuple:
+    field = SparseTsdf([-1.1] * 3, [1.1] * 3, cell, 4 * cell, ball=1.05, empty_outside=empty_outside, region=region)
     for view in views:
         field.fuse_coarse(view)
     field.allocate()
@@ -45,6 +46,15 @@ def test_exact_depth_reconstructs_the_shape(shape: Shape) -> None:
     assert abs(off.mean()) < 0.04  # no bias
     found = clean.topology(vertices, faces)
     assert found.watertight and found.components == 1
+
+
+def test_the_shape_ends_at_the_region_in_a_flat_face() -> None:
+    turn = np.array([[0.8, -0.6, 0.0], [0.6, 0.8, 0.0], [0.0, 0.0, 1.0]])
+    region = Region(turn @ [-0.8, 0.0, 0.0], np.array([2.0, 3, 3]), turn)
+    vertices, faces, _ = fuse(views_of(sphere, cameras_around()), region=region)
+    assert region.distance(vertices).max() < 0.1 * CELL and clean.topology(vertices, faces).watertight
+    assert ((vertices @ turn)[:, 0] > 0.2 - 0.1 * CELL).sum() > 50  # the cut is closed
+    assert np.abs(sphere(vertices[region.distance(vertices) < -2 * CELL])).mean() < 0.06 * CELL
 
 
 @pytest.mark.slow

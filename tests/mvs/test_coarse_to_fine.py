@@ -10,7 +10,7 @@ from gsbake.mvs.consistency import check_consistency
 from gsbake.mvs.depth_bounds import depth_bounds, seed_depths
 from gsbake.mvs.depth_maps import DepthMap, consistent_pixels, filter_depth_map, inverse_depth, matched_pixels, read_depth
 from gsbake.mvs.fusion import fuse
-from gsbake.mvs.outliers import find_outliers, remove_outliers
+from gsbake.mvs.outliers import find_outliers, without_points
 from gsbake.mvs.point_cloud import StereoCloud
 from tests.mvs.scenes import RADIUS, arc, sphere_depth, sphere_photos
 
@@ -167,7 +167,7 @@ def test_isolated_component_deep_inside_the_hull_is_removed(scene) -> None:
     field = (np.linalg.norm(grid, axis=-1) - RADIUS).astype(np.float32)
     hull = Hull(field < 0, np.full(3, -1.1), 2.2 / n, field)
     outliers = find_outliers(cloud, hull)
-    kept = remove_outliers(one, outliers)
+    kept = without_points(one, outliers.contains)
     assert 120 <= outliers.points < 126 and (kept.confidence[90:100, 100:112] == 0).all()
     assert (kept.confidence > 0).sum() == (depth > 0).sum() - outliers.points
     assert find_outliers(cloud, None).points < 6  # without a hull only tiny components are removed

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +16,7 @@ from gsbake.capture.posed_photos import PosedPhotos
 from gsbake.config.schema import Profile, Stereo
 from gsbake.errors import InterruptedRun
 from gsbake.geometry.cameras import CameraSet
+from gsbake.geometry.region import Region
 from gsbake.mvs.depth_maps import read_depth
 from gsbake.mvs.initial_points import in_free_space, initial_points, voxel_downsample
 from gsbake.mvs.point_cloud import StereoCloud
@@ -52,6 +55,24 @@ def poses(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def done(poses: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
     out = tmp_path_factory.mktemp("done") / "out"
     return out, run(poses, out)
+
+
+def test_nothing_is_matched_outside_the_region(poses: Path, done: tuple[Path, dict[str, Any]], tmp_path: Path) -> None:
+    """The upper half of the ball: all points and depths lie there, and fewer pixels are matched."""
+    shutil.copytree(poses, tmp_path / "poses")
+    region = Region(np.array([0.0, 0, 1]), np.array([4.0, 4, 2]), np.eye(3))
+    (tmp_path / "poses/region.json").write_text(json.dumps(region.document))
+    out = tmp_path / "out"
+    results = run(tmp_path / "poses", out)
+    cloud = StereoCloud.load(out / "points.ply")
+    whole = StereoCloud.load(done[0] / "points.ply")
+    assert 200 < len(cloud) < len(whole) and cloud.points[:, 2].min() >= 0 > whole.points[:, 2].min()
+    assert results["pixels"] < 0.97 * done[1]["pixels"]
+    camera = next(c for c in CAMERAS if (out / "depth" / f"{c.name}.npz").exists())
+    camera = camera.downscaled_to(max(read_depth(out / "depth" / f"{camera.name}.npz")[0].shape))
+    depth, _ = read_depth(out / "depth" / f"{camera.name}.npz")
+    points = camera.centre + (depth[..., None] * camera.rays())[depth > 0]
+    assert len(points) and points[:, 2].min() > -1e-6
 
 
 def test_files_and_figures(done: tuple[Path, dict[str, Any]]) -> None:

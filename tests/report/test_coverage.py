@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from gsbake.geometry.raycast import RayCaster
+from gsbake.geometry.region import Region
 from gsbake.imaging.exr import write_exr
 from gsbake.report.advice import advice
 from gsbake.report.coverage import SurfacePoints, in_words, map_json, proposals, surface_points
@@ -74,6 +75,10 @@ def test_the_map_marks_weak_views_and_cannot_leave_its_element(asset: Asset) -> 
     body = json.loads(text)
     assert "<" not in text and [c["weak"] for c in body["cameras"]] == [True, False, False]
     assert body["cameras"][2]["psnr"] is None and body["cameras"][1]["name"] == "</script>b"
+    assert body["region"] == []
+    box = Region(asset.centre, 2 * asset.radius * np.array([1.0, 2, 3]), np.eye(3))
+    edges = np.array(json.loads(map_json(asset, cameras, None, {}, [], box))["region"])
+    assert edges.shape == (12, 2, 3) and np.allclose(np.abs(edges), [1, 2, 3]) and np.allclose((edges[:, 0] != edges[:, 1]).sum(1), 1)
     assert body["proposed"] == [{"at": [0.0, -2.5, 0.0], "share": 0.5}] and len(body["surface"]) == 800
 
 

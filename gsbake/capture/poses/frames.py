@@ -14,6 +14,7 @@ import numpy as np
 from gsbake.capture.poses.validation import MAX_COORDINATE, ImportedCamera, validate
 from gsbake.errors import BadInputError
 from gsbake.geometry.cameras import Array, Camera
+from gsbake.geometry.region import Region
 from gsbake.text import shortlist
 
 #: Largest deviation of RᵀR from the identity that is attributed to rounding in a text file.
@@ -34,13 +35,14 @@ class GivenPoses:
     """Poses supplied by the user, in the frame of their file.
 
     `cameras` by the photo's path inside the photo folder, at the size of the upright source photo; `missing` frames without a photo;
-    `points` (n, 3) and `colours` (n, 3) 8-bit when the file has them.
+    `points` (n, 3) and `colours` (n, 3) 8-bit, and the `region` to be baked, when the file has them.
     """
 
     cameras: dict[str, Camera]
     missing: tuple[str, ...] = ()
     points: Array | None = None
     colours: Array | None = None
+    region: Region | None = None
 
 
 def checked_rigid(rotation: Array, translation: Array, frame: str, source: str) -> tuple[Array, Array]:

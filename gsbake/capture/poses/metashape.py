@@ -9,7 +9,7 @@ A point (X, Y, Z) of a camera's frame (x right, y down, z forward) with x = X/Z,
 which is OpenCV's model with p1 and p2 exchanged. Files up to version 1.1 have fx, fy and the principal point from the corner instead. The
 matrix of a camera leads from its frame to that of its chunk; cameras without one are not aligned. A fourth radial coefficient, skew b2, and
 fisheye or spherical cameras are refused: Metashape's *Undistort Photos* removes them. Where the chunk has a scale, coordinates are
-multiplied by it (metres, where scale bars were set).
+multiplied by it (metres, where scale bars were set). The chunk's region, a box in its frame, is read too.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ from gsbake.capture.poses.frames import GivenPoses, PhotoSize, checked_rigid, ma
 from gsbake.capture.poses.validation import MAX_FRAMES, read_xml, refuse_coefficient
 from gsbake.errors import BadInputError
 from gsbake.geometry.cameras import Camera
+from gsbake.geometry.region import Region
 
 
 def read_metashape(path: Path, sizes: Mapping[str, PhotoSize]) -> GivenPoses:
@@ -57,7 +58,7 @@ def read_metashape(path: Path, sizes: Mapping[str, PhotoSize]) -> GivenPoses:
     if not frames:
         raise BadInputError(f"{path} holds no aligned camera; align the photos in Metashape and export the cameras as Agisoft XML.")
     cameras, missing = match_cameras(frames, sizes, str(path))
-    return GivenPoses(cameras, missing)
+    return GivenPoses(cameras, missing, region=_region(document, scale, path))
 
 
 def _parse(path: Path) -> ElementTree.Element:
@@ -65,6 +66,20 @@ def _parse(path: Path) -> ElementTree.Element:
     if document.tag != "document" or document.find("chunk") is None:
         raise BadInputError(f"{path} is no file of Metashape cameras; export the cameras as Agisoft XML.")
     return document
+
+
+def _region(document: ElementTree.Element, scale: float, path: Path) -> Region | None:
+    """The box of the chunk's region; None without one."""
+    found = document.find("chunk/region")
+    if found is None:
+        return None
+    try:
+        parts = [np.array(found.findtext(name, "").split(), float) for name in ("center", "size", "R")]
+    except ValueError as error:
+        raise BadInputError(f"The region in {path} holds other things than numbers; export the cameras again.") from error
+    if [len(part) for part in parts] != [3, 3, 9]:
+        raise BadInputError(f"The region in {path} is not a centre, a size and a rotation; export the cameras again.")
+    return Region.of(np.concatenate([scale * parts[0], scale * parts[1], parts[2]]).tolist(), str(path))
 
 
 def _intrinsics(sensor: ElementTree.Element, name: str, path: Path) -> dict[str, Any]:

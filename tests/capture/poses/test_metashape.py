@@ -67,6 +67,20 @@ def test_old_files_have_the_principal_point_from_the_corner(tmp_path: Path) -> N
     assert (camera.fx, camera.fy, camera.cx, camera.cy, camera.distortion) == (700, 701, 306, 196, ())
 
 
+def test_the_region_of_the_chunk_is_read_in_its_units(tmp_path: Path) -> None:
+    more = (
+        "<transform><scale>2</scale></transform>"
+        "<region><center>1 2 3</center><size>.5 1 2</size><R>0 -1 0 1 0 0 0 0 1</R></region>"
+    )  # fmt: skip
+    region = read(tmp_path, document(scale=more)).region
+    assert region is not None and region.centre.tolist() == [2, 4, 6] and region.size.tolist() == [1, 2, 4]
+    assert region.contains(np.array([[2 + 0.9, 4 + 0.4, 6 + 1.9], [2 + 0.4, 4 + 0.9, 6]])).tolist() == [True, False]
+    assert read(tmp_path, document()).region is None
+    for wrong, message in (("1 2", "not a centre"), ("1 2 x", "other things"), ("1 2 0", "is no box")):
+        with pytest.raises(BadInputError, match=message):
+            read(tmp_path, document(scale=more.replace(".5 1 2", wrong)))
+
+
 def test_the_scale_of_the_chunk_gives_metres(tmp_path: Path) -> None:
     """Scale bars: coordinates times the chunk's scale."""
     camera = read(tmp_path, document(scale="<transform><scale>0.5</scale></transform>")).cameras["a.jpg"]
