@@ -93,6 +93,12 @@ class Region:
         """Which points (..., 3) lie in the box."""
         return np.asarray(self.distance(points) <= 0)
 
+    def clamped(self, points: Array) -> Array:
+        """The nearest points (n, 3) of the box to points (n, 3)."""
+        local = (points - self.centre) @ self.rotation
+        inside = np.clip(local, -self.size / 2, self.size / 2)
+        return np.asarray(np.where((inside == local).all(-1, keepdims=True), points, self.centre + inside @ self.rotation.T))
+
     def silhouette(self, camera: Camera) -> NDArray[np.uint8]:
         """Pixels (h, w) of a pinhole camera that show the box, 255, and others, 0; all where the box lies beside the camera."""
         import cv2

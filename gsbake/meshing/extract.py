@@ -159,6 +159,8 @@ class _Extraction:
             vertices, refinement = self._refine_shape(vertices, faces, resolution.cell)
         with self.monitor.part("denoising"):
             vertices = denoise(vertices, faces, self.options.mesh.denoising_iterations)
+        if (region := self.posed.region) is not None:
+            vertices = region.clamped(vertices)  # silhouettes draw the faces of the cut outwards
         with self.monitor.part("untangling"):
             vertices, faces = untangle(vertices, faces, start)
             vertices, faces, cut_off = cleanup.remove_small_components(vertices, faces, self.options.mesh.min_component)

@@ -24,6 +24,8 @@ def test_what_lies_in_a_turned_box() -> None:
     assert np.array_equal(BOX.contains(points), inside) and 10 < inside.sum() < 400
     nearest = np.clip(local, -BOX.size / 2, BOX.size / 2)
     np.testing.assert_allclose(BOX.distance(points)[~inside], np.linalg.norm(local - nearest, axis=1)[~inside])
+    np.testing.assert_allclose(BOX.clamped(points), BOX.centre + nearest @ TURN.T)
+    assert np.array_equal(BOX.clamped(points)[inside], points[inside])
     assert BOX.distance(BOX.centre) == pytest.approx(-0.2)  # half the shortest edge
     frame = Similarity(2.5, TURN.T, np.array([1.0, 2, 3]))
     assert np.array_equal(BOX.moved(frame).contains(frame.apply(points)), inside)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +16,7 @@ import trimesh
 from gsbake.config.schema import Mesh
 from gsbake.errors import BadInputError
 from gsbake.geometry.cameras import Array, CameraSet
+from gsbake.geometry.region import Region
 from gsbake.meshing.extract import MeshOptions, evenly, extract_mesh
 from gsbake.surfels.model import create
 from tests.meshing.scenes import cameras_around, gradient, torus, trace
@@ -124,6 +127,19 @@ def test_without_masks_the_table_is_removed(tmp_path: Path, support: str) -> Non
     assert max_radius == pytest.approx(0.77, abs=2 * results["cell"])
     assert mesh.bounds[0][2] == pytest.approx(floor, abs=results["cell"])
     assert mesh.bounds[1][2] == pytest.approx(0.22, abs=results["cell"])
+
+
+def test_the_mesh_ends_at_the_region(capture: Path, tmp_path: Path) -> None:
+    """Half of the torus: closed by flat faces, though silhouettes draw these outwards."""
+    shutil.copytree(capture, tmp_path / "half")
+    region = Region(np.array([1.0, 0, 0]), np.array([2.0, 3, 3]), np.eye(3))
+    (tmp_path / "half/poses/region.json").write_text(json.dumps(region.document))
+    out = tmp_path / "out"
+    results = run(tmp_path / "half", out, faces=2000, max_resolution=60)
+    dense, low = (trimesh.load(out / name, process=False) for name in ("dense.ply", "mesh.ply"))
+    for mesh in (dense, low):
+        assert region.distance(np.asarray(mesh.vertices)).max() < 0.25 * results["cell"]
+        assert mesh.is_watertight and mesh.volume == pytest.approx(np.pi**2 * 0.55 * 0.22**2, rel=0.1)
 
 
 def test_no_surfels_is_bad_input(capture: Path, tmp_path: Path) -> None:
