@@ -23,6 +23,7 @@ from gsbake.capture.photos.quality import find_blurred, find_near_duplicates
 from gsbake.capture.photos.reader_pool import ReaderPool
 from gsbake.capture.photos.sharpness import detect_oversampling
 from gsbake.capture.photos.video_process import extract_frames
+from gsbake.capture.poses.frame_masks import frame_masks, masks_by_photo
 from gsbake.capture.poses.frames import GivenPoses, PhotoSize
 from gsbake.capture.poses.given import read_poses
 from gsbake.capture.sources import is_video, list_photos
@@ -33,7 +34,7 @@ from gsbake.geometry.ply import write_cloud
 from gsbake.imaging.png import write_png
 from gsbake.monitor import SILENT, Monitor, Rule, decide_skip
 from gsbake.system.names import portable_name, same_file_key
-from gsbake.text import shortlist
+from gsbake.text import missing_list, shortlist
 
 #: Folder of the frames of a video, while they are read.
 FRAMES = "frames"
@@ -92,7 +93,7 @@ class _Ingestion:
         paths = {path.relative_to(self.folder).as_posix(): path for path in list_photos(self.folder)}
         names = photo_names(paths)
         use_masks = settings.masks != "ignore"
-        masks = match_masks(self.mask_folder, paths) if use_masks and self.mask_folder is not None else {}
+        masks = self._match_masks(paths) if use_masks else {}
         with self.monitor.part("duplicates"):
             self._skip_identical_files(paths)
         with self.monitor.part("photos"):
@@ -125,6 +126,14 @@ class _Ingestion:
             "megapixels": sum(e["width"] * e["height"] for e in entries) / 1e6,
             **results,
         }
+
+    def _match_masks(self, paths: dict[str, Path]) -> dict[str, Path]:
+        """Mask files by photo: those that frames of the poses name, and those of the mask folder."""
+        by_frame = frame_masks(self.poses)
+        named = masks_by_photo(by_frame, self.mask_folder, paths, self.poses) if self.poses is not None else {}
+        if by_frame and not named:
+            self.monitor.decide("mask_path", "not used", f"{len(by_frame)} frames name a mask; other masks were given")
+        return named if self.mask_folder is None else match_masks(self.mask_folder, paths, named)
 
     @property
     def _entries(self) -> list[dict[str, Any]]:
@@ -208,14 +217,14 @@ class _Ingestion:
         count = total - len(without)
         if without and setting == "require":
             raise BadInputError(
-                f"{len(without)} of {total} photos have no mask ({shortlist(without)}), but ingest.masks is require; "
+                f"{len(without)} of {total} photos have no mask ({missing_list(without)}), but ingest.masks is require; "
                 "give them masks or set it to auto."
             )
         files = sum(relative in masks for relative in self.read)
         given = f"{count} of {total} photos have one: {files} mask files, {count - files} alpha channels" if count else "no photo has one"
         self.monitor.decide("masks", "used" if count else "none", "set by the profile" if setting == "ignore" else given)
         if count and without and not self._makes_masks:
-            self.monitor.warn(f"{len(without)} of {total} photos have no mask ({shortlist(without)}); give every photo one.")
+            self.monitor.warn(f"{len(without)} of {total} photos have no mask ({missing_list(without)}); give every photo one.")
 
     @property
     def _makes_masks(self) -> bool:
@@ -274,10 +283,12 @@ class _Ingestion:
             if given.points is not None:
                 write_cloud(folder / "points.ply", given.points, given.colours if given.colours is not None else given.points * 0)
         without = [photo.entry["name"] for relative, photo in self.read.items() if relative not in given.cameras]
+        for note in given.notes:
+            self.monitor.decide(*note)
         if without:
-            self.monitor.warn(f"{len(without)} photos have no pose in {path.name} ({shortlist(without)}) and will not be used.")
+            self.monitor.warn(f"{len(without)} photos have no pose in {path.name} ({missing_list(without)}) and will not be used.")
         if given.missing:
-            self.monitor.warn(f"{len(given.missing)} frames of {path.name} have no photo ({shortlist(list(given.missing))}).")
+            self.monitor.warn(f"{len(given.missing)} frames of {path.name} have no photo ({missing_list(list(given.missing))}).")
         self.monitor.decide("given poses", f"{len(cameras)} of {len(self.read)} photos", path.name)
         return {"poses": path.name, "posed": len(cameras), "frames_without_photo": len(given.missing)}
 

@@ -63,7 +63,7 @@ def test_transforms_angle_suffixless_and_frame_wins(tmp_path: Path) -> None:
     [
         ({"at": (0, 3), "value": float("nan")}, r"Frame 1: .*finite number"),
         ({"at": (1, 1), "value": float("inf")}, r"Frame 1: .*finite number"),
-        ({"scale": 2.0}, r"images/a\.jpg.*no rigid"),
+        ({"scale": (1.0, 1.0, 2.0)}, r"images/a\.jpg.*no rigid"),
         ({"mirror": True}, r"images/a\.jpg.*no rigid"),
         ({"at": (3, 3), "value": 2.0}, r"images/a\.jpg.*last row"),
     ],
