@@ -97,11 +97,11 @@ def test_folders_with_equal_names_keep_their_poses_intrinsics_and_masks(tmp_path
 
 def test_masks_that_frames_name(tmp_path: Path, runner: Runner) -> None:
     """Names of their own, in two folders; a folder `masks` with other masks is not used."""
-    names = write_masks(tmp_path, ["matte/f/one.png", "matte/f/two.png", "matte/b/one.png", "matte/b/two.png"])
+    names = write_masks(tmp_path, ["cut/f/one.png", "cut/f/two.png", "cut/b/one.png", "cut/b/two.png"])
     write_masks(tmp_path, [f"masks/{name.removesuffix('.JPG')}.png" for name in reversed(FILES)])
     slashes = [*names[:3], names[3].replace("/", "\\")]
     capture(tmp_path, [frame(camera, mask_path=name) for camera, name in zip(cameras(), slashes, strict=True)])
-    assert discover(tmp_path).masks == tmp_path / "matte"  # its files are part of the key
+    assert discover(tmp_path).masks == tmp_path / "cut"  # its files are part of the key
     results, done = runner.ingest(tmp_path)
     assert results["masks"] == 4
     for k, camera in enumerate(cameras()):
@@ -129,12 +129,12 @@ def test_masks_given_otherwise_win(tmp_path: Path, runner: Runner) -> None:
 
 
 def test_missing_masks_are_listed(tmp_path: Path, runner: Runner) -> None:
-    write_masks(tmp_path, ["matte/0.png"])
-    capture(tmp_path, [frame(camera, mask_path=f"matte/{k}.png") for k, camera in enumerate(cameras())])
-    words = r"3 masks that .*transforms\.json names do not exist \(matte/1\.png, matte/2\.png, matte/3\.png\); .*--masks none"
+    write_masks(tmp_path, ["cut/0.png"])
+    capture(tmp_path, [frame(camera, mask_path=f"cut/{k}.png") for k, camera in enumerate(cameras())])
+    words = r"3 masks that .*transforms\.json names do not exist \(cut/1\.png, cut/2\.png, cut/3\.png\); .*--masks none"
     with pytest.raises(BadInputError, match=words):
         runner.ingest(tmp_path)
-    (tmp_path / "matte" / "0.png").unlink()
+    (tmp_path / "cut" / "0.png").unlink()
     with pytest.raises(BadInputError, match="4 masks that"):
         Runner(tmp_path / "again").ingest(tmp_path)
 
