@@ -19,6 +19,7 @@ from gsbake.capture.masks.saliency import SaliencyNetwork
 from gsbake.capture.masks.weights import INSTALL, WEIGHTS, resolve_network
 from gsbake.capture.photos.conversion import Conversion, ConvertedPhoto
 from gsbake.capture.photos.decode import RawPhoto, UnreadablePhotoError, to_working_size
+from gsbake.capture.photos.exif import is_recropped
 from gsbake.capture.photos.quality import find_blurred, find_near_duplicates
 from gsbake.capture.photos.reader_pool import ReaderPool
 from gsbake.capture.photos.sharpness import detect_oversampling
@@ -38,6 +39,8 @@ from gsbake.text import missing_list, shortlist
 
 #: Folder of the frames of a video, while they are read.
 FRAMES = "frames"
+#: Share of the pixels of the largest photo of a camera below which another is taken for a crop.
+MIN_SAME_SIZE = 0.98
 #: Most processes that read photos.
 MAX_READERS = 8
 
@@ -106,6 +109,7 @@ class _Ingestion:
                 "take more photos from all sides of the object."
             )
         self._report_quality()
+        self._report_crops()
         self._report_masks(masks)
         with self.monitor.part("resolution"):
             self._reduce_resolution()
@@ -210,6 +214,28 @@ class _Ingestion:
             names = shortlist([entries[i]["name"] for i in outliers])
             self.monitor.warn(f"{len(outliers)} photos are much more blurred than the rest ({names}).")
 
+    def _report_crops(self) -> None:
+        """Warn about photos that were cropped after their camera wrote EXIF, and take no focal length from it.
+
+        A crop of the same aspect ratio looks like a reduced photo, unless others of its camera were not reduced as much.
+        """
+        largest: dict[tuple[Any, ...], int] = {}
+        for entry in self._entries:
+            largest[_written(entry)] = max(largest.get(_written(entry), 0), entry["source_width"] * entry["source_height"])
+        cropped = []
+        for entry in self._entries:
+            size = entry["source_width"], entry["source_height"]
+            if entry["written_size"] and (
+                is_recropped(entry["written_size"], size) or size[0] * size[1] < MIN_SAME_SIZE * largest[_written(entry)]
+            ):
+                cropped.append(entry["name"])
+                entry["focal_px"] = None
+        if cropped:
+            self.monitor.warn(
+                f"{len(cropped)} photos seem cropped, for EXIF tells of more of the picture ({missing_list(cropped)}); poses are better "
+                "from whole photos."
+            )
+
     def _report_masks(self, masks: dict[str, Path]) -> None:
         """Report how many photos have masks, and their sources. Raises BadInputError when required masks are missing."""
         setting, total = self.options.ingest.masks, len(self.read)
@@ -291,6 +317,11 @@ class _Ingestion:
             self.monitor.warn(f"{len(given.missing)} frames of {path.name} have no photo ({missing_list(list(given.missing))}).")
         self.monitor.decide("given poses", f"{len(cameras)} of {len(self.read)} photos", path.name)
         return {"poses": path.name, "posed": len(cameras), "frames_without_photo": len(given.missing)}
+
+
+def _written(entry: dict[str, Any]) -> tuple[Any, ...]:
+    """Camera and the size that it wrote: photos in which both are equal were the same size."""
+    return entry["camera_model"], entry["camera_body"], *(entry["written_size"] or ())
 
 
 def _size(photo: ConvertedPhoto) -> PhotoSize:
