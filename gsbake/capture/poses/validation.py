@@ -146,10 +146,15 @@ def validate(model: type[Strict], values: Any, what: str) -> Any:
 
 
 def listed_errors(error: ValidationError) -> str:
-    """The errors of a validation, each as "field: reason", up to ten, then their number."""
+    """The errors of a validation as text, up to ten, then their number."""
+    return missing_list(error_lines(error))
+
+
+def error_lines(error: ValidationError) -> list[str]:
+    """The errors of a validation, each as "field: reason"."""
     lines = []
     for found in error.errors(include_url=False, include_context=False, include_input=False):
         where = ".".join(map(str, found["loc"]))[:MAX_FIELD_NAME]
         reason = found["msg"][:1].lower() + found["msg"][1:]
         lines.append(f"{where}: {reason}" if where else reason)
-    return missing_list(lines)
+    return lines

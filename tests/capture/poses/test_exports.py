@@ -154,3 +154,15 @@ def test_depths_of_frames_are_said_to_be_unused(tmp_path: Path, runner: Runner) 
     capture(tmp_path, [frames[0] | {"depth_file_path": "depth/a.png"}, frames[1] | {"depth_file_path": 7}, *frames[2:]])
     _, done = runner.ingest(tmp_path)
     assert done.line("depth_file_path").startswith("not used (2 frames of transforms.json have one; depth maps are read from")
+
+
+def test_masks_and_photos_that_are_missing_are_listed_up_to_ten(tmp_path: Path, runner: Runner) -> None:
+    frames = [frame(camera) for camera in cameras()]
+    capture(tmp_path, [*frames[:3], *(frames[0] | {"file_path": f"images/gone{k:02}.jpg"} for k in range(12))])
+    _, done = runner.ingest(tmp_path)
+    lost = ", ".join(f"images/gone{k:02}.jpg" for k in range(10))
+    assert f"12 frames of transforms.json have no photo ({lost} and 2 more)." in done.warnings
+    assert "1 photos have no pose in transforms.json (back_000002) and will not be used." in done.warnings
+    write_masks(tmp_path, [f"masks/{k:02}.png" for k in range(12)])
+    with pytest.raises(BadInputError, match=r"no photo belongs to 00\.png, .*09\.png and 2 more; name masks"):
+        Runner(tmp_path / "again").ingest(tmp_path)
