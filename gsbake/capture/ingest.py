@@ -110,6 +110,7 @@ class _Ingestion:
             )
         self._report_quality()
         self._report_crops()
+        self._report_gain_maps()
         self._report_masks(masks)
         with self.monitor.part("resolution"):
             self._reduce_resolution()
@@ -149,8 +150,10 @@ class _Ingestion:
         self.folder.mkdir(exist_ok=True)
         with self.monitor.part("frames"):
             settings = self.options.ingest
-            written, total = extract_frames(self.video, self.folder, settings.frames, settings.max_megapixels)
+            written, total, transfer = extract_frames(self.video, self.folder, settings.frames, settings.max_megapixels)
         self.monitor.decide("frames", f"{written} of {total}", "the sharpest of equal stretches of the video's motion")
+        if transfer:
+            self.monitor.decide("colours of the video", f"{transfer} undone", "reference white becomes white, what is brighter is clipped")
 
     def _skip_identical_files(self, paths: dict[str, Path]) -> None:
         """Remove from `paths` files that cannot be read or are identical to an earlier one."""
@@ -213,6 +216,15 @@ class _Ingestion:
         if outliers:
             names = shortlist([entries[i]["name"] for i in outliers])
             self.monitor.warn(f"{len(outliers)} photos are much more blurred than the rest ({names}).")
+
+    def _report_gain_maps(self) -> None:
+        """Warn about photos with gain maps: what they add is brighter than white, which 8-bit working photos do not hold."""
+        names = [entry["name"] for entry in self._entries if entry["gain_map"]]
+        if names:
+            self.monitor.warn(
+                f"{len(names)} photos have a gain map for HDR screens, which is not used ({shortlist(names)}): highlights clip as they do "
+                "on other screens; take photos without HDR, or RAW."
+            )
 
     def _report_crops(self) -> None:
         """Warn about photos that were cropped after their camera wrote EXIF, and take no focal length from it.
