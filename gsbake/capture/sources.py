@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from gsbake.capture.photos.heic_and_raw import HEIC_SUFFIXES, RAW_SUFFIXES
+from gsbake.capture.poses.folder_formats import has_xmp, is_colmap_model
 from gsbake.capture.poses.frame_masks import frame_masks, mask_folder
 from gsbake.errors import BadInputError
 
@@ -30,7 +31,6 @@ POSE_FORMATS = (
 )
 #: File name suffixes of pose files.
 POSE_SUFFIXES = frozenset({".json", ".npy", ".xml", ".csv"})
-_MODEL_FILES = ("cameras.bin", "cameras.txt")
 _MODEL_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse")
 #: Further pose files and folders of a folder that the user names for its poses.
 _POLYCAM_FOLDERS = ("corrected_cameras", "cameras")
@@ -90,16 +90,6 @@ def list_masks(folder: Path) -> list[str]:
     """Images of a mask folder as sorted relative POSIX names, those of sub-folders included; links to folders are not followed."""
     found = (path.relative_to(folder) for path in folder.rglob("*") if path.suffix.lower() in IMAGE_SUFFIXES and path.is_file())
     return sorted(name.as_posix() for name in found if not any(part.startswith(".") for part in name.parts))
-
-
-def is_colmap_model(folder: Path) -> bool:
-    """Whether a folder is a COLMAP sparse model (binary or text)."""
-    return any((folder / name).is_file() for name in _MODEL_FILES)
-
-
-def has_xmp(folder: Path) -> bool:
-    """Whether a folder holds XMP files."""
-    return any(path.suffix.lower() == ".xmp" for path in folder.iterdir())
 
 
 def find_poses(folder: Path) -> Path | None:
