@@ -92,9 +92,9 @@ def _band(rgb: Bytes, inside: Flags, width: float) -> Flags:
     beside[labels.ravel()[background]] = background
     at = np.flatnonzero(band.ravel() & (distance.ravel() < 2 * width + BACKGROUND_DISTANCE))
     colours = rgb.reshape(-1, 3)
-    alike = np.abs(colours[at].astype(np.int16) - colours[beside[labels.ravel()[at]]]).max(1) <= SAME_COLOUR
+    similar = np.abs(colours[at].astype(np.int16) - colours[beside[labels.ravel()[at]]]).max(1) <= SAME_COLOUR
     same = np.zeros(band.shape, np.bool_)
-    same.ravel()[at[alike]] = True
+    same.ravel()[at[similar]] = True
     joined = _touching(same, depth <= 1.5)
     return np.asarray(band & (cv2.dilate(joined.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0))
 

@@ -42,7 +42,7 @@ def test_background_inside_a_loose_mask_is_found() -> None:
     assert not background_band(np.full_like(rgb, 9), loose)[disc(44)].any()
 
 
-def test_an_uneven_background_is_told_by_what_lies_beside() -> None:
+def test_an_uneven_background_is_compared_with_what_lies_beside() -> None:
     object_ = disc(50)
     rgb = np.repeat(np.tile(np.linspace(60, 200, SIZE).astype(np.uint8), (SIZE, 1))[..., None], 3, 2)
     rgb[object_] = (250, 20, 20)
