@@ -8,8 +8,8 @@ from typing import Any
 
 #: Maximum number of results on a stage's line; the manifest has all.
 MAX_FIGURES = 4
-#: Maximum number of names in a message; the rest are counted.
-MAX_NAMES = 4
+#: Maximum number of names in a message, and in one about what is missing from an input; the rest are counted.
+MAX_NAMES, MAX_MISSING = 4, 10
 
 
 def printable(text: str) -> str:
@@ -94,6 +94,11 @@ def _with_unit(value: Any, unit: str) -> str:
             return value if isinstance(value, str) else number(value)
 
 
-def shortlist(names: Sequence[str]) -> str:
-    """The first MAX_NAMES names and the number of the others."""
-    return ", ".join(names[:MAX_NAMES]) + (f" and {len(names) - MAX_NAMES} more" if len(names) > MAX_NAMES else "")
+def shortlist(names: Sequence[str], most: int = MAX_NAMES) -> str:
+    """The first `most` names and the number of the others."""
+    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
+
+
+def missing_list(names: Sequence[str]) -> str:
+    """What an input lacks: the first MAX_MISSING names and the number of the others."""
+    return shortlist(names, MAX_MISSING)

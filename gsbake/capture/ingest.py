@@ -19,11 +19,13 @@ from gsbake.capture.masks.saliency import SaliencyNetwork
 from gsbake.capture.masks.weights import INSTALL, WEIGHTS, resolve_network
 from gsbake.capture.photos.conversion import Conversion, ConvertedPhoto
 from gsbake.capture.photos.decode import RawPhoto, UnreadablePhotoError, to_working_size
+from gsbake.capture.photos.exif import is_recropped
 from gsbake.capture.photos.quality import find_blurred, find_near_duplicates
 from gsbake.capture.photos.reader_pool import ReaderPool
 from gsbake.capture.photos.sharpness import detect_oversampling
 from gsbake.capture.photos.video_process import extract_frames
 from gsbake.capture.posed_photos import REGION
+from gsbake.capture.poses.frame_masks import frame_masks, masks_by_photo
 from gsbake.capture.poses.frames import GivenPoses, PhotoSize
 from gsbake.capture.poses.given import read_poses
 from gsbake.capture.sources import is_video, list_photos
@@ -34,10 +36,12 @@ from gsbake.geometry.ply import write_cloud
 from gsbake.imaging.png import write_png
 from gsbake.monitor import SILENT, Monitor, Rule, decide_skip
 from gsbake.system.names import portable_name, same_file_key
-from gsbake.text import shortlist
+from gsbake.text import missing_list, shortlist
 
 #: Folder of the frames of a video, while they are read.
 FRAMES = "frames"
+#: Share of the pixels of the largest photo of a camera below which another is taken for a crop.
+MIN_SAME_SIZE = 0.98
 #: Most processes that read photos.
 MAX_READERS = 8
 
@@ -94,7 +98,7 @@ class _Ingestion:
         paths = {path.relative_to(self.folder).as_posix(): path for path in list_photos(self.folder)}
         names = photo_names(paths)
         use_masks = settings.masks != "ignore"
-        masks = match_masks(self.mask_folder, paths) if use_masks and self.mask_folder is not None else {}
+        masks = self._match_masks(paths) if use_masks else {}
         with self.monitor.part("duplicates"):
             self._skip_identical_files(paths)
         with self.monitor.part("photos"):
@@ -107,6 +111,8 @@ class _Ingestion:
                 "take more photos from all sides of the object."
             )
         self._report_quality()
+        self._report_crops()
+        self._report_gain_maps()
         self._report_masks(masks)
         with self.monitor.part("resolution"):
             self._reduce_resolution()
@@ -128,6 +134,14 @@ class _Ingestion:
             **results,
         }
 
+    def _match_masks(self, paths: dict[str, Path]) -> dict[str, Path]:
+        """Mask files by photo: those that frames of the poses name, and those of the mask folder."""
+        by_frame = frame_masks(self.poses)
+        named = masks_by_photo(by_frame, self.mask_folder, paths, self.poses) if self.poses is not None else {}
+        if by_frame and not named:
+            self.monitor.decide("mask_path", "not used", f"{len(by_frame)} frames name a mask; other masks were given")
+        return named if self.mask_folder is None else match_masks(self.mask_folder, paths, named)
+
     @property
     def _entries(self) -> list[dict[str, Any]]:
         return [photo.entry for photo in self.read.values()]
@@ -138,8 +152,10 @@ class _Ingestion:
         self.folder.mkdir(exist_ok=True)
         with self.monitor.part("frames"):
             settings = self.options.ingest
-            written, total = extract_frames(self.video, self.folder, settings.frames, settings.max_megapixels)
+            written, total, transfer = extract_frames(self.video, self.folder, settings.frames, settings.max_megapixels)
         self.monitor.decide("frames", f"{written} of {total}", "the sharpest of equal stretches of the video's motion")
+        if transfer:
+            self.monitor.decide("colours of the video", f"{transfer} undone", "reference white becomes white, what is brighter is clipped")
 
     def _skip_identical_files(self, paths: dict[str, Path]) -> None:
         """Remove from `paths` files that cannot be read or are identical to an earlier one."""
@@ -203,6 +219,37 @@ class _Ingestion:
             names = shortlist([entries[i]["name"] for i in outliers])
             self.monitor.warn(f"{len(outliers)} photos are much more blurred than the rest ({names}).")
 
+    def _report_gain_maps(self) -> None:
+        """Warn about photos with gain maps: what they add is brighter than white, which 8-bit working photos do not hold."""
+        names = [entry["name"] for entry in self._entries if entry["gain_map"]]
+        if names:
+            self.monitor.warn(
+                f"{len(names)} photos have a gain map for HDR screens, which is not used ({shortlist(names)}): highlights clip as they do "
+                "on other screens; take photos without HDR, or RAW."
+            )
+
+    def _report_crops(self) -> None:
+        """Warn about photos that were cropped after their camera wrote EXIF, and take no focal length from it.
+
+        A crop of the same aspect ratio looks like a reduced photo, unless others of its camera were not reduced as much.
+        """
+        largest: dict[tuple[Any, ...], int] = {}
+        for entry in self._entries:
+            largest[_written(entry)] = max(largest.get(_written(entry), 0), entry["source_width"] * entry["source_height"])
+        cropped = []
+        for entry in self._entries:
+            size = entry["source_width"], entry["source_height"]
+            if entry["written_size"] and (
+                is_recropped(entry["written_size"], size) or size[0] * size[1] < MIN_SAME_SIZE * largest[_written(entry)]
+            ):
+                cropped.append(entry["name"])
+                entry["focal_px"] = None
+        if cropped:
+            self.monitor.warn(
+                f"{len(cropped)} photos seem cropped, for EXIF tells of more of the picture ({missing_list(cropped)}); poses are better "
+                "from whole photos."
+            )
+
     def _report_masks(self, masks: dict[str, Path]) -> None:
         """Report how many photos have masks, and their sources. Raises BadInputError when required masks are missing."""
         setting, total = self.options.ingest.masks, len(self.read)
@@ -210,14 +257,14 @@ class _Ingestion:
         count = total - len(without)
         if without and setting == "require":
             raise BadInputError(
-                f"{len(without)} of {total} photos have no mask ({shortlist(without)}), but ingest.masks is require; "
+                f"{len(without)} of {total} photos have no mask ({missing_list(without)}), but ingest.masks is require; "
                 "give them masks or set it to auto."
             )
         files = sum(relative in masks for relative in self.read)
         given = f"{count} of {total} photos have one: {files} mask files, {count - files} alpha channels" if count else "no photo has one"
         self.monitor.decide("masks", "used" if count else "none", "set by the profile" if setting == "ignore" else given)
         if count and without and not self._makes_masks:
-            self.monitor.warn(f"{len(without)} of {total} photos have no mask ({shortlist(without)}); give every photo one.")
+            self.monitor.warn(f"{len(without)} of {total} photos have no mask ({missing_list(without)}); give every photo one.")
 
     @property
     def _makes_masks(self) -> bool:
@@ -278,12 +325,19 @@ class _Ingestion:
             if given.points is not None:
                 write_cloud(folder / "points.ply", given.points, given.colours if given.colours is not None else given.points * 0)
         without = [photo.entry["name"] for relative, photo in self.read.items() if relative not in given.cameras]
+        for note in given.notes:
+            self.monitor.decide(*note)
         if without:
-            self.monitor.warn(f"{len(without)} photos have no pose in {path.name} ({shortlist(without)}) and will not be used.")
+            self.monitor.warn(f"{len(without)} photos have no pose in {path.name} ({missing_list(without)}) and will not be used.")
         if given.missing:
-            self.monitor.warn(f"{len(given.missing)} frames of {path.name} have no photo ({shortlist(list(given.missing))}).")
+            self.monitor.warn(f"{len(given.missing)} frames of {path.name} have no photo ({missing_list(list(given.missing))}).")
         self.monitor.decide("given poses", f"{len(cameras)} of {len(self.read)} photos", path.name)
         return {"poses": path.name, "posed": len(cameras), "frames_without_photo": len(given.missing)}
+
+
+def _written(entry: dict[str, Any]) -> tuple[Any, ...]:
+    """Camera and the size that it wrote: photos in which both are equal were the same size."""
+    return entry["camera_model"], entry["camera_body"], *(entry["written_size"] or ())
 
 
 def _size(photo: ConvertedPhoto) -> PhotoSize:

@@ -6,10 +6,13 @@ stays unused.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from gsbake.capture.photos.heic_and_raw import HEIC_SUFFIXES, RAW_SUFFIXES
+from gsbake.capture.poses.folder_formats import has_xmp, is_colmap_model
+from gsbake.capture.poses.frame_masks import frame_masks, mask_folder
 from gsbake.errors import BadInputError
 
 #: File name suffixes of images, which masks are as well, and of photos.
@@ -28,7 +31,6 @@ POSE_FORMATS = (
 )
 #: File name suffixes of pose files.
 POSE_SUFFIXES = frozenset({".json", ".npy", ".xml", ".csv"})
-_MODEL_FILES = ("cameras.bin", "cameras.txt")
 _MODEL_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse")
 #: Further pose files and folders of a folder that the user names for its poses.
 _POLYCAM_FOLDERS = ("corrected_cameras", "cameras")
@@ -90,16 +92,6 @@ def list_masks(folder: Path) -> list[str]:
     return sorted(name.as_posix() for name in found if not any(part.startswith(".") for part in name.parts))
 
 
-def is_colmap_model(folder: Path) -> bool:
-    """Whether a folder is a COLMAP sparse model (binary or text)."""
-    return any((folder / name).is_file() for name in _MODEL_FILES)
-
-
-def has_xmp(folder: Path) -> bool:
-    """Whether a folder holds XMP files."""
-    return any(path.suffix.lower() == ".xmp" for path in folder.iterdir())
-
-
 def find_poses(folder: Path) -> Path | None:
     """The pose file or COLMAP model folder inside `folder`, or None: transforms.json, a sparse model, poses_bounds.npy."""
     if (folder / "transforms.json").is_file():
@@ -129,13 +121,26 @@ def _given_poses(path: Path) -> Path:
     return path
 
 
+def _find_masks(folders: Sequence[Path], poses: Path | None) -> Path | None:
+    """The folder of the masks that frames of the poses name, else the folder `masks` of the first of `folders` that has one."""
+    masks, named = next((f / "masks" for f in folders if (f / "masks").is_dir()), None), frame_masks(poses)
+    if named and (masks is None or not all(path.is_relative_to(masks.resolve()) for path in named.values())):
+        return mask_folder(named)
+    if masks is not None and folders[-1].resolve() not in masks.resolve().parents:
+        raise BadInputError(
+            f"The mask folder {masks} is a link that leads out of the capture, to {masks.resolve()}; if that is meant, name it with "
+            "--masks."
+        )
+    return masks
+
+
 def discover(photos: Path, masks: Path | None = None, poses: Path | None = None) -> Sources:
     """Find the paths of a capture.
 
     `photos` is a capture folder (photos in `images/` or `photos/`, beside them `masks/` and poses), the photo folder itself, or a video,
     which has neither masks nor poses but those given. Masks and poses are looked for in the photo folder, then in its parent; `masks` and
-    `poses` override what is found. Raises BadInputError when a given path does not exist, there is no photo, or a mask folder that was
-    found is a link to elsewhere.
+    `poses` override what is found; masks that the frames of a transforms.json name come before a folder `masks`. Raises BadInputError when
+    a given path does not exist, there is no photo, or masks that were found lie elsewhere, behind a link or ".." in a name.
     """
     photos, folders = Path(photos), []
     if photos.is_dir():
@@ -146,14 +151,9 @@ def discover(photos: Path, masks: Path | None = None, poses: Path | None = None)
             folders = [photos, photos.resolve().parent]
     if not is_video(photos):
         list_photos(photos)
+    found = next((p for f in folders if (p := find_poses(f)) is not None), None) if poses is None else _given_poses(Path(poses))
     if masks is None:
-        masks = next((f / "masks" for f in folders if (f / "masks").is_dir()), None)
-        if masks is not None and folders[-1].resolve() not in masks.resolve().parents:
-            raise BadInputError(
-                f"The mask folder {masks} is a link that leads out of the capture, to {masks.resolve()}; if that is meant, name it with "
-                "--masks."
-            )
+        masks = _find_masks(folders, found)
     elif not Path(masks).is_dir():
         raise BadInputError(f"The mask folder {masks} does not exist.")
-    found = next((p for f in folders if (p := find_poses(f)) is not None), None) if poses is None else _given_poses(Path(poses))
     return Sources(photos, None if masks is None else Path(masks), found)

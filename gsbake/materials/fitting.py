@@ -38,6 +38,7 @@ from gsbake.texturing.normal_map import DenseSamples
 from gsbake.texturing.projection import ProjectedTexture
 from gsbake.texturing.resampling import MIN_SIZE, CoarseTexture
 from gsbake.texturing.unwrapped_mesh import UnwrappedMesh
+from gsbake.texturing.usable_pixels import UsablePixels
 
 Floats = NDArray[np.float32]
 
@@ -171,7 +172,7 @@ class _Fitting:
         """Read the pixels of all photos, exposure gains divided out, and measure view dependence."""
         surface, settings = self.surface, self.settings
         reader = PixelReader(surface.atlas_caster, surface.atlas.uv, self.coarse.texels, surface.diagonal)
-        count = len(self.posed)
+        count, usable = len(self.posed), UsablePixels(self.posed)
         validation, test = (set(roles(count, settings.holdout)) for roles in (validation_photos, test_photos))
         points = slice(None, None, max(1, len(surface.texel_position) // SURFACE_POINTS))
         brightness = MeshBrightness(surface.texel_position[points], surface.texel_normal[points], surface.caster, surface.diagonal)
@@ -181,7 +182,7 @@ class _Fitting:
             self.monitor.check_stop()
             view = self.posed.view(index, settings.bake.fit_size)
             brightness.add(view)
-            read = reader.read(view.camera, view.rgb, view.mask).subsampled(MAX_PIXELS)
+            read = reader.read(view.camera, view.rgb, usable.mask(index, view)).subsampled(MAX_PIXELS)
             pixels.append(read.without_gain(self.projected.gains[index]))
             cameras.append(view.camera)
         fitted = sorted(set(range(count)) - validation - test)

@@ -15,6 +15,7 @@ from gsbake.surfels.renderer import SurfelRenderer
 from gsbake.texturing.projection import ProjectedTexture, ProjectionBlender, mask_weights
 from gsbake.texturing.skip_rules import constant_exposure
 from gsbake.texturing.unwrapped_mesh import UnwrappedMesh
+from gsbake.texturing.usable_pixels import UsablePixels
 
 #: Weight of held-out photos: they fill only what no other photo observed, so that validation figures stay unbiased.
 HELD_OUT_WEIGHT = 1e-4
@@ -31,7 +32,7 @@ def project_photos(surface: UnwrappedMesh, posed: PosedPhotos, holdout: int, equ
     """
     held_out_views = set(held_out(len(posed), holdout))
     blender = ProjectionBlender(surface.texel_position, surface.texel_normal, surface.caster, 3, surface.texel_size)
-    measured = equalisation != "skip"
+    usable, measured = UsablePixels(posed), equalisation != "skip"
     tie_points = TiePointExposure.from_model(posed.folder / "sparse", posed.cameras.to_world.inverse()) if measured else None
     for index in range(len(posed)):
         monitor.check_stop()
@@ -39,8 +40,8 @@ def project_photos(surface: UnwrappedMesh, posed: PosedPhotos, holdout: int, equ
         linear = decode_bytes(view.rgb)
         if tie_points is not None:
             tie_points.add(view.camera, linear)
-        margin = MASK_MARGIN * max(view.camera.width, view.camera.height)
-        weights = None if view.mask is None else mask_weights(view.mask, margin)
+        mask = usable.mask(index, view)
+        weights = None if mask is None else mask_weights(mask, MASK_MARGIN * max(view.camera.width, view.camera.height))
         blender.add(view.camera, linear, weights, HELD_OUT_WEIGHT if index in held_out_views else 1.0)
         monitor.progress(index + 1, len(posed), "projection")
     projected = blender.result(solve_exposure=measured)

@@ -20,7 +20,8 @@ from gsbake.capture.photos.decode import (
     read_photo,
     to_working_size,
 )
-from gsbake.capture.photos.exif import camera_key, focal_pixels, gps_position
+from gsbake.capture.photos.exif import camera_body, camera_key, focal_pixels, gps_position, written_size
+from gsbake.capture.photos.hdr import has_gain_map
 from gsbake.capture.photos.quality import Quality, measure_quality
 from gsbake.errors import BadInputError
 from gsbake.imaging.png import write_png
@@ -117,6 +118,9 @@ def convert(what: Conversion) -> ConvertedPhoto:
         "source_height": photo.height,
         "focal_px": None if focal is None else focal * max(width, height) / max(photo.width, photo.height),
         "camera_model": camera_key(photo.tags),
+        "camera_body": camera_body(photo.tags),
+        "written_size": written_size(photo.tags),
+        "gain_map": has_gain_map(what.path),
         "gps": gps_position(photo.tags),
         "blur": quality.blur,
         "exposure": quality.exposure,

@@ -1,14 +1,14 @@
 """Decoding of a photo in any supported format to upright 8-bit sRGB at the working size.
 
 OpenImageIO reads JPEG, PNG, TIFF, EXR and WebP in 8 bit, 16 bit and float; `heic_and_raw` reads HEIC and RAW. Integer files are
-sRGB-coded, or converted from their embedded ICC profile; float files (EXR, float TIFF) and RAW are linear. Downsampling is an area filter
+sRGB-coded, or converted from their embedded ICC profile (16-bit ones before they are rounded), or coded for HDR screens, which is undone;
+float files (EXR, float TIFF) and RAW are linear. Downsampling is an area filter
 on linear values (IEC 61966-2-1 curve), weighted with alpha, because the mean of coded values is not the radiance that a larger sensor
 cell measures.
 """
 
 from __future__ import annotations
 
-import io
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -22,6 +22,7 @@ import OpenImageIO as oiio
 from numpy.typing import NDArray
 
 from gsbake.capture.photos import heic_and_raw
+from gsbake.capture.photos.embedded_colours import to_srgb
 from gsbake.imaging.srgb import decode_bytes, encode_bytes
 
 Bytes = NDArray[np.uint8]
@@ -167,23 +168,6 @@ def _decode(path: Path, max_megapixels: float) -> tuple[NDArray[Any], oiio.Image
         handle.close()
 
 
-def _convert_icc_profile(rgb: Bytes, tags: dict[str, Any]) -> Bytes:
-    """Convert from the embedded RGB profile of a file (Display P3 of phones, Adobe RGB of cameras) to sRGB."""
-    profile = tags.get("ICCProfile")
-    if profile is None or "srgb" in str(tags.get("ICCProfile:profile_description", "")).lower():
-        return rgb
-    if not str(tags.get("ICCProfile:color_space", "")).strip().upper().startswith("RGB"):
-        return rgb
-    from PIL import Image, ImageCms
-
-    try:
-        source = ImageCms.ImageCmsProfile(io.BytesIO(np.asarray(profile).astype(np.uint8).tobytes()))
-        out = ImageCms.profileToProfile(Image.fromarray(rgb), source, ImageCms.createProfile("sRGB"), outputMode="RGB")
-    except (ImageCms.PyCMSError, OSError, ValueError, TypeError, OverflowError):
-        return rgb  # a broken profile does not make the photo unusable
-    return rgb if out is None else np.asarray(out, np.uint8)
-
-
 def read_photo(path: Path, max_megapixels: float = MAX_MEGAPIXELS) -> RawPhoto:
     """Decode a photo: grey and CMYK are converted to RGB, alpha is separated and the EXIF orientation applied.
 
@@ -217,10 +201,16 @@ def _read_developed(path: Path, max_megapixels: float) -> RawPhoto:
     photo = heic_and_raw.develop(path)
     pixels: Any = photo.pixels if photo.pixels.ndim == 3 else photo.pixels[..., None]
     colour: Any = np.ascontiguousarray(pixels[..., :3] if pixels.shape[2] >= 3 else np.repeat(pixels[..., :1], 3, 2))
-    alpha = pixels[..., 3] if pixels.shape[2] == 4 and pixels[..., 3].min() < 255 else None
+    alpha: Any = pixels[..., 3] if pixels.shape[2] == 4 else None
+    if photo.hdr is not None:
+        whole = np.iinfo(colour.dtype).max
+        colour = to_srgb(colour / np.float32(whole), {"CICP": photo.hdr})
+        alpha = None if alpha is None else np.rint(alpha * (255.0 / whole)).astype(np.uint8)
+    if alpha is not None and alpha.min() == 255:
+        alpha = None
     if photo.icc_profile:
         profile = {"ICCProfile": np.frombuffer(photo.icc_profile, np.uint8), "ICCProfile:color_space": "RGB"}
-        colour = _convert_icc_profile(colour, profile)
+        colour = to_srgb(colour, profile)
     return RawPhoto(colour, alpha, 1, photo.tags)
 
 
@@ -243,11 +233,11 @@ def _read_photo(path: Path, max_megapixels: float) -> RawPhoto:
         if linear and alpha is not None and path.suffix.lower() == ".exr":  # EXR stores colour multiplied by alpha
             colour = colour / np.maximum(alpha, 1e-4)[..., None]
         if not linear:
-            colour = np.rint(np.clip(colour, 0, 1) * 255).astype(np.uint8)
+            colour = to_srgb(colour, tags)
         if alpha is not None:
             alpha = np.rint(np.clip(alpha, 0, 1) * 255).astype(np.uint8)
-    if colour.dtype == np.uint8:
-        colour = _convert_icc_profile(np.ascontiguousarray(colour), tags)
+    else:
+        colour = to_srgb(colour, tags)
     orientation = _orientation(tags.get("Orientation", 1))
     if alpha is not None:
         alpha = None if alpha.min() == 255 else apply_orientation(alpha, orientation)  # an opaque alpha channel is no mask

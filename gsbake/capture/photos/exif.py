@@ -6,8 +6,10 @@ The focal length only initialises structure from motion: photos get cropped and 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
+
+from blake3 import blake3
 
 #: Diagonal of the 36 x 24 mm frame that the 35 mm equivalent refers to (CIPA DCG-001).
 FULL_FRAME_DIAGONAL = math.hypot(36.0, 24.0)
@@ -30,13 +32,25 @@ def is_cropped(width: int, height: int) -> bool:
     return all(abs(aspect / known - 1) > 0.01 for known in SENSOR_ASPECTS)
 
 
+def written_size(tags: Mapping[str, Any]) -> tuple[int, int] | None:
+    """Longer and shorter side in pixels that the camera wrote; None where EXIF does not have both."""
+    sides = [_number(tags, f"Exif:Pixel{axis}Dimension") for axis in "XY"]
+    known = [round(side) for side in sides if side is not None]
+    return (max(known), min(known)) if len(known) == 2 and min(known) >= 1 else None
+
+
+def is_recropped(written: Sequence[int] | None, size: tuple[int, int]) -> bool:
+    """Whether a photo has another aspect ratio, by more than 1 %, than its camera wrote."""
+    return written is not None and abs(max(size) / min(size) * min(written) / max(written) - 1) > 0.01
+
+
 def focal_pixels(tags: Mapping[str, Any], width: int, height: int) -> float | None:
     """Focal length in pixels of a photo of width x height, or None where EXIF does not determine it.
 
     `tags` are OpenImageIO's attributes by name. The 35 mm equivalent takes precedence over the sensor width computed from the focal plane
     resolution, which refers to the pixels that the camera wrote (`PixelXDimension`). None for cropped photos.
     """
-    if is_cropped(width, height):
+    if is_cropped(width, height) or is_recropped(written_size(tags), (width, height)):
         return None
     diagonal = math.hypot(width, height)
     equivalent = _number(tags, "Exif:FocalLengthIn35mmFilm")
@@ -62,6 +76,12 @@ def camera_key(tags: Mapping[str, Any]) -> str:
     if focal is not None:
         parts.append(f"{focal:g} mm")
     return " ".join(part for part in parts if part)
+
+
+def camera_body(tags: Mapping[str, Any]) -> str | None:
+    """A digest of the body's serial number, which tells two of one model apart and names none; None where EXIF has no number."""
+    serial = str(tags.get("Exif:BodySerialNumber", "")).strip(" \0")
+    return blake3(serial.encode("utf-8", "surrogatepass")).hexdigest()[:12] if serial.strip("0") else None
 
 
 def gps_position(tags: Mapping[str, Any]) -> tuple[float, float, float] | None:

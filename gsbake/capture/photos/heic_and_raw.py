@@ -1,7 +1,7 @@
 """Photos of telephones (HEIC, HEIF) and undeveloped photos of cameras (RAW), by libraries that are optional.
 
-HEIC holds 8-bit sRGB or an ICC profile, as JPEG does. RAW is developed to linear values with the white balance that the camera wrote,
-without brightening, so that photos of one exposure keep their relation.
+HEIC holds sRGB or an ICC profile, as JPEG does, or is coded for HDR screens (PQ, HLG). RAW is developed to linear values with the white
+balance that the camera wrote, without brightening, so that photos of one exposure keep their relation.
 """
 
 from __future__ import annotations
@@ -14,6 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from gsbake.capture.photos.hdr import TRANSFERS
+
 #: File name suffixes by the package that reads them, and the extra of gsbake that installs it.
 HEIC_SUFFIXES = frozenset({".heic", ".heif", ".hif"})
 RAW_SUFFIXES = frozenset({".dng", ".nef", ".nrw", ".cr2", ".cr3", ".arw", ".raf", ".rw2", ".orf", ".pef", ".srw"})
@@ -22,7 +24,8 @@ SUFFIXES = HEIC_SUFFIXES | RAW_SUFFIXES
 _IMAGE_TAGS = {0x010F: "Make", 0x0110: "Model"}
 _EXIF_TAGS = {
     0x920A: "Exif:FocalLength", 0xA405: "Exif:FocalLengthIn35mmFilm", 0xA20E: "Exif:FocalPlaneXResolution",
-    0xA210: "Exif:FocalPlaneResolutionUnit", 0xA002: "Exif:PixelXDimension",
+    0xA210: "Exif:FocalPlaneResolutionUnit", 0xA002: "Exif:PixelXDimension", 0xA003: "Exif:PixelYDimension",
+    0xA431: "Exif:BodySerialNumber",
 }  # fmt: skip
 _GPS_TAGS = {
     1: "GPS:LatitudeRef", 2: "GPS:Latitude", 3: "GPS:LongitudeRef", 4: "GPS:Longitude", 5: "GPS:AltitudeRef", 6: "GPS:Altitude",
@@ -36,11 +39,13 @@ class MissingReaderError(Exception):
 
 @dataclass(frozen=True)
 class Developed:
-    """An upright photo: `pixels` (h, w, 3 or 4), 8-bit sRGB-coded or 32-bit linear, its `icc_profile` or none, and EXIF `tags`."""
+    """An upright photo: `pixels` (h, w, 3 or 4), 8-bit sRGB-coded or 32-bit linear, its `icc_profile` or none, and EXIF `tags`; `hdr`,
+    primaries and transfer (codes of H.273) of a photo for HDR screens, whose pixels are coded in 8 or 16 bits."""
 
-    pixels: NDArray[np.uint8] | NDArray[np.float32]
+    pixels: NDArray[np.uint8] | NDArray[np.uint16] | NDArray[np.float32]
     icc_profile: bytes | None
     tags: dict[str, Any]
+    hdr: tuple[int, int] | None = None
 
 
 def _library(name: str, extra: str) -> Any:
@@ -54,10 +59,17 @@ def upright_size(path: Path) -> tuple[int, int, int, int]:
     """Width, height, channels and bytes per channel after decoding, from the file's header; raises what `develop` raises."""
     if path.suffix.lower() in HEIC_SUFFIXES:
         image = _library("pi_heif", "heic").open_heif(path, convert_hdr_to_8bit=True)
-        return (*image.size, len(image.mode), 1)
+        return (*image.size, len(image.mode), 1 if _hdr_coding(image) is None else 4)
     with _library("rawpy", "raw").imread(str(path)) as raw:
         width, height = raw.sizes.width, raw.sizes.height
         return (height, width, 3, 4) if raw.sizes.flip in (5, 6) else (width, height, 3, 4)
+
+
+def _hdr_coding(image: Any) -> tuple[int, int] | None:
+    """Primaries and transfer of a HEIC photo for HDR screens; None for others."""
+    coding = image.info.get("nclx_profile") or {}
+    transfer = int(coding.get("transfer_characteristics", 0))
+    return (int(coding.get("color_primaries", 0)), transfer) if transfer in TRANSFERS and not image.info.get("icc_profile") else None
 
 
 def develop(path: Path) -> Developed:
@@ -65,7 +77,10 @@ def develop(path: Path) -> Developed:
     if path.suffix.lower() in HEIC_SUFFIXES:
         # The pixels are copied: the library's own memory ends with `image`.
         image = _library("pi_heif", "heic").open_heif(path, convert_hdr_to_8bit=True)
-        return Developed(np.array(image), image.info.get("icc_profile"), _exif_tags(image.info.get("exif")))
+        coding = _hdr_coding(image)
+        if coding is not None:
+            image = _library("pi_heif", "heic").open_heif(path, convert_hdr_to_8bit=False)
+        return Developed(np.array(image), image.info.get("icc_profile"), _exif_tags(image.info.get("exif")), coding)
     rawpy = _library("rawpy", "raw")
     with rawpy.imread(str(path)) as raw:
         linear = raw.postprocess(use_camera_wb=True, no_auto_bright=True, output_bps=16, gamma=(1, 1), output_color=rawpy.ColorSpace.sRGB)

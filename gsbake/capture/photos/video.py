@@ -20,6 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsbake.capture.photos.decode import UnreadablePhotoError
+from gsbake.capture.photos.hdr import TRANSFERS, frame_to_srgb
+from gsbake.capture.photos.video_transfer import video_transfer
 from gsbake.imaging.png import write_png
 
 #: FFmpeg's readers of the containers in which videos come, by FFmpeg's names; all others are refused, whatever a file is called.
@@ -97,16 +99,19 @@ def choose(measures: FrameMeasures, count: int) -> NDArray[np.int64]:
     return np.sort(order[first])
 
 
-def write_frames(path: Path, out: Path, count: int, max_megapixels: float) -> tuple[int, int]:
-    """Write the chosen frames of a video into the folder `out` as frame_NNNNNN.png; the number written and that of all frames.
+def write_frames(path: Path, out: Path, count: int, max_megapixels: float) -> tuple[int, int, str]:
+    """Write the chosen frames of a video into the folder `out` as frame_NNNNNN.png, in sRGB; the number written, that of all frames, and
+    the name of the HDR transfer that was undone, or "".
 
     Raises UnreadablePhotoError, and OSError where a frame cannot be written.
     """
     measures = measure(path, max_megapixels)
     chosen = set(choose(measures, count).tolist())
+    transfer = video_transfer(path) or 0
     written = 0
     for index, frame in enumerate(frames(path, max_megapixels)):
         if index in chosen:
-            write_png(out / f"frame_{index:06d}.png", np.ascontiguousarray(frame[..., ::-1]))
+            rgb = np.ascontiguousarray(frame[..., ::-1])
+            write_png(out / f"frame_{index:06d}.png", frame_to_srgb(rgb, transfer) if transfer in TRANSFERS else rgb)
             written += 1
-    return written, len(measures.motion)
+    return written, len(measures.motion), TRANSFERS.get(transfer, "")

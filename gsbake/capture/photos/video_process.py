@@ -21,8 +21,8 @@ MEMORY = 4 << 30
 MIN_SECONDS, SECONDS_PER_BYTE = 600.0, 1e-5
 
 
-def extract_frames(path: Path, out: Path, count: int, max_megapixels: float) -> tuple[int, int]:
-    """Write at most `count` frames of the video at `path` into the folder `out`; the number written and that of all frames.
+def extract_frames(path: Path, out: Path, count: int, max_megapixels: float) -> tuple[int, int, str]:
+    """Write at most `count` frames of the video at `path` into the folder `out`; what `write_frames` returns.
 
     Raises BadInputError for a video that cannot be decoded, OSError for the output, InterruptedRun.
     """
@@ -38,21 +38,22 @@ def extract_frames(path: Path, out: Path, count: int, max_megapixels: float) -> 
         raise BadInputError(f"The video {path} cannot be used ({found['unreadable']}); convert it to MP4, or give its frames.")
     if "os_error" in found:
         raise OSError(*found["os_error"])
-    return int(found["written"]), int(found["frames"])
+    return int(found["written"]), int(found["frames"]), str(found["transfer"])
 
 
 def answer(request: dict[str, Any]) -> dict[str, Any]:
     """Write the frames; {"unreadable": reason} for the video, {"os_error": [number, text, file]} for the output."""
     limit_memory(min(MEMORY, budget()))
     try:
-        written, total = write_frames(Path(request["path"]), Path(request["out"]), int(request["count"]), float(request["max_megapixels"]))
+        count, most = int(request["count"]), float(request["max_megapixels"])
+        written, total, transfer = write_frames(Path(request["path"]), Path(request["out"]), count, most)
     except UnreadablePhotoError as error:
         return {"unreadable": str(error)}
     except (MemoryError, cv2.error) as error:
         return {"unreadable": f"decoding it failed: {' '.join(str(error).split())[:200] or 'out of memory'}"}
     except OSError as error:
         return {"os_error": [error.errno, error.strerror, str(error.filename or request["out"])]}
-    return {"written": written, "frames": total}
+    return {"written": written, "frames": total, "transfer": transfer}
 
 
 def main() -> None:

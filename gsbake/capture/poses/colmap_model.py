@@ -20,9 +20,13 @@ from gsbake.errors import BadInputError
 from gsbake.geometry.cameras import Camera
 from gsbake.limited_process import ParserProcess, read_in_child
 from gsbake.memory_budget import check, child_limit
+from gsbake.text import missing_list
 
 #: Files of a model.
 FILES = (*BINARY_FILES, *(name.replace(".bin", ".txt") for name in BINARY_FILES))
+#: Files that a binary model has, and a text model; rigs and frames came with COLMAP 4.
+NEEDED = ("cameras.bin", "images.bin", "points3D.bin")
+TEXT_FILES = ("cameras.txt", "images.txt", "points3D.txt")
 #: Camera model → index of each of fx, fy, cx, cy, k1, k2, p1, p2, k3, k4, k5, k6 in COLMAP's parameters, as far as the model has them.
 _LAYOUT = {
     "SIMPLE_PINHOLE": (0, 0, 1, 2),
@@ -77,6 +81,7 @@ def read_model_with(reader: ParserProcess, folder: Path, sizes: Mapping[str, Pho
     name = f"The COLMAP model {folder}"
     needed = MEMORY_FACTOR * sum((folder / file).stat().st_size for file in FILES if (folder / file).is_file())
     check(needed, name)  # by the size that the files state: a sparse one of a terabyte is as long to read
+    _check_files(folder, name)
     check_binary_files(folder)
     with tempfile.TemporaryDirectory(prefix="gsbake-colmap-") as scratch:
         target = Path(scratch) / "model.npz"
@@ -95,6 +100,13 @@ def read_model_with(reader: ParserProcess, folder: Path, sizes: Mapping[str, Pho
     near = (np.abs(arrays["points"]) < MAX_COORDINATE).all(1)
     points, colours = arrays["points"][near], arrays["colours"][near]
     return GivenPoses(cameras, missing, points if len(points) else None, colours if len(points) else None)
+
+
+def _check_files(folder: Path, name: str) -> None:
+    """Raise BadInputError where a model is complete neither in binary nor in text."""
+    absent = [[file for file in kind if not (folder / file).is_file()] for kind in (NEEDED, TEXT_FILES)]
+    if all(absent):
+        raise BadInputError(f"{name} cannot be read (it lacks {missing_list(min(absent, key=len))}); export it again.")
 
 
 def read_tracks(folder: Path) -> tuple[Any, dict[str, NDArray[np.int64]]]:

@@ -15,7 +15,7 @@ from gsbake.capture.poses.validation import MAX_COORDINATE, ImportedCamera, vali
 from gsbake.errors import BadInputError
 from gsbake.geometry.cameras import Array, Camera
 from gsbake.geometry.region import Region
-from gsbake.text import shortlist
+from gsbake.text import missing_list, shortlist
 
 #: Largest deviation of RᵀR from the identity that is attributed to rounding in a text file.
 RIGID_TOLERANCE = 1e-2
@@ -35,7 +35,8 @@ class GivenPoses:
     """Poses supplied by the user, in the frame of their file.
 
     `cameras` by the photo's path inside the photo folder, at the size of the upright source photo; `missing` frames without a photo;
-    `points` (n, 3) and `colours` (n, 3) 8-bit, and the `region` to be baked, when the file has them.
+    `points` (n, 3) and `colours` (n, 3) 8-bit, and the `region` to be baked, when the file has them; `notes`, what the reader changed or
+    did not use, as the arguments of `Monitor.decide`.
     """
 
     cameras: dict[str, Camera]
@@ -43,6 +44,7 @@ class GivenPoses:
     points: Array | None = None
     colours: Array | None = None
     region: Region | None = None
+    notes: tuple[tuple[str, str, str], ...] = ()
 
 
 def checked_rigid(rotation: Array, translation: Array, frame: str, source: str) -> tuple[Array, Array]:
@@ -182,5 +184,8 @@ def match_cameras(
         else:
             cameras[photo] = fit_to_photo(camera, sizes[photo], source)
     if not cameras:
-        raise BadInputError(f"No frame in {source} belongs to a photo by its file name; check that poses and photos are of one capture.")
+        raise BadInputError(
+            f"No frame in {source} belongs to a photo by its file name ({missing_list(missing) or 'there is no frame'}); check that poses "
+            "and photos are of one capture."
+        )
     return cameras, tuple(missing)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from gsbake.capture.poses.folder_formats import has_xmp, is_colmap_model
 from gsbake.capture.poses.frames import GivenPoses, PhotoSize
 from gsbake.capture.poses.llff import read_llff
 from gsbake.capture.poses.metashape import read_metashape
@@ -14,7 +15,6 @@ from gsbake.capture.poses.polycam import read_polycam
 from gsbake.capture.poses.reality_scan import read_reality_scan_csv, read_reality_scan_xmp
 from gsbake.capture.poses.transforms_json import read_transforms
 from gsbake.capture.poses.validation import read_file
-from gsbake.capture.sources import has_xmp, is_colmap_model
 
 
 def read_poses(path: Path, listing: Sequence[str], sizes: Mapping[str, PhotoSize]) -> GivenPoses:

@@ -27,6 +27,7 @@ from gsbake.capture.poses.validation import MAX_FRAMES, read_xml, refuse_coeffic
 from gsbake.errors import BadInputError
 from gsbake.geometry.cameras import Camera
 from gsbake.geometry.region import Region
+from gsbake.text import missing_list
 
 
 def read_metashape(path: Path, sizes: Mapping[str, PhotoSize]) -> GivenPoses:
@@ -41,13 +42,15 @@ def read_metashape(path: Path, sizes: Mapping[str, PhotoSize]) -> GivenPoses:
         scale = float(document.findtext("chunk/transform/scale", "1"))
         if not (math.isfinite(scale) and scale > 0):
             raise BadInputError(f"The scale of the chunk in {path} is {scale}; export the cameras again.")
+        aligned = [entry for entry in document.iter("camera") if entry.findtext("transform") is not None and entry.get("label")]
+        if len(aligned) > MAX_FRAMES:
+            raise BadInputError(f"{path} has more than {MAX_FRAMES} cameras.")
+        lacking = [f"{entry.get('label')}: {what}" for entry in aligned if (what := _absent(sensors.get(entry.get("sensor_id", ""))))]
+        if lacking:
+            raise BadInputError(f"Cameras in {path} lack fields ({missing_list(lacking)}); export the cameras after alignment.")
         frames: list[tuple[str, Camera]] = []
-        for entry in document.iter("camera"):
-            matrix, name = entry.findtext("transform"), entry.get("label", "")
-            if matrix is None or not name:
-                continue
-            if len(frames) == MAX_FRAMES:
-                raise BadInputError(f"{path} has more than {MAX_FRAMES} cameras.")
+        for entry in aligned:
+            matrix, name = entry.findtext("transform", ""), entry.get("label", "")
             pose = np.array(matrix.split(), float).reshape(4, 4)
             rotation, centre = checked_rigid(pose[:3, :3], scale * pose[:3, 3], name, str(path))
             inner = _intrinsics(sensors[entry.get("sensor_id", "")], name, path)
@@ -82,20 +85,23 @@ def _region(document: ElementTree.Element, scale: float, path: Path) -> Region |
     return Region.of(np.concatenate([scale * parts[0], scale * parts[1], parts[2]]).tolist(), str(path))
 
 
+def _absent(sensor: ElementTree.Element | None) -> str:
+    """What a sensor lacks: itself, its calibration or its resolution; empty where nothing."""
+    if sensor is None:
+        return "sensor"
+    if sensor.find("calibration") is None:
+        return "calibration"
+    return "resolution" if sensor.find("calibration/resolution") is None and sensor.find("resolution") is None else ""
+
+
 def _intrinsics(sensor: ElementTree.Element, name: str, path: Path) -> dict[str, Any]:
-    """Size, focal lengths, principal point and distortion of a camera with this sensor."""
+    """Size, focal lengths, principal point and distortion of a camera with this sensor, which lacks nothing."""
     found = sensor.findall("calibration")
-    calibration = next((c for c in found if c.get("class") == "adjusted"), found[0] if found else None)
-    if calibration is None:
-        raise BadInputError(f"The sensor of frame {name} in {path} has no calibration; export the cameras after alignment.")
+    calibration = next((c for c in found if c.get("class") == "adjusted"), found[0])
     kind = calibration.get("type", sensor.get("type", "frame"))
     if kind != "frame":
         raise BadInputError(f"The camera of frame {name} in {path} is of the type {kind}, not frame; undistort the photos first.")
-    resolution = calibration.find("resolution")
-    if resolution is None:
-        resolution = sensor.find("resolution")
-    if resolution is None:
-        raise BadInputError(f"The sensor of frame {name} in {path} has no resolution.")
+    resolution = next(r for where in (calibration, sensor, *found) if (r := where.find("resolution")) is not None)
     width, height = int(resolution.get("width", "")), int(resolution.get("height", ""))
     value = {child.tag: float(child.text or "") for child in calibration if child.tag != "resolution" and len(child) == 0}
     if "f" in value:

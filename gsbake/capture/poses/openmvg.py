@@ -20,6 +20,7 @@ from gsbake.capture.poses.frames import GivenPoses, PhotoSize, checked_rigid, ma
 from gsbake.capture.poses.validation import MAX_FRAMES, Coefficient, Focal, Principal, Size, Strict, Vector, read_json
 from gsbake.errors import BadInputError
 from gsbake.geometry.cameras import Camera
+from gsbake.text import missing_list
 
 _Body = TypeVar("_Body")
 
@@ -81,12 +82,13 @@ def read_openmvg(path: Path, sizes: Mapping[str, PhotoSize]) -> GivenPoses:
     body = read_json(path, _SfmData, "sfm_data.json of OpenMVG")
     lenses = {entry.key: entry.value.ptr_wrapper.data for entry in body.intrinsics}
     poses = {entry.key: entry.value for entry in body.extrinsics}
+    posed = [view for entry in body.views if (view := entry.value.ptr_wrapper.data).id_pose in poses]
+    if lost := [view.filename for view in posed if view.id_intrinsic not in lenses]:
+        raise BadInputError(f"The intrinsics of {len(lost)} views in {path} are not in the file ({missing_list(lost)}); export it again.")
+    if lacking := [f"{view.filename}: {field}" for view in posed for field in _absent(lenses[view.id_intrinsic])]:
+        raise BadInputError(f"{path} lacks fields of cameras ({missing_list(lacking)}); export it again.")
     frames = []
-    for view in (entry.value.ptr_wrapper.data for entry in body.views):
-        if view.id_pose not in poses:
-            continue
-        if view.id_intrinsic not in lenses:
-            raise BadInputError(f"The intrinsics of view {view.filename} in {path} are not in the file; export it again.")
+    for view in posed:
         pose = poses[view.id_pose]
         R, centre = checked_rigid(np.array(pose.rotation), np.array(pose.center), view.filename, str(path))
         camera = Camera(name=view.filename, R=R, t=-R @ centre, **_intrinsics(lenses[view.id_intrinsic], view.filename, path))
@@ -97,13 +99,18 @@ def read_openmvg(path: Path, sizes: Mapping[str, PhotoSize]) -> GivenPoses:
     return GivenPoses(cameras, missing)
 
 
+def _absent(lens: _Lens) -> list[str]:
+    """Fields of its size that a camera lacks."""
+    pinhole = lens.value0 or lens
+    return [name for name in ("width", "height") if getattr(pinhole, name) is None]
+
+
 def _intrinsics(lens: _Lens, name: str, path: Path) -> dict[str, Any]:
     """Size, focal length, principal point and OpenCV distortion."""
     pinhole = lens.value0 or lens
     if lens.fisheye is not None or pinhole.focal_length is None or pinhole.principal_point is None:
         raise BadInputError(f"The camera of view {name} in {path} is no pinhole (it is fisheye or spherical); undistort the photos first.")
-    if pinhole.width is None or pinhole.height is None:
-        raise BadInputError(f"The camera of view {name} in {path} has no size; export it again.")
+    assert pinhole.width is not None and pinhole.height is not None, "checked for all cameras at once"
     k1, k2, k3, p1, p2 = lens.disto_t2 or [*(lens.disto_k3 or [*(lens.disto_k1 or [0.0]), 0.0, 0.0]), 0.0, 0.0]
     k = k1, k2, p1, p2, k3
     return {

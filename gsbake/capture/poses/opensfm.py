@@ -19,6 +19,7 @@ from gsbake.capture.poses.frames import GivenPoses, PhotoSize, checked_rigid, ma
 from gsbake.capture.poses.validation import MAX_FRAMES, Coefficient, Focal, Size, Strict, Vector, read_json
 from gsbake.errors import BadInputError
 from gsbake.geometry.cameras import Camera
+from gsbake.text import missing_list
 
 #: Models with one focal length, and models with two and a principal point.
 _MODELS = ("perspective", "simple_radial", "radial", "brown")
@@ -65,10 +66,12 @@ def read_opensfm(path: Path, sizes: Mapping[str, PhotoSize]) -> GivenPoses:
     found = max(read_json(path, list[_Reconstruction], "reconstruction.json of OpenSfM"), key=lambda r: len(r.shots), default=None)
     if found is None or not found.shots:
         raise BadInputError(f"{path} holds no reconstruction with a photo; run OpenSfM's reconstruction again.")
+    if lost := [f"{shot.camera} of {name}" for name, shot in found.shots.items() if shot.camera not in found.cameras]:
+        raise BadInputError(f"{len(lost)} frames in {path} have a camera that is not in the file ({missing_list(lost)}); export it again.")
+    if lacking := [name for name, lens in found.cameras.items() if lens.focal is None and lens.focal_x is None]:
+        raise BadInputError(f"{len(lacking)} cameras in {path} have no focal length, focal or focal_x ({missing_list(lacking)}).")
     frames = []
     for name, shot in found.shots.items():
-        if shot.camera not in found.cameras:
-            raise BadInputError(f"The camera {shot.camera} of frame {name} in {path} is not in the file; export the poses again.")
         turn = Rotation.from_rotvec(shot.rotation).as_matrix()
         R, t = checked_rigid(turn, np.array(shot.translation), name, str(path))
         frames.append((name, Camera(name=name, R=R, t=t, **_intrinsics(found.cameras[shot.camera], name, path))))
@@ -87,8 +90,7 @@ def _intrinsics(lens: _Lens, name: str, path: Path) -> dict[str, Any]:
     side = max(lens.width, lens.height)
     fx = lens.focal if lens.focal_x is None else lens.focal_x
     fy = fx if lens.focal_y is None else lens.focal_y
-    if fx is None or fy is None:
-        raise BadInputError(f"The camera of frame {name} in {path} has no focal length.")
+    assert fx is not None and fy is not None, "checked for all cameras at once"
     k = lens.k1, lens.k2, lens.p1, lens.p2, lens.k3
     return {
         "width": round(lens.width),

@@ -10,12 +10,13 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
-from pydantic import create_model
+from pydantic import ValidationError, create_model
 
 from gsbake.capture.poses.frames import GivenPoses, PhotoSize, checked_rigid, match_cameras
-from gsbake.capture.poses.validation import MAX_FRAMES, Coordinate, Focal, Principal, Size, Strict, read_json
+from gsbake.capture.poses.validation import MAX_FRAMES, Coordinate, Focal, Principal, Size, Strict, error_lines, read_json_text
 from gsbake.errors import BadInputError
 from gsbake.geometry.cameras import Camera
+from gsbake.text import missing_list
 
 _ROWS = tuple(f"t_{row}{column}" for row in range(3) for column in range(4))
 #: From Y up to Z up.
@@ -42,9 +43,16 @@ def read_polycam(folder: Path, sizes: Mapping[str, PhotoSize]) -> GivenPoses:
     files = sorted(folder.glob("*.json"))
     if len(files) > MAX_FRAMES:
         raise BadInputError(f"{folder} has more than {MAX_FRAMES} cameras.")
-    frames = []
+    bodies, wrong = [], []
     for file in files:
-        body = read_json(file, _Keyframe, "camera of Polycam")
+        try:
+            bodies.append(_Keyframe.model_validate_json(read_json_text(file)))
+        except ValidationError as error:
+            wrong += [f"{file.name}: {line}" for line in error_lines(error)]
+    if wrong:
+        raise BadInputError(f"{folder} holds files that are not a valid camera of Polycam ({missing_list(wrong)}).")
+    frames = []
+    for file, body in zip(files, bodies, strict=True):
         matrix = np.array([getattr(body, name) for name in _ROWS]).reshape(3, 4)
         rotation, centre = checked_rigid(_Z_UP @ matrix[:, :3], _Z_UP @ matrix[:, 3], file.stem, str(folder))
         R, t = Camera.pose_from_opengl(np.column_stack([rotation, centre]))

@@ -27,6 +27,7 @@ from gsbake.capture.poses.frames import GivenPoses, PhotoIndex, PhotoSize, check
 from gsbake.capture.poses.validation import MAX_FRAMES, read_file, read_xml, refuse_coefficient
 from gsbake.errors import BadInputError
 from gsbake.geometry.cameras import Array, Camera
+from gsbake.text import missing_list
 
 #: Longer side of the sensor in mm that focal lengths are for.
 SENSOR = 36.0
@@ -52,7 +53,8 @@ def read_reality_scan_csv(path: Path, sizes: Mapping[str, PhotoSize]) -> GivenPo
         header = [name.strip().lstrip("#").lower() for name in next(rows, [])]
         if absent := [name for name in REQUIRED if name not in header]:
             raise BadInputError(
-                f"{path} lacks the column {absent[0]}; export Internal/External camera parameters, with all columns, from RealityScan."
+                f"{path} lacks columns ({missing_list(absent)}); export Internal/External camera parameters, with all columns, from "
+                "RealityScan."
             )
         for number, row in enumerate(rows, 2):
             if not row:
@@ -86,10 +88,11 @@ def read_reality_scan_xmp(folder: Path, sizes: Mapping[str, PhotoSize]) -> Given
     files = sorted(path for path in folder.iterdir() if path.suffix.lower() == ".xmp")
     if len(files) > MAX_FRAMES:
         raise BadInputError(f"{folder} has more than {MAX_FRAMES} cameras.")
-    for file in files:
-        root = read_xml(file, "XMP file of RealityScan")
-        if _value(root, "Position") is None:
-            continue
+    placed = [(file, root) for file in files if _value(root := read_xml(file, "XMP file of RealityScan"), "Position") is not None]
+    lacking = [f"{file.name}: {field}" for file, root in placed for field in ("Rotation", "FocalLength35mm") if _value(root, field) is None]
+    if lacking:
+        raise BadInputError(f"XMP files in {folder} lack fields ({missing_list(lacking)}); export them again from RealityScan.")
+    for file, root in placed:
         try:
             camera = _xmp_camera(root, file, _size(file.stem, index, sizes))
         except (ValueError, OverflowError) as error:

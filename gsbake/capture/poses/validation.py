@@ -15,6 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
 from gsbake.errors import BadInputError
 from gsbake.memory_budget import check, json_bytes
+from gsbake.text import missing_list
 
 #: Largest pose file in bytes: a transforms.json of 100 000 frames has about 100 MB.
 MAX_FILE_SIZE = 256 << 20
@@ -24,6 +25,8 @@ MAX_COORDINATE = 1e9
 XML_BYTES = 400
 #: Most frames of a pose file.
 MAX_FRAMES = 100_000
+#: Most characters of a field's path in a message: keys come from strangers.
+MAX_FIELD_NAME = 200
 #: Largest effect in pixels at which a coefficient that is not supported is ignored.
 NEGLIGIBLE_PIXELS = 0.1
 
@@ -90,7 +93,7 @@ def read_json(path: Path, kind: type[_Body], what: str) -> _Body:
     try:
         return TypeAdapter(kind).validate_json(read_json_text(path))
     except ValidationError as error:
-        raise BadInputError(f"{path} is not a valid {what} ({first_error(error)}).") from error
+        raise BadInputError(f"{path} is not a valid {what} ({listed_errors(error)}).") from error
 
 
 def read_xml(path: Path, what: str) -> ElementTree.Element:
@@ -133,18 +136,25 @@ def refuse_coefficient(coefficient: str, pixels: float, frame: str, source: str)
 
 
 def validate(model: type[Strict], values: Any, what: str) -> Any:
-    """`values` as an instance of `model`. Raises BadInputError that names the first wrong field of `what`."""
+    """`values` as an instance of `model`. Raises BadInputError that lists the wrong fields of `what`."""
     try:
         return model.model_validate(values)
     except ValidationError as error:
-        raise BadInputError(f"{what} is invalid: {first_error(error)}.") from error
+        raise BadInputError(f"{what} is invalid: {listed_errors(error)}.") from error
     except (OverflowError, RecursionError) as error:
         raise BadInputError(f"{what} is invalid: a number is too large.") from error
 
 
-def first_error(error: ValidationError) -> str:
-    """The first error of a validation as "field: reason"."""
-    first = error.errors(include_url=False, include_context=False, include_input=False)[0]
-    where = ".".join(map(str, first["loc"]))
-    reason = first["msg"][:1].lower() + first["msg"][1:]
-    return f"{where}: {reason}" if where else reason
+def listed_errors(error: ValidationError) -> str:
+    """The errors of a validation as text, up to ten, then their number."""
+    return missing_list(error_lines(error))
+
+
+def error_lines(error: ValidationError) -> list[str]:
+    """The errors of a validation, each as "field: reason"."""
+    lines = []
+    for found in error.errors(include_url=False, include_context=False, include_input=False):
+        where = ".".join(map(str, found["loc"]))[:MAX_FIELD_NAME]
+        reason = found["msg"][:1].lower() + found["msg"][1:]
+        lines.append(f"{where}: {reason}" if where else reason)
+    return lines

@@ -13,8 +13,9 @@ from urllib.parse import quote
 
 import numpy as np
 
-from gsbake.capture.photos.undistortion import distort, intrinsics_key, pinhole_camera
+from gsbake.capture.photos.undistortion import distort, pinhole_camera
 from gsbake.capture.sfm.feature_masks import FeatureMasks
+from gsbake.capture.sfm.lenses import given_lenses, solved_lenses
 from gsbake.capture.sfm.pairs import choose_matching
 from gsbake.capture.sfm.process import JobCallbacks, run_job
 from gsbake.capture.sfm.standing_background import StandingBackground, find_standing_background
@@ -87,6 +88,9 @@ class PoseSolver:
         names = sorted(e["name"] for e in self.entries)
         kind, evidence = choose_matching(self.options.matching, names)
         self.monitor.decide("matching", kind, evidence)
+        lenses, folders = solved_lenses(self.entries)
+        if folders:
+            self.monitor.decide("shared intrinsics", f"{len(lenses)} cameras", folders)
         found = self._best_attempt(kind)
         result = found.result
         count, missing = int(result["registered"]), list(result["missing"])
@@ -119,7 +123,7 @@ class PoseSolver:
             "reprojection_px": result["reprojection_px"],
             "points": result["points"],
             "track_length": result["track_length"],
-            "cameras": len(_lenses(self.entries)),
+            "cameras": len(lenses),
             "matching": kind,
             "masked_features": found.masked,
             "moving_features": found.region == "moving parts",
@@ -209,7 +213,7 @@ class PoseSolver:
             return Solved(cameras, known, figures)
         posed = {c.name for c in cameras}
         job = self._job("triangulate", [e for e in self.entries if e["name"] in posed], None)
-        job |= {"cameras": str(self.ingest / "poses" / "cameras.json"), "lenses": _given_lenses(cameras)}
+        job |= {"cameras": str(self.ingest / "poses" / "cameras.json"), "lenses": given_lenses(cameras)}
         limit = max(MIN_SECONDS, SECONDS_PER_PHOTO * len(cameras))
         cloud = self.folder / "points.ply"
         solved = self._run(job, self.folder, limit)
@@ -228,7 +232,7 @@ class PoseSolver:
             "masks": None if masks is None else str(masks),
             "work": str(self.scratch / "colmap"),
             "cache": None if self.cache is None else str(self.cache),
-            "lenses": _lenses(entries),
+            "lenses": solved_lenses(entries)[0],
             "one_camera": list(one_camera),
             "max_features": options.max_features,
             "peak_threshold": options.peak_threshold,
@@ -296,27 +300,3 @@ def _database_is_intact(path: Path) -> bool:
             return bool(base.execute("PRAGMA integrity_check").fetchone() == ("ok",))
     except sqlite3.Error:
         return False
-
-
-def _lenses(entries: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Photos grouped by shared intrinsics: photo size, and camera and focal length from EXIF."""
-    groups: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
-    for entry in entries:
-        groups.setdefault((entry["width"], entry["height"], entry["camera_model"]), []).append(entry)
-    lenses = []
-    for (width, height, _), members in groups.items():
-        focals = sorted(e["focal_px"] for e in members if e["focal_px"])
-        focal = focals[len(focals) // 2] if focals else None
-        lenses.append({"names": [e["name"] for e in members], "width": width, "height": height, "focal": focal})
-    return lenses
-
-
-def _given_lenses(cameras: Sequence[Camera]) -> list[dict[str, Any]]:
-    """Photos grouped by their given intrinsics."""
-    groups: dict[tuple[float, ...], list[Camera]] = {}
-    for camera in cameras:
-        groups.setdefault(intrinsics_key(camera), []).append(camera)
-    return [
-        {"names": [c.name for c in members], "width": members[0].width, "height": members[0].height, "focal": None}
-        for members in groups.values()
-    ]

@@ -3,18 +3,24 @@
 from __future__ import annotations
 
 import json
+import struct
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from gsbake.capture.ingest import IngestOptions, ingest
 from gsbake.capture.photos.decode import UnreadablePhotoError
-from gsbake.capture.photos.video import FrameMeasures, choose, frames, measure
+from gsbake.capture.photos.hdr import linear_light
+from gsbake.capture.photos.video import FrameMeasures, choose, frames, measure, write_frames
+from gsbake.capture.photos.video_transfer import video_transfer
 from gsbake.capture.sources import discover
 from gsbake.config.schema import Ingest
 from gsbake.errors import BadInputError
+from gsbake.imaging.srgb import decode
+from tests.support.slow import slow
 
 
 def write_video(path: Path, offsets: list[int], blurred: tuple[int, ...] = (), size: int = 160) -> Path:
@@ -28,6 +34,72 @@ def write_video(path: Path, offsets: list[int], blurred: tuple[int, ...] = (), s
         writer.write(cv2.GaussianBlur(frame, (0, 0), 3) if index in blurred else frame)
     writer.release()
     return path
+
+
+def tagged(path: Path, primaries: int, transfer: int, matrix: int) -> Path:
+    """A copy of an MP4 of `write_video` whose only track says how its colours are coded (the box colr)."""
+    data, at, end = bytearray(path.read_bytes()), 0, path.stat().st_size
+    box = struct.pack(">I4s4sHHHB", 19, b"colr", b"nclx", primaries, transfer, matrix, 0)
+    around = []
+    for kind, before in (*((k, 0) for k in (b"moov", b"trak", b"mdia", b"minf", b"stbl")), (b"stsd", 8), (b"mp4v", 78)):
+        while data[at + 4 : at + 8] != kind:
+            at += int.from_bytes(data[at : at + 4], "big")
+            assert at < end, kind
+        around.append(at)
+        end = at + int.from_bytes(data[at : at + 4], "big")
+        at += 8 + before
+    for place in around:
+        data[place : place + 4] = (int.from_bytes(data[place : place + 4], "big") + len(box)).to_bytes(4, "big")
+    copy = path.with_name(f"{transfer}.mp4")
+    copy.write_bytes(bytes(data[:end]) + box + bytes(data[end:]))
+    return copy
+
+
+def even(folder: Path, colours: list[tuple[int, int, int]]) -> Path:
+    """Two frames of each even colour (r, g, b)."""
+    writer = cv2.VideoWriter(str(folder / "even.mp4"), cv2.VideoWriter.fourcc(*"mp4v"), 25, (64, 64))
+    for colour in colours:
+        for _ in range(2):
+            writer.write(np.full((64, 64, 3), colour[::-1], np.uint8))
+    writer.release()
+    return folder / "even.mp4"
+
+
+@pytest.mark.parametrize("transfer", [slow(16), 18])
+def test_hdr_transfers_are_undone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, transfer: int) -> None:
+    """The light that BT.2100 says, of the scene for HLG and of a screen for PQ, in primaries of sRGB; reference white is white.
+
+    This holds for the FFmpeg in OpenCV's wheel, which converts part of the way and takes seconds to prepare for it: one pass is left out.
+    """
+    monkeypatch.setattr("gsbake.capture.photos.video.measure", lambda *_: FrameMeasures(np.ones(12), np.ones(12)))
+    greys = [(level, level, level) for level in (60, 100, 140, 250)]
+    path = even(tmp_path, [*greys, (120, 105, 100), (100, 110, 120)])
+    (tmp_path / "plain").mkdir()
+    (tmp_path / "out").mkdir()
+    assert write_frames(path, tmp_path / "plain", 100, 10.0) == (12, 12, "")
+    assert write_frames(tagged(path, 9, transfer, 6), tmp_path / "out", 100, 10.0)[2] == {16: "PQ", 18: "HLG"}[transfer]
+
+    def read(folder: str) -> NDArray[np.float64]:
+        """Colours (n, 3) of the frames."""
+        files = sorted((tmp_path / folder).iterdir())[1::2]
+        return np.array([np.asarray(cv2.imread(str(file)))[32, 32, ::-1] for file in files]) / 255.0
+
+    shown = linear_light(read("plain"), transfer, 9).clip(0, 1)
+    allowed = 0.008 + (0.05 if transfer == 18 else 0.09) * shown  # a step of PQ in 8 bits is 4 % of the light
+    assert (np.abs(decode(read("out")) - shown) < allowed).all()
+    assert not (np.abs(decode(read("plain")) - shown) < allowed).all()  # the signal, taken for sRGB
+
+
+def test_a_video_says_how_it_is_coded(tmp_path: Path) -> None:
+    path = even(tmp_path, [(50, 50, 50)])
+    assert video_transfer(path) is None
+    for code in (1, 16, 18):
+        assert video_transfer(tagged(path, 9, code, 9)) == code
+    whole = tagged(path, 9, 18, 9).read_bytes()
+    cut = tmp_path / "cut.mp4"
+    for length in range(0, len(whole), 37):  # damaged files end in an answer
+        cut.write_bytes(whole[:length])
+        assert video_transfer(cut) in (None, 18)
 
 
 def test_frames_follow_the_motion() -> None:

@@ -63,7 +63,7 @@ def test_transforms_angle_suffixless_and_frame_wins(tmp_path: Path) -> None:
     [
         ({"at": (0, 3), "value": float("nan")}, r"Frame 1: .*finite number"),
         ({"at": (1, 1), "value": float("inf")}, r"Frame 1: .*finite number"),
-        ({"scale": 2.0}, r"images/a\.jpg.*no rigid"),
+        ({"scale": (1.0, 1.0, 2.0)}, r"images/a\.jpg.*no rigid"),
         ({"mirror": True}, r"images/a\.jpg.*no rigid"),
         ({"at": (3, 3), "value": 2.0}, r"images/a\.jpg.*last row"),
     ],
@@ -172,8 +172,49 @@ def test_broken_colmap_models(tmp_path: Path) -> None:
     with pytest.raises(BadInputError, match="OPENCV_FISHEYE.*undistort"):
         read_poses(folder, [], SIZES)
     (folder / "images.txt").unlink()
-    with pytest.raises(BadInputError, match="cannot be read"):
+    (folder / "points3D.txt").unlink()
+    with pytest.raises(BadInputError, match=r"cannot be read \(it lacks images\.txt, points3D\.txt\)"):
         read_poses(folder, [], SIZES)
+
+
+def test_colmap_names_with_spaces(tmp_path: Path) -> None:
+    """A name is the rest of its line; the line of points may be empty, and lines may end as on Windows."""
+    folder = colmap_text(tmp_path / "text")
+    one, points = (folder / "images.txt").read_text().splitlines()
+    first, second = (one.replace("left/a.jpg", f"left side/{name}.jpg") for name in ("a  1", "b 2"))
+    lines = ["# Image list", "", first, points, f"2{second[1:]}", "", ""]
+    (folder / "images.txt").write_bytes("\r\n".join(lines).encode())
+    sizes = {"left side/a  1.jpg": SIZES["a.jpg"], "left side/b 2.jpg": SIZES["b.jpg"]}
+    given = read_poses(folder, [], sizes)
+    assert sorted(given.cameras) == sorted(sizes) and given.missing == ()
+    assert given.cameras["left side/a  1.jpg"].centre == pytest.approx([5, 0, 1])
+
+
+def rig_model(folder: Path, second: str) -> Path:
+    """A text model of COLMAP 4: a rig of two cameras, the second as `second` says, seen once from the origin moved back by 5."""
+    folder.mkdir()
+    (folder / "cameras.txt").write_text("1 PINHOLE 200 100 150 160 90 60\n2 PINHOLE 200 100 150 160 90 60\n")
+    (folder / "rigs.txt").write_text(f"1 2 CAMERA 1 CAMERA 2 {second}\n")
+    (folder / "frames.txt").write_text("1 1 1 0 0 0 0 0 5 2 CAMERA 1 1 CAMERA 2 2\n")
+    (folder / "images.txt").write_text("1 1 0 0 0 0 0 5 1 a.jpg\n\n2 1 0 0 0 1 0 5 2 b.jpg\n\n")
+    (folder / "points3D.txt").write_text("")
+    return folder
+
+
+def test_colmap_rigs_and_frames(tmp_path: Path) -> None:
+    """Cameras of a rig are placed by it; a rig of one camera is what COLMAP 4 writes for each single camera."""
+    text, binary = rig_model(tmp_path / "text", "1 1 0 0 0 1 0 0"), tmp_path / "binary"
+    single = colmap_text(tmp_path / "single")
+    pycolmap.Reconstruction(str(single)).write_text(str(single))
+    assert (single / "rigs.txt").is_file() and (single / "frames.txt").is_file()
+    assert read_poses(single, [], SIZES).cameras["a.jpg"].centre == pytest.approx([5, 0, 1])
+    binary.mkdir()
+    pycolmap.Reconstruction(str(text)).write_binary(str(binary))
+    for folder in (text, binary):
+        cameras = read_poses(folder, [], SIZES).cameras
+        assert cameras["a.jpg"].centre == pytest.approx([0, 0, -5]) and cameras["b.jpg"].centre == pytest.approx([-1, 0, -5])
+    with pytest.raises(BadInputError, match=r"rigs in which cameras have no known place \(b\.jpg\)"):
+        read_poses(rig_model(tmp_path / "unknown", "0"), [], SIZES)
 
 
 def test_frames_match_their_photos() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import cv2
@@ -109,6 +110,15 @@ def test_wrong_files_end_in_a_sentence(tmp_path: Path, text: str, message: str) 
     with pytest.raises(BadInputError, match=message) as caught:
         read(tmp_path, text)
     assert "\n" not in str(caught.value)
+
+
+def test_what_cameras_lack_is_listed(tmp_path: Path) -> None:
+    """A sensor that is not in the file, and one without a calibration or a resolution."""
+    one, two = '<camera id="0" label="a" sensor_id="0">', '<camera id="2" label="b" sensor_id="7"><transform>x</transform></camera>'
+    with pytest.raises(BadInputError, match=r"lack fields \(b: sensor, a: resolution\)"):
+        read(tmp_path, re.sub("<resolution[^>]*>", "", document()).replace(one, two + one))
+    with pytest.raises(BadInputError, match=r"lack fields \(a: calibration\)"):
+        read(tmp_path, re.sub("<calibration.*</calibration>", "", document()))
 
 
 def test_a_real_file() -> None:

@@ -224,7 +224,7 @@ def test_polycam(tmp_path: Path) -> None:
         ("c.csv", f"{HEADER}\n{csv_row(heading='nan')}\n", "row 2 has no name"),
         ("c.csv", f"{HEADER}\n{csv_row(heading='x')}\n", "not a valid CSV file of RealityScan"),
         ("c.csv", f"{HEADER}\na.jpg,1\n", "not a valid CSV file of RealityScan"),
-        ("c.csv", "name,x\n", "lacks the column y"),
+        ("c.csv", "name,x\n", "lacks columns .y, alt, heading, pitch, roll, f."),
         ("c.csv", f"{HEADER}\n", "No frame"),
         ("r.json", json.dumps(opensfm(projection_type="fisheye")), "of the type fisheye"),
         ("r.json", json.dumps(opensfm(focal_x=None)), "no focal length"),
@@ -234,10 +234,10 @@ def test_polycam(tmp_path: Path) -> None:
         ("r.json", "[" * 3000, "not a valid reconstruction.json"),
         ("s.json", json.dumps(openmvg(lens={"fisheye": [0.1]})), "no pinhole"),
         ("s.json", json.dumps({**openmvg(), "extrinsics": []}), "no view with a pose"),
-        ("s.json", json.dumps({**openmvg(), "intrinsics": []}), "intrinsics of view a.jpg"),
+        ("s.json", json.dumps({**openmvg(), "intrinsics": []}), r"intrinsics of 1 views in .*\(a\.jpg\)"),
         ("s.json", '{"sfm_data_version": "0.3"}', "not a valid sfm_data.json"),
         ("cameras/a.json", json.dumps({**polycam(np.eye(3), CENTRE), "t_00": 3.0}), "no rigid motion"),
-        ("cameras/a.json", "{}", "not a valid camera of Polycam"),
+        ("cameras/a.json", "{}", r"not a valid camera of Polycam \(a\.json: fx: field .*t_03: field required and 8 more"),
     ],
 )
 def test_wrong_files_end_in_a_sentence(tmp_path: Path, name: str, text: str, message: str) -> None:
@@ -248,3 +248,29 @@ def test_wrong_files_end_in_a_sentence(tmp_path: Path, name: str, text: str, mes
     with pytest.raises(BadInputError, match=message) as caught:
         read(path if path.suffix in (".csv", ".json") and path.parent == tmp_path else path.parent)
     assert "\n" not in str(caught.value)
+
+
+def test_all_that_is_missing_is_listed_up_to_ten(tmp_path: Path) -> None:
+    """Fields, cameras and photos by name, then their number; the first alone would be mended twelve times."""
+    names = [f"{k:02}.jpg" for k in range(12)]
+    ten, whole = r"00.*01.*02.*03.*04.*05.*06.*07.*08.*09.*and 2 more", {name: SIZE for name in names}
+    shots = opensfm()[1]["shots"]["a.jpg"]
+    (tmp_path / "r.json").write_text(json.dumps([{**opensfm()[1], "shots": {name: shots | {"camera": "gone"} for name in names}}]))
+    frames = [{"file_path": name, "transform_matrix": np.eye(4).tolist()} for name in names]
+    (tmp_path / "t.json").write_text(json.dumps({"frames": frames}))
+    (tmp_path / "u.json").write_text(json.dumps({"w": 600, "h": 400, "fl_x": 500, "frames": [{"file_path": name} for name in names]}))
+    (tmp_path / "v.json").write_text(json.dumps({"w": 600, "h": 400, "fl_x": 500, "frames": frames}))
+    (tmp_path / "xmp").mkdir()
+    for name in names:
+        position = '<x xmlns:xcr="http://www.capturingreality.com/ns/xcr/1.1#"><xcr:Position>1 2 3</xcr:Position></x>'
+        (tmp_path / "xmp" / name.replace("jpg", "xmp")).write_text(position)
+    for name, message in {
+        "r.json": f"12 frames in .*camera that is not in the file .*{ten}",
+        "t.json": f"12 frames in .*no focal length.*{ten}",
+        "u.json": r"frames\.0\.transform_matrix: field required.*frames\.9\.transform_matrix: field required and 2 more",
+        "xmp": r"lack fields \(00\.xmp: Rotation, 00\.xmp: FocalLength35mm, 01\.xmp.*04\.xmp: FocalLength35mm and 14 more",
+    }.items():
+        with pytest.raises(BadInputError, match=message):
+            read_poses(tmp_path / name, [], whole)
+    with pytest.raises(BadInputError, match=f"No frame in .*{ten}"):
+        read_poses(tmp_path / "v.json", [], SIZES)
