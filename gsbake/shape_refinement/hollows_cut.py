@@ -16,9 +16,7 @@ from scipy.sparse.csgraph import breadth_first_order, maximum_flow
 UNITS = 1000
 
 
-def cut_cells(
-    removed: NDArray[np.bool_], left: NDArray[np.bool_], cost: NDArray[np.float32], area: float
-) -> NDArray[np.bool_]:
+def cut_cells(removed: NDArray[np.bool_], left: NDArray[np.bool_], cost: NDArray[np.float32], area: float) -> NDArray[np.bool_]:
     """Which of the `removed` cells (n, n, n) stay air: the cut of least cost between the air and what is `left` (n, n, n).
 
     `cost` (n, n, n), 0 to 10⁵, of a surface in a cell; `area` is added for each face between two cells.

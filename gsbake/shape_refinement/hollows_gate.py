@@ -1,8 +1,8 @@
 """Whether an opened hollow explains photos that its opening did not see.
 
-A glossy surface shows its surroundings behind itself, and a front follows them inwards. So the closed hull is given its reflections: diffuse
-colour, reflectance and distant light are fitted to the photos that the front saw, for the hull and for the opened shape, each with and
-without reflections, and predict the others. An opened region stays where it predicts them much better than the hull's surface over it.
+A glossy surface shows its surroundings behind itself, and a front follows them inwards. So the closed hull is given its reflections:
+diffuse colour, reflectance and distant light are fitted to the photos that the front saw, for the hull and for the opened shape, each with
+and without reflections, and predict the others. An opened region stays where it predicts them much better than the hull's surface over it.
 """
 
 from __future__ import annotations
@@ -47,9 +47,7 @@ class Verdict:
     accepted: bool
 
 
-def judge_regions(
-    hull: Hull, opened: Hull, photos: Sequence[Photo], held: NDArray[np.bool_]
-) -> tuple[list[Verdict], NDArray[np.bool_]]:
+def judge_regions(hull: Hull, opened: Hull, photos: Sequence[Photo], held: NDArray[np.bool_]) -> tuple[list[Verdict], NDArray[np.bool_]]:
     """What is decided about each connected region that is solid in `hull` and air in `opened`, the largest first, and the cells
     (n, n, n) of those that are refused; smaller ones are refused without a verdict. `held` (photos,) are the photos that decide."""
     removed = (hull.field < 0) & (opened.field >= 0)
@@ -57,7 +55,7 @@ def judge_regions(
     if not count:
         return [], np.zeros(removed.shape, bool)
     size = np.bincount(label[removed], minlength=count + 1)
-    before, after = (_errors(one, other, label, photos, held) for one, other in ((hull, opened), (opened, hull)))
+    before, after = (_RegionErrors(one, other, label, photos, held) for one, other in ((hull, opened), (opened, hull)))
     verdicts, accepted = [], np.zeros(count + 1, bool)
     accepted[0] = True
     for number in np.argsort(-size, kind="stable"):
@@ -68,12 +66,10 @@ def judge_regions(
     return verdicts, ~accepted[label]
 
 
-class _errors:  # noqa: N801
+class _RegionErrors:
     """Median errors of a shape by region."""
 
-    def __init__(
-        self, shape: Hull, other: Hull, label: NDArray[np.int32], photos: Sequence[Photo], held: NDArray[np.bool_]
-    ) -> None:
+    def __init__(self, shape: Hull, other: Hull, label: NDArray[np.int32], photos: Sequence[Photo], held: NDArray[np.bool_]) -> None:
         vertices, corners = shape.triangles()
         cells = np.clip(np.floor((vertices - shape.lower) / shape.cell), 0, len(label) - 1).astype(np.int64)
         self._region = np.where(np.abs(other.field[tuple(cells.T)]) > OFF * shape.cell, label[tuple(cells.T)], 0)

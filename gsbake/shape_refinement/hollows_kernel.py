@@ -20,7 +20,10 @@ ROUNDS = 2
 
 @kernel("i8, i8, f4[:, :, ::1], f4[:, :, ::1], f4[:, ::1], f8, f8[:, ::1]", error_model="numpy", nogil=True)
 def parallax_rows(start: int, stop: int, colour: Any, slope: Any, weight: Any, floor: float, out: Any) -> None:
-    """Fill `out` (v, 4) of the vertices start..stop: h, g, the mean of |I − m|² with the weights `weight` (v, photos) alone, and Σ w ρ. `colour` and `slope` (v, photos, 3); `floor` is the least deviation of a sample."""
+    """Fill `out` (v, 4) of the vertices start..stop: h, g, the mean of |I − m|² with the weights `weight` (v, photos) alone, and Σ w ρ.
+
+    `colour` and `slope` (v, photos, 3); `floor` is the least deviation of a sample.
+    """
     photos = weight.shape[1]
     used = np.empty(photos)
     for v in range(start, stop):
