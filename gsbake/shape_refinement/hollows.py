@@ -1,104 +1,186 @@
 """Hollows of a visual hull, opened where photos disagree about the colour of their lids.
 
 A visual hull has a lid on every hollow, and stereo measures nothing in a hollow without texture. Photos disagree about the colour of a lid:
-each sees another part of the hollow through it. A front moves inwards from the hull (`hollows_front`), a minimum cut goes back to the
-surface that the photos agreed on most (`hollows_cut`), and photos that the front did not see decide about each hollow (`hollows_gate`).
-All of it on blocks of the hull's cells and small photos: stereo measures the surface afterwards.
+each sees another part of the hollow through it (`hollows_lids`). A hollow is proposed under each lid: what is farther from the rest of the
+hull's surface than some thickness of the wall, for several thicknesses. Photos that a surface's colours were not fitted to say how well
+it predicts them (`hollows_prediction`): the best thickness is taken, or a minimum cut between all of them (`hollows_cut`), where it
+predicts much better than the lid with reflections. Only what photos see through the lid is opened. Stereo measures the surface afterwards.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
-from typing import Any
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
+from scipy.spatial import cKDTree
 
 from gsbake.capture.hull.visual_hull import Hull
-from gsbake.imaging.srgb import encode
-from gsbake.shape_refinement.hollows_front import Front, FrontOptions
-from gsbake.shape_refinement.hollows_gate import Verdict, judge_regions
+from gsbake.geometry.raycast import RayCaster
+from gsbake.shape_refinement.hollows_cut import cut_cells
+from gsbake.shape_refinement.hollows_lids import find_lids, hull_mesh, surface_cells
+from gsbake.shape_refinement.hollows_prediction import HeldOut, Prediction
 from gsbake.shape_refinement.samples import Photo
 
 Floats = NDArray[np.float32]
+Cells = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
 class HollowOptions:
-    """Settings."""
+    """Settings. Lengths in cells of the hull, of which the longest side of the object has about 100."""
 
-    #: Cells of the hull along the edge of a block; longer side of the photos in pixels.
-    block: int = 2
-    size: int = 100
-    #: Rounds of so many steps of the front, each ended by a cut.
-    rounds: int = 2
-    steps: int = 30
-    #: Softness (`gsbake.capture.hull.softness`) from which a part of the hull may be a lid.
-    soft: float = 1.1
-    #: Depth in cells of the hull that stays below other parts: the wall of a vessel.
-    crust: float = 0.75
-    #: Every so manieth photo is kept from the front, for the decision; the first of them.
-    held_out: int = 4
-    first_held_out: int = 2
-    #: Longer side in pixels of the photos that decide.
-    decision_size: int = 150
-    front: FrontOptions = field(default_factory=FrontOptions)
+    #: Longer side in pixels of the photos.
+    size: int = 150
+    #: Thicknesses of the wall that are tried.
+    thicknesses: tuple[float, ...] = (2.0, 2.5, 3.1, 3.9, 4.9, 6.1, 7.6, 9.5, 11.9)
+    #: Least cells of a hollow.
+    cells: int = 100
+    #: The error of a hollow's surface, as a share of the lid's, up to which it is opened: hollows of development objects reach .001 to .03,
+    #: other parts .08 and more. At least so many vertices, as a share of the lid's, have to be seen: others 0 to .3.
+    share: float = 0.05
+    seen: float = 0.6
+    #: A thicker wall is preferred up to this factor on the least error; the cut has to have less than this factor.
+    thicker: float = 1.6
+    cut: float = 0.9
+    #: Thicknesses end at this factor on the least error.
+    end: float = 5.0
+    #: Photos that have to see a cell.
+    photos: int = 2
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """A lid of `vertices` vertices: errors of the lid and of the hollow's surface (`Prediction.error`), NaN where too little was seen of
+    one, and the `cells` that were opened, 0 for a hollow that was refused."""
+
+    vertices: int
+    closed: float
+    opened: float
+    cells: int
 
 
 def open_hollows(
     hull: Hull, softness: Floats, load_photos: Callable[[int], Sequence[Photo]], options: HollowOptions | None = None,
-    *, on_cut: Callable[[str, Hull], None] = lambda text, opened: None,
+    *, on_step: Callable[[], None] = lambda: None,
 ) -> tuple[Hull, list[Verdict]]:  # fmt: skip
-    """The hull (n, n, n) with its hollows opened, and what was decided about each.
+    """The hull (n, n, n), n even, with its hollows opened, and what was decided about each lid.
 
     `softness` (n, n, n) as from `surface_softness`; `load_photos` returns the photos, their longer side at most a number of pixels, all
-    with masks and always the same cameras. n is a multiple of the block. Raises ValueError for an empty hull.
+    with masks. Raises ValueError for an empty hull.
     """
     options = options or HollowOptions()
-    block = options.block
-    photos = [replace(photo, rgb=np.asarray(encode(photo.rgb), np.float32)) for photo in load_photos(options.size)]
-    held = np.arange(len(photos)) % options.held_out == options.first_held_out
-    room = _blocks(_distance_to_hard(hull, softness, options.soft) - options.crust, block) / block
-    blocks = _blocks(hull.field, block)
-    front = Front(Hull(blocks < 0, hull.lower, hull.cell * block, blocks), np.asarray(room, np.float32))
-    used = [photo for photo, kept in zip(photos, held, strict=True) if not kept]
-    for number in range(options.rounds):
-        for _ in range(options.steps):
-            text = front.step(used, options.front)
-        front.cut(options.front)
-        on_cut(f"round {number}: {text}", front.hull())
-    opened = _without(hull, front, block)
-    verdicts, refused = judge_regions(hull, opened, load_photos(options.decision_size), held)
-    return replace(hull, **_fields(np.where(refused, hull.field, opened.field))), verdicts
+    held_out = HeldOut.split(load_photos(options.size))
+    opened, verdicts = hull, []
+    for lid in find_lids(hull, softness, held_out):
+        on_step()
+        shape, found = _Hollow(opened, lid.cells, held_out, options).best(lid.prediction)
+        before = opened
+        if found.error <= options.share * lid.prediction.error and found.seen >= options.seen * lid.prediction.seen:
+            opened = _seen_part(opened, shape, held_out.photos, options.photos)
+        verdicts.append(Verdict(lid.vertices, lid.prediction.error, found.error, int((before.occupancy & ~opened.occupancy).sum())))
+    return opened, verdicts
 
 
-def _fields(values: NDArray[Any]) -> dict[str, Any]:
-    """The fields of a Hull that depend on its distances."""
-    return {"field": np.asarray(values, np.float32), "occupancy": values < 0}
+def with_field(hull: Hull, field: NDArray[np.floating]) -> Hull:
+    """The hull with other signed distances."""
+    return replace(hull, field=np.asarray(field, np.float32), occupancy=field < 0)
 
 
-def _distance_to_hard(hull: Hull, softness: Floats, soft: float) -> Floats:
-    """Distance (n, n, n) in cells from the parts of the hull's surface that are not soft."""
-    solid = hull.field < 0
-    hard = solid & ~ndimage.binary_erosion(solid) & (softness < soft)
-    if not hard.any():
-        return np.full(solid.shape, float(max(solid.shape)), np.float32)
-    return np.asarray(ndimage.distance_transform_edt(~hard), np.float32)
+class _Hollow:
+    """Proposals for the hollow under one lid, `lid` (n, n, n), of a `hull`."""
+
+    def __init__(self, hull: Hull, lid: Cells, held_out: HeldOut, options: HollowOptions) -> None:
+        self.hull, self.held_out, self.options = hull, held_out, options
+        surface = surface_cells(hull.occupancy)
+        self.lid = lid & surface
+        self.depth = ndimage.distance_transform_edt(~(surface & ~lid))  # below all of the surface but the lid
+        self._points: list[NDArray[np.float64]] = []
+        self._errors: list[Floats] = []
+
+    def best(self, closed: Prediction) -> tuple[Hull, Prediction]:
+        """The proposal that predicts best, the thicker of those that predict about as well, and how it does."""
+        options, tried = self.options, []
+        for thickness in options.thicknesses:
+            air = self._air(thickness)
+            if air.sum() < options.cells:
+                break
+            distance = np.where(air, np.maximum(self.depth - thickness, 0.2), np.minimum(self.depth - thickness, -0.05))
+            shape = with_field(self.hull, self._field(air, distance))
+            found = self._predict(shape, air)
+            if found.seen < 0.5 * options.seen * closed.seen:
+                break
+            tried.append((air, thickness, shape, found))
+            if found.error > options.end * min(row[3].error for row in tried):
+                break
+        rows = [row for row in tried if row[3].seen >= options.seen * closed.seen]
+        if not rows:
+            return self.hull, Prediction(float("nan"), 0)
+        least = min(row[3].error for row in rows)
+        _, _, shape, found = [row for row in rows if row[3].error <= options.thicker * least][-1]
+        if least <= 2 * options.share * closed.error:
+            cut = self._cut(tried[0][0], tried[-1][1])
+            by_cut = self._predict(cut, cut.field >= 0)
+            if by_cut.error < options.cut * least and by_cut.seen >= options.seen * closed.seen:
+                return cut, by_cut
+        return shape, found
+
+    def _air(self, thickness: float) -> Cells:
+        """Cells (n, n, n) deeper than the thickness that are connected to the lid."""
+        air = self.hull.occupancy & (self.depth > thickness)
+        label, count = ndimage.label(air | self.lid)
+        keep = np.bincount(label[air], minlength=count + 1) >= self.options.cells
+        keep &= np.isin(np.arange(count + 1), label[self.lid])
+        keep[0] = False
+        return np.asarray(air & keep[label])
+
+    def _field(self, air: Cells, distance: NDArray[np.floating]) -> NDArray[np.floating]:
+        """The hull's distances with a `distance` (n, n, n) in cells in and near the air, positive in it."""
+        near = ndimage.binary_dilation(air, iterations=3) & self.hull.occupancy
+        return np.where(near, np.maximum(self.hull.field, np.clip(distance, -3, 3) * self.hull.cell), self.hull.field)
+
+    def _predict(self, shape: Hull, air: Cells) -> Prediction:
+        """How the surface of `shape` in the hull's inside, around the `air`, predicts; keeps the errors for the cut."""
+        vertices, faces = hull_mesh(shape)
+        errors = self.held_out.errors(vertices, faces, reflections=False)
+        inside = (self.hull.signed_distance(vertices) < -1.5 * self.hull.cell) & np.isfinite(errors)
+        inside &= ndimage.binary_dilation(air, iterations=3)[self.hull.cells_of(vertices)]
+        self._points.append(vertices[inside])
+        self._errors.append(errors[inside])
+        return Prediction.of(errors[inside])
+
+    def _cut(self, air: Cells, deepest: float) -> Hull:
+        """The surface of least error in the `air`, between the thinnest wall and one of `deepest` cells."""
+        cells = np.argwhere(ndimage.binary_dilation(air))
+        points, errors = np.concatenate(self._points), np.minimum(np.concatenate(self._errors), 1)
+        distance, nearest = cKDTree(points).query(self.hull.lower + (cells + 0.5) * self.hull.cell, k=min(4, len(points)))
+        weight = 1 / (distance.reshape(len(cells), -1) / self.hull.cell + 0.5) ** 2
+        cost = np.zeros(air.shape, np.float32)
+        cost[tuple(cells.T)] = 100 * (weight * errors[nearest].reshape(weight.shape)).sum(1) / weight.sum(1)
+        removed = air & (self.depth <= deepest)
+        left = self.hull.occupancy & ~air
+        kept = cut_cells(removed, left, cost, 0.02) | (air & ~removed)
+        signed = np.where(kept, ndimage.distance_transform_edt(kept) - 0.5, 0.5 - ndimage.distance_transform_edt(~kept))
+        return with_field(self.hull, self._field(kept, ndimage.gaussian_filter(np.clip(signed, -3, 3), 0.8)))
 
 
-def _blocks(values: Floats, block: int) -> Floats:
-    """Means of blocks of block³ cells."""
-    n = values.shape[0] // block
-    return np.asarray(values.reshape(n, block, n, block, n, block).mean((1, 3, 5)), np.float32)
-
-
-def _without(hull: Hull, front: Front, block: int) -> Hull:
-    """The hull without what the front removed."""
-    index = (np.indices(hull.field.shape).astype(np.float32) + 0.5) / block - 0.5
-    removed, distance = (
-        ndimage.map_coordinates(values, index, order=1, mode="nearest") for values in (front.distance - front.least, front.distance)
-    )
-    cells = np.where(removed > 0.5, np.maximum(distance * front.start.cell, hull.field), hull.field)
-    return replace(hull, **_fields(cells))
+def _seen_part(hull: Hull, shape: Hull, photos: Sequence[Photo], least: int) -> Hull:
+    """`shape` without those of its hollows that fewer than `least` photos see."""
+    vertices, faces = hull_mesh(shape)
+    caster = RayCaster(vertices, faces)
+    cells = np.argwhere(hull.occupancy & ~shape.occupancy)
+    centres, seen = hull.lower + (cells + 0.5) * hull.cell, np.zeros(len(cells), np.int64)
+    for photo in photos:
+        depth = caster.depth(photo.camera)
+        pixel, z = photo.camera.project(centres)
+        visible = photo.camera.in_view(pixel, z)
+        column, row = np.floor(pixel[visible]).astype(np.int64).T
+        there = depth[row, column]
+        seen[np.flatnonzero(visible)] += (there <= 0) | (z[visible] < there)
+    open_cells = np.zeros(hull.field.shape, bool)
+    open_cells[tuple(cells.T)] = seen >= least
+    open_cells = ndimage.binary_closing(open_cells, iterations=2) | open_cells
+    near = ndimage.binary_dilation(open_cells, iterations=2)
+    return with_field(hull, np.where(near, shape.field, hull.field))
