@@ -29,8 +29,8 @@ from gsbake.shape_refinement.samples import Photo, load_photos
 
 #: Minimum number of photos and longer side in pixels; below, matching finds too few depths.
 MIN_PHOTOS, MIN_SIZE = 5, 200
-#: Blur in pixels of the photos that open hollows, and verdicts on them that are logged.
-HOLLOW_BLUR, MOST_VERDICTS = 0.8, 4
+#: Blur in pixels of the photos that open hollows.
+HOLLOW_BLUR = 0.8
 #: Density of points on thin parts, as a number of points over the whole object.
 THIN_POINTS = 40_000
 
@@ -150,11 +150,11 @@ def _open_hollows(
 
     with monitor.part("hollows"):
         opened, verdicts = open_hollows(hull, softness, load, on_step=monitor.check_stop)
-    accepted = [verdict for verdict in verdicts if verdict.accepted]
     share = float((hull.occupancy & ~opened.occupancy).sum() / max(hull.occupancy.sum(), 1))
-    evidence = f"{len(accepted)} of {len(verdicts)} regions predict photos that they were not opened by better than the hull"
-    errors = "; ".join(f"{one.cells} cells: {one.closed:.3f} closed, {one.opened:.3f} opened" for one in verdicts[:MOST_VERDICTS])
-    monitor.decide("hollows", f"{100 * share:.1f} % of the visual hull opened", f"{evidence} ({errors})" if errors else evidence)
+    evidence = f"{sum(one.cells > 0 for one in verdicts)} of {len(verdicts)} places where photos disagree about the hull's colour"
+    if errors := "; ".join(f"{one.closed:.4f}, opened {one.opened:.4f}" for one in verdicts):
+        evidence += f"; relative squared errors of photos that the colours were not fitted to: {errors}"
+    monitor.decide("hollows", f"{100 * share:.1f} % of the visual hull opened", evidence)
     return opened
 
 

@@ -23,9 +23,13 @@ from gsbake.shape_refinement.hollows_cut import cut_cells
 from gsbake.shape_refinement.hollows_lids import find_lids, hull_mesh, surface_cells
 from gsbake.shape_refinement.hollows_prediction import HeldOut, Prediction
 from gsbake.shape_refinement.samples import Photo
+from gsbake.shape_refinement.surface import Surface
 
 Floats = NDArray[np.float32]
 Cells = NDArray[np.bool_]
+
+#: Rings of neighbours to which a known prediction extends, and as how many photos one counts that sees such a surface.
+RINGS, KNOWN = 3, 2
 
 
 @dataclass(frozen=True)
@@ -47,8 +51,8 @@ class HollowOptions:
     cut: float = 0.9
     #: Thicknesses end at this factor on the least error.
     end: float = 5.0
-    #: Photos that have to see a cell.
-    photos: int = 2
+    #: Photos that have to see a cell; those that see a surface of known prediction behind it count twice.
+    photos: int = 4
 
 
 @dataclass(frozen=True)
@@ -79,7 +83,7 @@ def open_hollows(
         shape, found = _Hollow(opened, lid.cells, held_out, options).best(lid.prediction)
         before = opened
         if found.error <= options.share * lid.prediction.error and found.seen >= options.seen * lid.prediction.seen:
-            opened = _seen_part(opened, shape, held_out.photos, options.photos)
+            opened = _seen_part(opened, shape, held_out, options.photos)
         verdicts.append(Verdict(lid.vertices, lid.prediction.error, found.error, int((before.occupancy & ~opened.occupancy).sum())))
     return opened, verdicts
 
@@ -166,21 +170,26 @@ class _Hollow:
         return with_field(self.hull, self._field(kept, ndimage.gaussian_filter(np.clip(signed, -3, 3), 0.8)))
 
 
-def _seen_part(hull: Hull, shape: Hull, photos: Sequence[Photo], least: int) -> Hull:
-    """`shape` without those of its hollows that fewer than `least` photos see."""
+def _seen_part(hull: Hull, shape: Hull, held_out: HeldOut, least: int) -> Hull:
+    """`shape` where at least `least` photos see through its hollows, elsewhere the hull."""
     vertices, faces = hull_mesh(shape)
+    known = np.isfinite(held_out.errors(vertices, faces, reflections=False))
+    adjacency = Surface(len(vertices), faces).adjacency
+    for _ in range(RINGS):
+        known |= adjacency @ known > 0
     caster = RayCaster(vertices, faces)
     cells = np.argwhere(hull.occupancy & ~shape.occupancy)
     centres, seen = hull.lower + (cells + 0.5) * hull.cell, np.zeros(len(cells), np.int64)
-    for photo in photos:
-        depth = caster.depth(photo.camera)
-        pixel, z = photo.camera.project(centres)
-        visible = photo.camera.in_view(pixel, z)
+    for camera in (photo.camera for photo in held_out.photos):
+        hits = caster.first_hit(camera.centre[None], camera.rays().reshape(-1, 3))
+        weight = np.where(known[faces[np.maximum(hits.face, 0)]].any(1), KNOWN, 1)
+        there = np.where(hits.hit, hits.distance, 0)
+        pixel, z = camera.project(centres)
+        visible = camera.in_view(pixel, z)
         column, row = np.floor(pixel[visible]).astype(np.int64).T
-        there = depth[row, column]
-        seen[np.flatnonzero(visible)] += (there <= 0) | (z[visible] < there)
-    open_cells = np.zeros(hull.field.shape, bool)
-    open_cells[tuple(cells.T)] = seen >= least
-    open_cells = ndimage.binary_closing(open_cells, iterations=2) | open_cells
-    near = ndimage.binary_dilation(open_cells, iterations=2)
-    return with_field(hull, np.where(near, shape.field, hull.field))
+        pixel = row * camera.width + column
+        seen[np.flatnonzero(visible)] += weight[pixel] * (z[visible] < there[pixel])
+    through = np.zeros(hull.field.shape, bool)
+    through[tuple(cells.T)] = seen >= least
+    through |= ndimage.binary_closing(through, iterations=2)
+    return with_field(hull, np.where(ndimage.binary_dilation(through, iterations=2), shape.field, hull.field))

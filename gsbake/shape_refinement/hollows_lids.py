@@ -23,7 +23,7 @@ LEAST_ERROR, AVERAGING = 0.02, 6
 #: Softness holds for this many cells around; normals are averaged by so many half-steps.
 AROUND, NORMAL_AVERAGING = 5, 4
 #: Neighbours whose normals have a smaller cosine belong to different parts: a lid ends at the rim.
-SAME_PART = 0.9
+SAME_PART = 0.95
 #: Least vertices of a lid, the share of them that photos have to see, and the most lids that are tried, the largest first.
 LEAST_VERTICES, SEEN_SHARE, MOST_LIDS = 40, 0.5, 6
 #: Holes in a lid up to twice as many cells wide are closed.
