@@ -83,7 +83,7 @@ def open_hollows(
         shape, found = _Hollow(opened, lid.cells, held_out, options).best(lid.prediction)
         before = opened
         if found.error <= options.share * lid.prediction.error and found.seen >= options.seen * lid.prediction.seen:
-            opened = _seen_part(opened, shape, held_out, options.photos)
+            opened = seen_part(opened, shape, held_out, options.photos)
         verdicts.append(Verdict(lid.vertices, lid.prediction.error, found.error, int((before.occupancy & ~opened.occupancy).sum())))
     return opened, verdicts
 
@@ -170,7 +170,7 @@ class _Hollow:
         return with_field(self.hull, self._field(kept, ndimage.gaussian_filter(np.clip(signed, -3, 3), 0.8)))
 
 
-def _seen_part(hull: Hull, shape: Hull, held_out: HeldOut, least: int) -> Hull:
+def seen_part(hull: Hull, shape: Hull, held_out: HeldOut, least: int) -> Hull:
     """`shape` where at least `least` photos see through its hollows, elsewhere the hull."""
     vertices, faces = hull_mesh(shape)
     known = np.isfinite(held_out.errors(vertices, faces, reflections=False))
