@@ -3,8 +3,8 @@
 A visual hull has a lid on every hollow, and stereo measures nothing in a hollow without texture. Photos disagree about the colour of a lid:
 each sees another part of the hollow through it (`hollows_lids`). A hollow is proposed under each lid: what is farther from the rest of the
 hull's surface than some thickness of the wall, for several thicknesses. Photos that a surface's colours were not fitted to say how well
-it predicts them (`hollows_prediction`): the best thickness is taken, or a minimum cut between all of them (`hollows_cut`), where it
-predicts much better than the lid with reflections. Only what photos see through the lid is opened. Stereo measures the surface afterwards.
+it predicts them (`hollows_prediction`): the best thickness is taken, or the best at each part of the wall, where the hollow predicts
+much better than the lid with reflections. Only what photos see through the lid is opened. Stereo measures the surface afterwards.
 """
 
 from __future__ import annotations
@@ -15,18 +15,24 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
-from scipy.spatial import cKDTree
 
 from gsbake.capture.hull.visual_hull import Hull
 from gsbake.geometry.raycast import RayCaster
-from gsbake.shape_refinement.hollows_cut import cut_cells
-from gsbake.shape_refinement.hollows_lids import find_lids, hull_mesh, surface_cells
-from gsbake.shape_refinement.hollows_prediction import HeldOut, Prediction
+from gsbake.shape_refinement.hollows_lids import BLOCK, find_lids, hull_mesh, surface_cells
+from gsbake.shape_refinement.hollows_prediction import FLOOR, HeldOut, Prediction
 from gsbake.shape_refinement.samples import Photo
-from gsbake.shape_refinement.surface import Surface
+from gsbake.shape_refinement.surface import Doubles, Surface
 
 Floats = NDArray[np.float32]
 Cells = NDArray[np.bool_]
+
+#: Depth in cells below the hull from which a vertex is a hollow's.
+INSIDE = 1.5
+#: Blocks along the wall over which errors and thicknesses are averaged (standard deviation), and the difference of logarithms of errors by
+#: which a thickness counts 1/e.
+ALONG, SOFTNESS = 3.0, 0.25
+#: Stands for the logarithm of an error that is not known.
+UNKNOWN = 100.0
 
 #: Rings of neighbours to which a known prediction extends, and as how many photos one counts that sees such a surface.
 RINGS, KNOWN = 3, 2
@@ -46,9 +52,8 @@ class HollowOptions:
     #: other parts .08 and more. At least so many vertices, as a share of the lid's, have to be seen: others 0 to .3.
     share: float = 0.05
     seen: float = 0.6
-    #: A thicker wall is preferred up to this factor on the least error; the cut has to have less than this factor.
-    thicker: float = 1.6
-    cut: float = 0.9
+    #: A thicker wall, or one of uneven thickness, is preferred up to this factor on the least error.
+    tolerance: float = 1.2
     #: Thicknesses end at this factor on the least error.
     end: float = 5.0
     #: Photos that have to see a cell; those that see a surface of known prediction behind it count twice.
@@ -93,6 +98,19 @@ def with_field(hull: Hull, field: NDArray[np.floating]) -> Hull:
     return replace(hull, field=np.asarray(field, np.float32), occupancy=field < 0)
 
 
+@dataclass(frozen=True)
+class _Proposal:
+    """A `shape` with a hollow of the cells `air` (n, n, n), its wall's `thickness`, and the `vertices` (v, 3) of its surface that predict
+    photos, with their `errors` (v,)."""
+
+    shape: Hull
+    air: Cells
+    thickness: float
+    vertices: Doubles
+    errors: Floats
+    prediction: Prediction
+
+
 class _Hollow:
     """Proposals for the hollow under one lid, `lid` (n, n, n), of a `hull`."""
 
@@ -100,36 +118,66 @@ class _Hollow:
         self.hull, self.held_out, self.options = hull, held_out, options
         surface = surface_cells(hull.occupancy)
         self.lid = lid & surface
-        self.depth = ndimage.distance_transform_edt(~(surface & ~lid))  # below all of the surface but the lid
-        self._points: list[NDArray[np.float64]] = []
-        self._errors: list[Floats] = []
+        # Below all of the surface but the lid, and where that is nearest.
+        self.depth, self.wall = ndimage.distance_transform_edt(~(surface & ~lid), return_indices=True)
 
     def best(self, closed: Prediction) -> tuple[Hull, Prediction]:
-        """The proposal that predicts best, the thicker of those that predict about as well, and how it does."""
+        """The proposal that predicts best, or a thicker one that does about as well, and how it does; NaN where there is none."""
         options, tried = self.options, []
         for thickness in options.thicknesses:
             air = self._air(thickness)
             if air.sum() < options.cells:
                 break
-            distance = np.where(air, np.maximum(self.depth - thickness, 0.2), np.minimum(self.depth - thickness, -0.05))
-            shape = with_field(self.hull, self._field(air, distance))
-            found = self._predict(shape, air)
-            if found.seen < 0.5 * options.seen * closed.seen:
+            proposal = self._propose(air, np.full(1, thickness))
+            if proposal.prediction.seen < 0.5 * options.seen * closed.seen:
                 break
-            tried.append((air, thickness, shape, found))
-            if found.error > options.end * min(row[3].error for row in tried):
+            tried.append(proposal)
+            if proposal.prediction.error > options.end * min(one.prediction.error for one in tried):
                 break
-        rows = [row for row in tried if row[3].seen >= options.seen * closed.seen]
-        if not rows:
+        able = [one for one in tried if one.prediction.seen >= options.seen * closed.seen]
+        if not able:
             return self.hull, Prediction(float("nan"), 0)
-        least = min(row[3].error for row in rows)
-        _, _, shape, found = [row for row in rows if row[3].error <= options.thicker * least][-1]
-        if least <= 2 * options.share * closed.error:
-            cut = self._cut(tried[0][0], tried[-1][1])
-            by_cut = self._predict(cut, cut.field >= 0)
-            if by_cut.error < options.cut * least and by_cut.seen >= options.seen * closed.seen:
-                return cut, by_cut
-        return shape, found
+        most = options.tolerance * min(one.prediction.error for one in able)
+        best = [one for one in able if one.prediction.error <= most][-1]
+        if best.prediction.error <= 2 * options.share * closed.error:
+            uneven = self._propose(tried[0].air, self._local_thickness(tried))
+            if uneven.prediction.error <= most and uneven.prediction.seen >= options.seen * closed.seen:
+                best = uneven
+        return best.shape, best.prediction
+
+    def _propose(self, air: Cells, thickness: NDArray[np.floating]) -> _Proposal:
+        """What of the `air` (n, n, n) is below walls of this thickness, one value or that of each cell (n, n, n)."""
+        below = np.asarray(self.depth - thickness, np.float32)
+        air = air & (below > 0)
+        distance = np.clip(np.where(air, np.maximum(below, 0.2), np.minimum(below, -0.05)), -3, 3)
+        near = ndimage.binary_dilation(air, iterations=3) & self.hull.occupancy
+        shape = with_field(self.hull, np.where(near, np.maximum(self.hull.field, distance * self.hull.cell), self.hull.field))
+        vertices, faces = hull_mesh(shape)
+        errors = self.held_out.errors(vertices, faces, reflections=False)
+        inside = (self.hull.signed_distance(vertices) < -INSIDE * self.hull.cell) & np.isfinite(errors)
+        inside &= ndimage.binary_dilation(air, iterations=3)[self.hull.cells_of(vertices)]
+        return _Proposal(shape, air, float(thickness.flat[0]), vertices[inside], errors[inside], Prediction.of(errors[inside]))
+
+    def _local_thickness(self, tried: Sequence[_Proposal]) -> Floats:
+        """The thickness (n, n, n) of the nearest wall that predicts best there: errors are averaged along the wall, thicknesses weighted by
+        them."""
+        n = len(self.hull.field) // BLOCK
+        shape, means = (n, n, n), []
+        for proposal in tried:
+            cells = self.hull.cells_of(proposal.vertices)
+            flat = np.ravel_multi_index(tuple(axis[cells] // BLOCK for axis in self.wall), shape)
+            logarithms = np.log(np.minimum(proposal.errors, 1) + FLOOR)
+            total, count = (
+                ndimage.gaussian_filter(np.bincount(flat, weights, n**3).reshape(shape), ALONG) for weights in (logarithms, np.ones(len(flat)))
+            )
+            means.append(np.where(count > 1e-4, total / np.maximum(count, 1e-9), UNKNOWN))
+        best = np.min(means, axis=0)
+        known = best < UNKNOWN
+        weights = np.exp((best - np.stack(means)) / SOFTNESS)
+        thickness = np.einsum("k,kxyz->xyz", [one.thickness for one in tried], weights) / weights.sum(0)
+        smooth = ndimage.gaussian_filter(thickness * known, ALONG) / np.maximum(ndimage.gaussian_filter(known.astype(float), ALONG), 1e-9)
+        nearest = ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True)
+        return np.asarray(smooth[tuple(nearest)][tuple(axis // BLOCK for axis in self.wall)], np.float32)
 
     def _air(self, thickness: float) -> Cells:
         """Cells (n, n, n) deeper than the thickness that are connected to the lid."""
@@ -139,35 +187,6 @@ class _Hollow:
         keep &= np.isin(np.arange(count + 1), label[self.lid])
         keep[0] = False
         return np.asarray(air & keep[label])
-
-    def _field(self, air: Cells, distance: NDArray[np.floating]) -> NDArray[np.floating]:
-        """The hull's distances with a `distance` (n, n, n) in cells in and near the air, positive in it."""
-        near = ndimage.binary_dilation(air, iterations=3) & self.hull.occupancy
-        return np.where(near, np.maximum(self.hull.field, np.clip(distance, -3, 3) * self.hull.cell), self.hull.field)
-
-    def _predict(self, shape: Hull, air: Cells) -> Prediction:
-        """How the surface of `shape` in the hull's inside, around the `air`, predicts; keeps the errors for the cut."""
-        vertices, faces = hull_mesh(shape)
-        errors = self.held_out.errors(vertices, faces, reflections=False)
-        inside = (self.hull.signed_distance(vertices) < -1.5 * self.hull.cell) & np.isfinite(errors)
-        inside &= ndimage.binary_dilation(air, iterations=3)[self.hull.cells_of(vertices)]
-        self._points.append(vertices[inside])
-        self._errors.append(errors[inside])
-        return Prediction.of(errors[inside])
-
-    def _cut(self, air: Cells, deepest: float) -> Hull:
-        """The surface of least error in the `air`, between the thinnest wall and one of `deepest` cells."""
-        cells = np.argwhere(ndimage.binary_dilation(air))
-        points, errors = np.concatenate(self._points), np.minimum(np.concatenate(self._errors), 1)
-        distance, nearest = cKDTree(points).query(self.hull.lower + (cells + 0.5) * self.hull.cell, k=min(4, len(points)))
-        weight = 1 / (distance.reshape(len(cells), -1) / self.hull.cell + 0.5) ** 2
-        cost = np.zeros(air.shape, np.float32)
-        cost[tuple(cells.T)] = 100 * (weight * errors[nearest].reshape(weight.shape)).sum(1) / weight.sum(1)
-        removed = air & (self.depth <= deepest)
-        left = self.hull.occupancy & ~air
-        kept = cut_cells(removed, left, cost, 0.02) | (air & ~removed)
-        signed = np.where(kept, ndimage.distance_transform_edt(kept) - 0.5, 0.5 - ndimage.distance_transform_edt(~kept))
-        return with_field(self.hull, self._field(kept, ndimage.gaussian_filter(np.clip(signed, -3, 3), 0.8)))
 
 
 def seen_part(hull: Hull, shape: Hull, held_out: HeldOut, least: int) -> Hull:

@@ -1,4 +1,4 @@
-"""Hollows: predictions, lids, the cut, a bowl that opens, and a glossy box that stays closed."""
+"""Hollows: predictions, lids, a bowl that opens, and a glossy box that stays closed."""
 
 from __future__ import annotations
 
@@ -14,7 +14,6 @@ from gsbake.geometry.cameras import Camera
 from gsbake.geometry.raycast import RayCaster
 from gsbake.shape_refinement.appearance import BLACK
 from gsbake.shape_refinement.hollows import HollowOptions, open_hollows, seen_part, with_field
-from gsbake.shape_refinement.hollows_cut import cut_cells
 from gsbake.shape_refinement.hollows_lids import find_lids, hull_mesh, surface_cells
 from gsbake.shape_refinement.hollows_prediction import EVERY, FIRST, FLOOR, HeldOut, Prediction
 from gsbake.shape_refinement.samples import Photo
@@ -25,20 +24,6 @@ Shade = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 
 #: Walls of the hulls of these tests, which have half as many cells.
 OPTIONS = HollowOptions(thicknesses=(2.0, 3.1, 4.9, 7.6), cells=20)
-
-
-def test_the_cut_goes_through_the_cheapest_cells() -> None:
-    removed, left = np.zeros((8, 8, 12), bool), np.zeros((8, 8, 12), bool)
-    removed[2:6, 2:6, 3:9] = True
-    left[1:7, 1:7, 2:9] = True
-    left &= ~removed  # a box with a shaft that opens at 9
-    cost = np.full(removed.shape, 2, np.float32)
-    assert not cut_cells(removed, left, cost, 0.1).any()  # the lid is the smallest surface
-    cost[:] = 0.01
-    cost[3:5, 3:5, 7:] = 50  # a surface there is dear, and beside it cheap
-    air = cut_cells(removed, left, cost, 0.001)
-    assert air[3:5, 3:5, 7:9].all()
-    assert not (air & ~removed).any()
 
 
 def ring(count: int, size: int) -> list[Camera]:
@@ -77,7 +62,7 @@ def bowl() -> trimesh.Trimesh:
     return mesh.subdivide()
 
 
-def matte(point: np.ndarray, normal: np.ndarray, ray: np.ndarray) -> np.ndarray:
+def diffuse(point: np.ndarray, normal: np.ndarray, ray: np.ndarray) -> np.ndarray:
     return 0.8 * pattern(point)
 
 
@@ -87,7 +72,7 @@ def glossy(point: np.ndarray, normal: np.ndarray, ray: np.ndarray) -> np.ndarray
 
 @pytest.fixture(scope="module")
 def bowl_scene() -> tuple[Hull, np.ndarray, list[Photo]]:
-    return scene(bowl(), matte)
+    return scene(bowl(), diffuse)
 
 
 def test_a_surface_in_the_right_place_predicts_held_out_photos() -> None:
@@ -151,7 +136,7 @@ def test_a_glossy_box_stays_closed() -> None:
 
 def test_what_no_photo_sees_stays_solid() -> None:
     """A cavity inside of a ball, and a shaft that leads from outside into it."""
-    hull, _, photos = scene(trimesh.creation.icosphere(3, 0.6), matte)
+    hull, _, photos = scene(trimesh.creation.icosphere(3, 0.6), diffuse)
     x, y, z = np.moveaxis(hull.lower + (np.indices(hull.field.shape).T + 0.5) * hull.cell, -1, 0).transpose(0, 3, 2, 1)
     cavity = np.maximum(hull.field, 0.3 - np.sqrt(x**2 + y**2 + z**2))
     held_out = HeldOut.split(photos)
