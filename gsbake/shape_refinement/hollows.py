@@ -167,9 +167,8 @@ class _Hollow:
             cells = self.hull.cells_of(proposal.vertices)
             flat = np.ravel_multi_index(tuple(axis[cells] // BLOCK for axis in self.wall), shape)
             logarithms = np.log(np.minimum(proposal.errors, 1) + FLOOR)
-            total, count = (
-                ndimage.gaussian_filter(np.bincount(flat, weights, n**3).reshape(shape), ALONG) for weights in (logarithms, np.ones(len(flat)))
-            )
+            sums = (np.bincount(flat, weights, n**3).reshape(shape) for weights in (logarithms, np.ones(len(flat))))
+            total, count = (ndimage.gaussian_filter(values, ALONG) for values in sums)
             means.append(np.where(count > 1e-4, total / np.maximum(count, 1e-9), UNKNOWN))
         best = np.min(means, axis=0)
         known = best < UNKNOWN
