@@ -12,25 +12,27 @@ def run(ctx: Context) -> dict[str, Any]:
     from gsbake.mvs.stereo import run_stereo
 
     return run_stereo(
-        ctx.inputs["poses"], ctx.out, ctx.settings.stereo, seed=ctx.seed, threads=ctx.threads, scratch=ctx.checkpoint, monitor=ctx
-    )
+        ctx.inputs["poses"], ctx.out, ctx.settings.stereo, holdout=ctx.settings.train.holdout, seed=ctx.seed, threads=ctx.threads,
+        scratch=ctx.checkpoint, monitor=ctx,
+    )  # fmt: skip
 
 
 #: Modules with the kernels of this stage.
 KERNELS = (
     "gsbake.mvs.patchmatch", "gsbake.mvs.depth_bounds", "gsbake.capture.hull.softness", "gsbake.mvs.consistency", "gsbake.mvs.fusion",
-    "gsbake.mvs.mirror_images", "gsbake.mvs.carving",
+    "gsbake.mvs.mirror_images", "gsbake.mvs.carving", "gsbake.shape_refinement.hollows_kernel", "gsbake.shape_refinement.samples_kernel",
+    "gsbake.shape_refinement.reflection_kernel",
 )  # fmt: skip
 
 
 STAGE = Stage(
     name="stereo",
-    version=12,
+    version=13,
     title="Multi-view stereo",
     run=run,
     summary="{points} points, {confirmed_share:%} of the object confirmed",
     needs=("poses",),
-    settings=("stereo.*",),
+    settings=("stereo.*", "train.holdout"),
     seeded=True,
     kernels=lambda settings: () if settings.stereo.enabled == "never" else KERNELS,
 )

@@ -96,6 +96,7 @@ class Stereo(Section):
     best_views: int = Field(4, ge=1, le=8, description="Source views with the lowest matching cost, over which a pixel's cost is averaged.")
     consistency_views: int = Field(12, ge=1, le=32, description="Views with which the geometric consistency of a depth map is checked.")
     min_consistent_views: int = Field(2, ge=1, le=10, description="Minimum number of views that agree on a depth; other depths are dropped.")
+    hollows: Literal["auto", "never"] = Field("auto", description="Open hollows of the visual hull. auto: where the surface inside predicts photos that its colours were not fitted to much better than the hull does.")
 
 
 class Surfels(Section):

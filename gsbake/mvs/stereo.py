@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ from gsbake.capture.hull.rigidity import moved_part
 from gsbake.capture.hull.softness import SOFT, surface_softness
 from gsbake.capture.hull.thin_parts import find_thin_parts
 from gsbake.capture.hull.visual_hull import Hull, read_masks, unit_hull
+from gsbake.capture.photos.roles import test_photos
 from gsbake.capture.posed_photos import PosedPhotos
 from gsbake.config.schema import Stereo
 from gsbake.monitor import SILENT, Monitor
@@ -22,9 +24,13 @@ from gsbake.mvs.mirror_images import without_mirror_images
 from gsbake.mvs.outliers import find_outliers, without_points
 from gsbake.mvs.point_cloud import StereoCloud
 from gsbake.mvs.pyramids import single_threaded_opencv
+from gsbake.shape_refinement.hollows import open_hollows
+from gsbake.shape_refinement.samples import Photo, load_photos
 
 #: Minimum number of photos and longer side in pixels; below, matching finds too few depths.
 MIN_PHOTOS, MIN_SIZE = 5, 200
+#: Blur in pixels of the photos that open hollows.
+HOLLOW_BLUR = 0.8
 #: Density of points on thin parts, as a number of points over the whole object.
 THIN_POINTS = 40_000
 
@@ -34,6 +40,7 @@ def run_stereo(
     out: Path,
     options: Stereo | None = None,
     *,
+    holdout: int = 8,
     seed: int = 0,
     threads: int = 2,
     scratch: Path | None = None,
@@ -52,7 +59,7 @@ def run_stereo(
         return {"points": 0}
     if scratch is None:
         with tempfile.TemporaryDirectory(prefix="gsbake-stereo-") as folder:
-            return run_stereo(poses, out, options, seed=seed, threads=threads, scratch=Path(folder), monitor=monitor)
+            return run_stereo(poses, out, options, holdout=holdout, seed=seed, threads=threads, scratch=Path(folder), monitor=monitor)
 
     def report(done: int, text: str) -> None:
         monitor.check_stop()
@@ -72,8 +79,9 @@ def run_stereo(
                 maps = _without_mirror_images(maps, hull, softness, monitor)
         with monitor.part("fusion"):
             cloud, maps = _fuse(run, maps, hull, monitor)
-        if softness is not None:
-            _carve(run, softness, out, monitor)
+        if hull is not None and softness is not None:
+            opened = _open_hollows(posed, hull, softness, options, holdout, monitor)
+            _carve(run, softness, opened, out, monitor)
     if hull is not None:
         _thin_parts(posed, hull, out, seed, monitor)
     (out / "depth").mkdir()
@@ -131,11 +139,33 @@ def _fuse(run: StereoRun, maps: list[DepthMap], hull: Hull | None, monitor: Moni
     return cloud.select(~outliers.contains(cloud.points)), [without_points(one, outliers.contains) for one in maps]
 
 
-def _carve(run: StereoRun, softness: NDArray[np.float32], out: Path, monitor: Monitor) -> None:
-    """Carve the hull where photos see through it, and write it."""
+def _open_hollows(
+    posed: PosedPhotos, hull: Hull, softness: NDArray[np.float32], options: Stereo, holdout: int, monitor: Monitor
+) -> Hull:  # fmt: skip
+    """The hull with the hollows that photos other than test photos show."""
+    if options.hollows == "never":
+        return hull
+    used = sorted(set(range(len(posed))) - set(test_photos(len(posed), holdout)))
+
+    def load(size: int) -> list[Photo]:
+        return load_photos(posed, used, size, HOLLOW_BLUR, monitor.check_stop)
+
+    with monitor.part("hollows"):
+        opened, verdicts = open_hollows(hull, softness, load, on_step=monitor.check_stop)
+    share = float((hull.occupancy & ~opened.occupancy).sum() / max(hull.occupancy.sum(), 1))
+    evidence = f"{sum(one.cells > 0 for one in verdicts)} of {len(verdicts)} places where photos disagree about the hull's colour"
+    if errors := "; ".join(f"{one.closed:.4f}, opened {one.opened:.4f}" for one in verdicts):
+        evidence += f"; relative squared errors of photos that the colours were not fitted to: {errors}"
+    monitor.decide("hollows", f"{100 * share:.1f} % of the visual hull opened", evidence)
+    return opened
+
+
+def _carve(run: StereoRun, softness: NDArray[np.float32], opened: Hull, out: Path, monitor: Monitor) -> None:
+    """Carve the hull where photos see through it, and write what neither that nor its hollows, which are `opened`, removes."""
     with monitor.part("carving"):
         carved = run.carved_hull(softness)
-    carved.hull.save(out / "hull.npz")
+    field = np.maximum(carved.hull.field, opened.field)
+    replace(carved.hull, field=field, occupancy=field < 0).save(out / "hull.npz")
     monitor.decide(
         "visual hull carving",
         f"{carved.carved_regions} regions carved",

@@ -216,6 +216,11 @@ class Hull:
         beyond = np.linalg.norm(pts - np.clip(pts, self.lower, upper), axis=1)
         return np.asarray(self._sample(pts) + beyond)
 
+    def cells_of(self, points: Array) -> tuple[NDArray[np.int64], ...]:
+        """Indices, three of (k,), of the cells with the points (k, 3); of the nearest ones for points beyond the grid."""
+        index = np.floor((points - self.lower) / self.cell).astype(np.int64)
+        return tuple(np.clip(index, 0, np.array(self.field.shape) - 1).T)
+
     def gradient(self, points: Array) -> Array:
         """Outward unit normals (k, 3) of the field at points (k, 3), central differences over one cell."""
         pts = np.asarray(points, float).reshape(-1, 3)
