@@ -143,7 +143,7 @@ def _open_hollows(
     posed: PosedPhotos, hull: Hull, softness: NDArray[np.float32], options: Stereo, holdout: int, monitor: Monitor
 ) -> Hull:  # fmt: skip
     """The hull with the hollows that photos other than test photos show."""
-    if options.hollows == "never":
+    if options.hollows == "never" or posed.region is not None:  # a region's faces cut the object: photos disagree about their colour too
         return hull
     used = sorted(set(range(len(posed))) - set(test_photos(len(posed), holdout)))
 
