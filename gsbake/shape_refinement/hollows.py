@@ -48,9 +48,9 @@ class HollowOptions:
     thicknesses: tuple[float, ...] = (2.0, 2.5, 3.1, 3.9, 4.9, 6.1, 7.6, 9.5, 11.9)
     #: Least cells of a hollow.
     cells: int = 100
-    #: The error of a hollow's surface, as a share of the lid's, up to which it is opened: hollows of development objects reach .001 to .03,
-    #: other parts .08 and more. At least so many vertices, as a share of the lid's, have to be seen: others 0 to .3.
-    share: float = 0.05
+    #: The error of a hollow's surface, as a share of the lid's, up to which it is opened: hollows of development objects reach .001 to .04,
+    #: other parts .12 and more. At least so many vertices, as a share of the lid's, have to be seen: others 0 to .3.
+    share: float = 0.07
     seen: float = 0.6
     #: A thicker wall, or one of uneven thickness, is preferred up to this factor on the least error.
     tolerance: float = 1.2

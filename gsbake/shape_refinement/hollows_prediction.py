@@ -1,19 +1,20 @@
 """How well a surface predicts photos that its colours were not fitted to.
 
-Diffuse colour, and with reflections also reflectance and distant light, are fitted to three quarters of the photos and predict the others.
-A surface in the wrong place shows each photo another colour; a glossy one in the right place is predicted by its reflections.
+Diffuse colour is the mean of all photos but the one that it predicts. With reflections, it is fitted together with reflectance and distant
+light to three quarters of the photos, and predicts the others. A surface in the wrong place shows each photo another colour; a glossy one
+in the right place is predicted by its reflections.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gsbake.kernels.threads import run_chunks
-from gsbake.shape_refinement.appearance import Appearance, Geometry, choose_light_vertices, fit_appearance, fit_light
+from gsbake.shape_refinement.appearance import BLACK, Appearance, Geometry, choose_light_vertices, fit_appearance, fit_light
 from gsbake.shape_refinement.reflection_kernel import gauss_newton_rows
 from gsbake.shape_refinement.reflection_map import ReflectionMap
 from gsbake.shape_refinement.samples import Doubles, Floats, Photo, VertexSamples, sample_photos
@@ -25,8 +26,6 @@ EVERY, FIRST = 4, 2
 LEAST_VIEWS = 3
 #: Edge of the light's map, its level at the start, alternations of light and appearance.
 LIGHT_SIZE, LIGHT_LEVEL, ALTERNATIONS = 16, 0.5, 8
-#: Rounds of robust weights without reflections.
-ROBUST_ROUNDS = 3
 #: Least relative squared error that counts, and least vertices.
 FLOOR, LEAST_VERTICES = 1e-5, 5
 
@@ -60,15 +59,26 @@ class HeldOut:
         return cls(photos, np.arange(len(photos)) % EVERY == FIRST)
 
     def errors(self, vertices: Doubles, faces: NDArray[np.int32], reflections: bool) -> Floats:
-        """Squared error (v,) of the held-out photos over the squared brightness, mean over photos and channels, of what the others say;
-        NaN where either see too little."""
-        return prediction_errors(vertices, faces, self.photos, self.held, reflections)
+        """Squared error (v,) of photos over the squared brightness, mean over photos and channels, of what other photos say; NaN where too
+        few see a vertex."""
+        return (reflected_errors if reflections else diffuse_errors)(vertices, faces, self)
 
 
-def prediction_errors(
-    vertices: Doubles, faces: NDArray[np.int32], photos: Sequence[Photo], held: NDArray[np.bool_], reflections: bool
-) -> Floats:
-    """See `HeldOut.errors`."""
+def diffuse_errors(vertices: Doubles, faces: NDArray[np.int32], held_out: HeldOut) -> Floats:
+    """See `HeldOut.errors`: each photo is predicted by the mean of all others, in closed form."""
+    samples = sample_photos(vertices, Surface(len(vertices), faces).normals(vertices), faces, held_out.photos)
+    weight = samples.weight
+    total = np.maximum(weight.sum(1), 1e-9)
+    mean = np.einsum("vp,vpc->vc", weight, samples.colour) / total[:, None]
+    others = total[:, None] / np.maximum(total[:, None] - weight, 1e-9)
+    square = np.square(samples.colour - mean[:, None]).mean(2) * others**2
+    error = (weight * square).sum(1) / total / (mean.mean(1) + BLACK) ** 2
+    return np.where((weight > 0).sum(1) > LEAST_VIEWS, error, np.nan).astype(np.float32)
+
+
+def reflected_errors(vertices: Doubles, faces: NDArray[np.int32], held_out: HeldOut) -> Floats:
+    """See `HeldOut.errors`: the held-out photos are predicted by diffuse colour, reflectance and light fitted to the others."""
+    photos, held = held_out.photos, held_out.held
     surface = Surface(len(vertices), faces)
     normals = surface.normals(vertices)
     geometry = Geometry(vertices, normals, np.stack([photo.camera.centre for photo in photos]))
@@ -89,21 +99,12 @@ def prediction_errors(
         run_chunks(lambda start, stop: gauss_newton_rows(start, stop, *fixed), len(vertices))
         return out[:, 0]
 
-    if reflections:
-        chosen = choose_light_vertices(known, 0)
-        for index in range(ALTERNATIONS):
-            light = fit_light(geometry, known, robust, appearance, light, chosen)
-            appearance = fit_appearance(surface, geometry, known, robust, light)
-            if index >= ALTERNATIONS // 2:
-                residual(seen, robust)
-    else:
+    chosen = choose_light_vertices(known, 0)
+    for index in range(ALTERNATIONS):
+        light = fit_light(geometry, known, robust, appearance, light, chosen)
         appearance = fit_appearance(surface, geometry, known, robust, light)
-        appearance = replace(appearance, reflectance=np.zeros_like(appearance.reflectance))
-        for _ in range(ROBUST_ROUNDS):
+        if index >= ALTERNATIONS // 2:
             residual(seen, robust)
-            weight = seen * robust
-            total = np.maximum(weight.sum(1), 1e-9)[:, None]
-            appearance = replace(appearance, diffuse=np.asarray((weight[..., None] * samples.colour).sum(1) / total, np.float32))
     error = residual(asked, np.ones_like(asked)) * appearance.importance / 3
     enough = (asked.sum(1) > 0) & ((seen > 0).sum(1) >= LEAST_VIEWS)
     return np.where(enough, error, np.float32(np.nan))

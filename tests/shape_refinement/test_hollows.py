@@ -15,8 +15,9 @@ from gsbake.geometry.raycast import RayCaster
 from gsbake.shape_refinement.appearance import BLACK
 from gsbake.shape_refinement.hollows import HollowOptions, open_hollows, seen_part, with_field
 from gsbake.shape_refinement.hollows_lids import find_lids, hull_mesh, surface_cells
-from gsbake.shape_refinement.hollows_prediction import EVERY, FIRST, FLOOR, HeldOut, Prediction
-from gsbake.shape_refinement.samples import Photo
+from gsbake.shape_refinement.hollows_prediction import FLOOR, HeldOut, Prediction
+from gsbake.shape_refinement.samples import Photo, sample_photos
+from gsbake.shape_refinement.surface import Surface
 from tests.shape_refinement.conftest import pattern, smooth_light
 from tests.support.cameras import look_at
 
@@ -75,17 +76,33 @@ def bowl_scene() -> tuple[Hull, np.ndarray, list[Photo]]:
     return scene(bowl(), diffuse)
 
 
-def test_a_surface_in_the_right_place_predicts_held_out_photos() -> None:
-    """One colour everywhere and held-out photos that are a tenth brighter."""
-    ball = trimesh.creation.icosphere(3, 0.5)
-    *_, photos = scene(ball, lambda point, normal, ray: np.full(point.shape, 0.4))
-    brighter = [Photo(one.camera, one.rgb * np.float32(1.1 if k % EVERY == FIRST else 1), one.mask) for k, one in enumerate(photos)]
-    faces = np.ascontiguousarray(ball.faces, np.int32)
-    errors = HeldOut.split(brighter).errors(0.95 * ball.vertices, faces, reflections=False)
-    known = np.isfinite(errors)
-    assert known.mean() > 0.5
-    assert np.median(errors[known]) == pytest.approx((0.04 / (0.4 + BLACK)) ** 2, rel=0.01)
-    assert np.nanmax(HeldOut.split(photos).errors(0.95 * ball.vertices, faces, reflections=False)) < 1e-9
+def test_each_photo_is_predicted_by_the_others() -> None:
+    """One colour everywhere, photos of different brightness: the errors are those of a loop over vertices and photos."""
+    ball = trimesh.creation.icosphere(2, 0.5)
+    *_, photos = scene(ball, lambda point, normal, ray: np.full(point.shape, 0.4), size=60)
+    uneven = [Photo(one.camera, one.rgb * np.float32(1 + 0.1 * (k % 3)), one.mask) for k, one in enumerate(photos)]
+    vertices, faces = 0.95 * ball.vertices, np.ascontiguousarray(ball.faces, np.int32)
+    errors = HeldOut.split(uneven).errors(vertices, faces, reflections=False)
+    samples = sample_photos(vertices, Surface(len(vertices), faces).normals(vertices), faces, uneven)
+    for v in range(0, len(vertices), 9):
+        seen = np.flatnonzero(samples.weight[v] > 0)
+        assert np.isfinite(errors[v]) == (len(seen) > 3)
+        if len(seen) > 3:
+            x, w = samples.colour[v, seen].astype(float), samples.weight[v, seen].astype(float)
+            left_out = [np.average(np.delete(x, j, 0), axis=0, weights=np.delete(w, j)) for j in range(len(seen))]
+            expected = np.average(((x - left_out) ** 2).mean(1), weights=w) / (np.average(x, axis=0, weights=w).mean() + BLACK) ** 2
+            assert errors[v] == pytest.approx(expected, rel=1e-3)
+    assert np.nanmedian(HeldOut.split(photos).errors(vertices, faces, reflections=False)) < 1e-9
+
+
+def test_reflections_predict_a_glossy_ball() -> None:
+    ball = trimesh.creation.icosphere(4, 0.6)
+    *_, photos = scene(ball, glossy, count=32)
+    vertices, faces = np.asarray(ball.vertices), np.ascontiguousarray(ball.faces, np.int32)
+    reflected, diffuse_only = (HeldOut.split(photos).errors(vertices, faces, reflections) for reflections in (True, False))
+    both = np.isfinite(reflected) & np.isfinite(diffuse_only)
+    assert both.mean() > 0.3
+    assert Prediction.of(reflected[both]).error < 0.3 * Prediction.of(diffuse_only[both]).error
 
 
 def test_prediction_is_the_geometric_mean() -> None:
