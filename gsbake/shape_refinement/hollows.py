@@ -21,7 +21,7 @@ from gsbake.geometry.raycast import RayCaster
 from gsbake.shape_refinement.hollows_lids import BLOCK, find_lids, hull_mesh, surface_cells
 from gsbake.shape_refinement.hollows_prediction import FLOOR, HeldOut, Prediction
 from gsbake.shape_refinement.samples import Photo
-from gsbake.shape_refinement.surface import Doubles, Surface
+from gsbake.shape_refinement.surface import Doubles
 
 Floats = NDArray[np.float32]
 Cells = NDArray[np.bool_]
@@ -34,8 +34,6 @@ ALONG, SOFTNESS = 3.0, 0.25
 #: Stands for the logarithm of an error that is not known.
 UNKNOWN = 100.0
 
-#: Rings of neighbours to which a known prediction extends, and as how many photos one counts that sees such a surface.
-RINGS, KNOWN = 3, 2
 
 
 @dataclass(frozen=True)
@@ -56,8 +54,8 @@ class HollowOptions:
     tolerance: float = 1.2
     #: Thicknesses end at this factor on the least error.
     end: float = 5.0
-    #: Photos that have to see a cell; those that see a surface of known prediction behind it count twice.
-    photos: int = 4
+    #: Photos that have to see a cell.
+    photos: int = 2
 
 
 @dataclass(frozen=True)
@@ -88,7 +86,7 @@ def open_hollows(
         shape, found = _Hollow(opened, lid.cells, held_out, options).best(lid.prediction)
         before = opened
         if found.error <= options.share * lid.prediction.error and found.seen >= options.seen * lid.prediction.seen:
-            opened = seen_part(opened, shape, held_out, options.photos)
+            opened = seen_part(opened, shape, held_out.photos, options.photos)
         verdicts.append(Verdict(lid.vertices, lid.prediction.error, found.error, int((before.occupancy & ~opened.occupancy).sum())))
     return opened, verdicts
 
@@ -188,25 +186,18 @@ class _Hollow:
         return np.asarray(air & keep[label])
 
 
-def seen_part(hull: Hull, shape: Hull, held_out: HeldOut, least: int) -> Hull:
+def seen_part(hull: Hull, shape: Hull, photos: Sequence[Photo], least: int) -> Hull:
     """`shape` where at least `least` photos see through its hollows, elsewhere the hull."""
     vertices, faces = hull_mesh(shape)
-    known = np.isfinite(held_out.errors(vertices, faces, reflections=False))
-    adjacency = Surface(len(vertices), faces).adjacency
-    for _ in range(RINGS):
-        known |= adjacency @ known > 0
     caster = RayCaster(vertices, faces)
     cells = np.argwhere(hull.occupancy & ~shape.occupancy)
     centres, seen = hull.lower + (cells + 0.5) * hull.cell, np.zeros(len(cells), np.int64)
-    for camera in (photo.camera for photo in held_out.photos):
-        hits = caster.first_hit(camera.centre[None], camera.rays().reshape(-1, 3))
-        weight = np.where(known[faces[np.maximum(hits.face, 0)]].any(1), KNOWN, 1)
-        there = np.where(hits.hit, hits.distance, 0)
+    for camera in (photo.camera for photo in photos):
+        depth = caster.depth(camera)
         pixel, z = camera.project(centres)
         visible = camera.in_view(pixel, z)
         column, row = np.floor(pixel[visible]).astype(np.int64).T
-        pixel = row * camera.width + column
-        seen[np.flatnonzero(visible)] += weight[pixel] * (z[visible] < there[pixel])
+        seen[np.flatnonzero(visible)] += z[visible] < depth[row, column]
     through = np.zeros(hull.field.shape, bool)
     through[tuple(cells.T)] = seen >= least
     through |= ndimage.binary_closing(through, iterations=2)
