@@ -78,7 +78,7 @@ def open_hollows(
     """The hull (n, n, n), n even, with its hollows opened, and what was decided about each lid.
 
     `softness` (n, n, n) as from `surface_softness`; `load_photos` returns the photos, their longer side at most a number of pixels, all
-    with masks. Raises ValueError for an empty hull.
+    with masks.
     """
     options = options or HollowOptions()
     held_out = HeldOut.split(load_photos(options.size))

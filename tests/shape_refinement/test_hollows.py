@@ -154,6 +154,15 @@ def test_without_photos_that_see_it_the_hull_stays(bowl_scene: tuple[Hull, np.nd
     assert (opened.field == hull.field).all() and not verdicts
 
 
+def test_a_leaf_has_no_hollows(bowl_scene: tuple[Hull, np.ndarray, list[Photo]]) -> None:
+    """A hull of one layer of cells, as of a leaf or a sheet of paper: nothing of it is left on blocks of cells."""
+    hull, softness, photos = bowl_scene
+    field = np.full(hull.field.shape, 2 * hull.cell)
+    field[16:48, 16:48, 32] = -0.1 * hull.cell
+    opened, verdicts = open_hollows(with_field(hull, field), softness, lambda size: photos, OPTIONS)
+    assert opened.occupancy.sum() == 32 * 32 and not verdicts
+
+
 def test_the_mesh_of_a_hull_has_its_size(bowl_scene: tuple[Hull, np.ndarray, list[Photo]]) -> None:
     hull = bowl_scene[0]
     vertices, faces = hull_mesh(hull)
