@@ -47,10 +47,11 @@ def linear_light(profile: bytes, coded: Floats) -> Floats | None:
     try:
         columns = [struct.unpack_from(">4s4x3i", found[name]) for name in (b"rXYZ", b"gXYZ", b"bXYZ")]
         matrix = np.linalg.inv(_SRGB_D50) @ np.array([column[1:] for column in columns]).T / 65536
-        planes = [_curve(found[name], coded[..., k]) for k, name in enumerate((b"rTRC", b"gTRC", b"bTRC"))]
+        with np.errstate(all="ignore"):  # curves of strangers; what is not finite is refused below
+            planes = [_curve(found[name], coded[..., k]) for k, name in enumerate((b"rTRC", b"gTRC", b"bTRC"))]
+            out = np.stack(planes, -1) @ matrix.T
     except (KeyError, struct.error, ValueError):
         return None
-    out = np.stack(planes, -1) @ matrix.T
     return out.astype(np.float32) if np.isfinite(out).all() else None
 
 

@@ -87,6 +87,8 @@ def test_broken_profiles_do_not_make_a_photo_unusable() -> None:
     for length in range(0, len(whole), 7):
         tags = {"ICCProfile": np.frombuffer(whole[:length], np.uint8), "ICCProfile:color_space": "RGB"}
         assert to_srgb(pixels, tags).shape == pixels.shape
+    infinite = profile(struct.pack(">4s4xHxxi", b"para", 0, -(2 << 16)))  # black has no light by it
+    assert icc.linear_light(infinite, np.zeros((1, 1, 3), np.float32)) is None
 
 
 def hlg(scene: NDArray[np.float64]) -> NDArray[np.float64]:
