@@ -140,6 +140,18 @@ def test_a_mesh_without_faults_is_the_same_mesh() -> None:
     assert found.vertices is vertices and found.faces is opened and found.faults == ""
 
 
+def test_thousands_of_faces_at_one_edge() -> None:
+    """Both directions alternate, all edges are free: the largest face of each direction stays. One face a round would take minutes."""
+    count = 30_000
+    angle, length = np.arange(count), 1 + np.arange(count) / count
+    vertices = np.array([[0, 0, -1], [0, 0, 1], *np.stack([np.cos(angle) * length, np.sin(angle) * length, 0 * angle], 1)])
+    faces = np.column_stack([angle % 2, 1 - angle % 2, 2 + angle]).astype(np.int32)
+    found = repair_foreign(vertices, faces, 100)
+    assert (found.non_manifold, found.cut, len(found.faces)) == (1, count - 2, 2)
+    assert np.abs(found.vertices).max() > 0.9 and np.hypot(*found.vertices[:, :2].T).max() == pytest.approx(2, abs=1e-3)
+    assert topology(found.vertices, found.faces).non_manifold_edges == 0
+
+
 @pytest.mark.parametrize("faces", [np.zeros((0, 3), np.int32), np.array([[0, 0, 0]], np.int32), np.array([[0, 1, 2]] * 3, np.int32)])
 def test_nothing_and_almost_nothing(faces: np.ndarray) -> None:
     vertices, left = repair(np.eye(3), faces)
