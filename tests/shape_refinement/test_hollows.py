@@ -120,6 +120,14 @@ def test_a_bowl_opens(bowl_scene: tuple[Hull, np.ndarray, list[Photo]]) -> None:
     assert (opened.field >= hull.field).all()
 
 
+def test_a_stop_ends_between_proposals(bowl_scene: tuple[Hull, np.ndarray, list[Photo]]) -> None:
+    hull, softness, photos = bowl_scene
+    steps = iter(range(3))
+    with pytest.raises(StopIteration):
+        open_hollows(hull, softness, lambda size: photos, OPTIONS, on_step=lambda: next(steps) and None)
+    assert len(list(find_lids(hull, softness, HeldOut.split(photos)))) < 3  # it ended inside of one lid
+
+
 def test_a_glossy_box_stays_closed() -> None:
     box = trimesh.creation.box((1.1, 0.7, 0.5))
     for _ in range(4):
