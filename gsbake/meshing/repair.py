@@ -75,13 +75,17 @@ def repair_foreign(vertices: Vertices, faces: Faces, max_hole_edges: int) -> Rep
         mesh = remove_unused_vertices(merged_vertices, single) if joined or without_area or double else (vertices, faces)
         return Repaired(*mesh, joined, without_area, double)
     manifold = _remove_non_manifold_faces(merged_vertices, single)
-    holes = _boundary(merged_vertices, manifold)
-    holes = holes[~np.isin(np.sort(holes, axis=1) @ np.array([len(merged_vertices), 1]), border)]
-    used = np.unique(edge_keys(merged_vertices, manifold))
-    patches = [fill_hole(merged_vertices, loop, used) for loop in boundary_loops(holes) if len(loop) <= max_hole_edges]
-    whole = np.concatenate([manifold, *patches]).astype(np.int32)
-    final = split_non_manifold_vertices(*remove_unused_vertices(merged_vertices, whole))
-    cut, filled = len(single) - len(manifold), len(whole) - len(manifold)
+    # Several holes may meet at a vertex; once it is split, each has its own.
+    parted_vertices, parted = split_non_manifold_vertices(merged_vertices, manifold)
+    origin = np.zeros(len(parted_vertices), np.int64)
+    origin[parted] = manifold
+    holes = _boundary(parted_vertices, parted)
+    holes = holes[~np.isin(np.sort(origin[holes], axis=1) @ np.array([len(merged_vertices), 1]), border)]
+    used = np.unique(edge_keys(parted_vertices, parted))
+    patches = [fill_hole(parted_vertices, loop, used) for loop in boundary_loops(holes) if len(loop) <= max_hole_edges]
+    whole = np.concatenate([parted, *patches]).astype(np.int32)
+    final = remove_unused_vertices(parted_vertices, whole)
+    cut, filled = len(single) - len(manifold), len(whole) - len(parted)
     return Repaired(*final, joined, without_area, double, non_manifold, cut, filled)
 
 
