@@ -45,7 +45,7 @@ def _allowed(field: FieldInfo) -> str:
     if field.annotation is bool:
         return "true or false"
     if get_origin(field.annotation) is tuple:
-        return "a list"
+        return bounds(field)
     choices = [c for c in get_args(field.annotation) if not isinstance(c, type)]
     words = [str(inner) for c in choices for inner in (get_args(c) or (c,))]
     if words:

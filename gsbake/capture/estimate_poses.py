@@ -167,12 +167,16 @@ class _Estimation:
         shown = 0
         for camera in cameras:
             box = region.silhouette(camera)
-            shown += bool(box.any())
             path = self.out / "masks" / f"{camera.name}.png"
             if path.exists():
-                write_png(path, np.minimum(read_grey(path), box))
+                box = np.minimum(read_grey(path), box)
+                write_png(path, box)
+            shown += bool(box.any())
         if not shown:
-            raise BadInputError("poses: the region lies in no photo; its box is in the frame of the cameras (photo_cameras.json).")
+            raise BadInputError(
+                "poses: the region lies in no photo, or beside the object in all masks; its box is in the frame of the cameras "
+                "(photo_cameras.json)."
+            )
         inside = None if points is None else region.contains(points)
         return (None, None) if inside is None else (points[inside], None if colours is None else colours[inside])
 

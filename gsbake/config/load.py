@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from functools import cache
 from importlib import resources
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, get_args, get_origin
 
 from pydantic import BaseModel, ValidationError
 from pydantic.fields import FieldInfo
@@ -92,6 +92,9 @@ def bounds(field: FieldInfo) -> str:
     kind = field.annotation
     if kind is bool:
         return "true or false"
+    if get_origin(kind) is tuple:
+        most = next(m.max_length for m in field.metadata if hasattr(m, "max_length"))
+        return f"a list of at most {most} {'numbers' if float in get_args(kind) else 'texts'}"
     if choices := get_args(kind):
         words = [word for c in choices for word in (("true", "false") if c is bool else get_args(c) or (c,))]
         return "one of " + ", ".join(str(word) for word in words)

@@ -21,6 +21,8 @@ from gsbake.geometry.cameras import Array, Camera, Similarity
 
 #: Largest deviation of RᵀR from the identity that is attributed to rounding in a text file.
 RIGID_TOLERANCE = 1e-2
+#: Largest coordinate and edge, and its inverse the smallest edge: lengths beyond are those of no object in any unit.
+MAX_LENGTH = 1e9
 #: Largest file of a region in bytes.
 MAX_BYTES = 10_000
 #: Pairs of corners that edges join, as `Region.corners` orders them.
@@ -39,7 +41,7 @@ class Region:
     def of(numbers: Sequence[float], source: str) -> Region:
         """The box of 15 numbers: centre, size, rotation by rows. Raises BadInputError, which names the `source`, for what is no box."""
         values = np.asarray(numbers, float)
-        if values.shape != (15,) or not np.isfinite(values).all() or not (values[3:6] > 0).all():
+        if values.shape != (15,) or not (np.abs(values) <= MAX_LENGTH).all() or not (values[3:6] >= 1 / MAX_LENGTH).all():
             raise BadInputError(f"The region of {source} is no box: it needs a centre, three positive edges, and a rotation.")
         rotation = values[6:].reshape(3, 3)
         if np.abs(rotation.T @ rotation - np.eye(3)).max() > RIGID_TOLERANCE or np.linalg.det(rotation) < 0:
@@ -53,12 +55,12 @@ class Region:
         try:
             with path.open("rb") as file:
                 body = json.loads(file.read(MAX_BYTES))
-            parts = [np.asarray(body[key], float).ravel() for key in ("centre", "size")]
-            parts.append(np.asarray(body.get("rotation", np.eye(3)), float).ravel())
+            parts = [np.asarray(body[key], float).reshape(3) for key in ("centre", "size")]
+            parts.append(np.asarray(body.get("rotation", np.eye(3)), float).reshape(9))
             numbers = np.concatenate(parts).tolist()
         except OSError as error:
             raise BadInputError(f"The region '{path}' cannot be read: {error.strerror}.") from error
-        except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+        except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError) as error:
             raise BadInputError(
                 f"'{path}' is no region: it is JSON with a centre [x, y, z], a size [x, y, z] and, where it is turned, a rotation of 3 × 3."
             ) from error

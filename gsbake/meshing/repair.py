@@ -75,13 +75,17 @@ def repair_foreign(vertices: Vertices, faces: Faces, max_hole_edges: int) -> Rep
         mesh = remove_unused_vertices(merged_vertices, single) if joined or without_area or double else (vertices, faces)
         return Repaired(*mesh, joined, without_area, double)
     manifold = _remove_non_manifold_faces(merged_vertices, single)
-    holes = _boundary(merged_vertices, manifold)
-    holes = holes[~np.isin(np.sort(holes, axis=1) @ np.array([len(merged_vertices), 1]), border)]
-    used = np.unique(edge_keys(merged_vertices, manifold))
-    patches = [fill_hole(merged_vertices, loop, used) for loop in boundary_loops(holes) if len(loop) <= max_hole_edges]
-    whole = np.concatenate([manifold, *patches]).astype(np.int32)
-    final = split_non_manifold_vertices(*remove_unused_vertices(merged_vertices, whole))
-    cut, filled = len(single) - len(manifold), len(whole) - len(manifold)
+    # Several holes may meet at a vertex; once it is split, each has its own.
+    parted_vertices, parted = split_non_manifold_vertices(merged_vertices, manifold)
+    origin = np.zeros(len(parted_vertices), np.int64)
+    origin[parted] = manifold
+    holes = _boundary(parted_vertices, parted)
+    holes = holes[~np.isin(np.sort(origin[holes], axis=1) @ np.array([len(merged_vertices), 1]), border)]
+    used = np.unique(edge_keys(parted_vertices, parted))
+    patches = [fill_hole(parted_vertices, loop, used) for loop in boundary_loops(holes) if len(loop) <= max_hole_edges]
+    whole = np.concatenate([parted, *patches]).astype(np.int32)
+    final = remove_unused_vertices(parted_vertices, whole)
+    cut, filled = len(single) - len(manifold), len(whole) - len(parted)
     return Repaired(*final, joined, without_area, double, non_manifold, cut, filled)
 
 
@@ -168,7 +172,8 @@ def _remove_duplicate_faces(faces: Faces) -> Faces:
 def _remove_non_manifold_faces(vertices: Vertices, faces: Faces) -> Faces:
     """Remove a face of each edge with more than two faces, of the direction that has more of them, until there is none.
 
-    It is one with a free edge, whose loss opens nothing, else the smallest.
+    It is one with a free edge, whose loss opens nothing, else the smallest. Edges with very many lose an eighth of them at once, else
+    thousands of faces at one edge would take as many rounds.
     """
     while len(faces):
         keys = edge_keys(vertices, faces)
@@ -181,7 +186,8 @@ def _remove_non_manifold_faces(vertices: Vertices, faces: Faces) -> Faces:
         closed = np.all(counts[edge].reshape(-1, 3) > 1, axis=1)
         face, edge = np.repeat(np.arange(len(faces)), 3)[excess], edge[excess]
         order = np.lexsort((face, _doubled_areas(vertices, faces)[face], closed[face], edge))
-        worst = np.unique(edge[order], return_index=True)[1]
+        _, first, place = np.unique(edge[order], return_index=True, return_inverse=True)
+        worst = np.arange(len(order)) - first[place] < np.maximum(counts[edge[order]] // 8, 1)
         keep = np.ones(len(faces), np.bool_)
         keep[face[order[worst]]] = False
         faces = faces[keep]

@@ -76,14 +76,13 @@ def open_hollows(
     """The hull (n, n, n), n even, with its hollows opened, and what was decided about each lid.
 
     `softness` (n, n, n) as from `surface_softness`; `load_photos` returns the photos, their longer side at most a number of pixels, all
-    with masks. Raises ValueError for an empty hull.
+    with masks. `on_step` is called before each proposal, and may raise.
     """
     options = options or HollowOptions()
     held_out = HeldOut.split(load_photos(options.size))
     opened, verdicts = hull, []
     for lid in find_lids(hull, softness, held_out):
-        on_step()
-        shape, found = _Hollow(opened, lid.cells, held_out, options).best(lid.prediction)
+        shape, found = _Hollow(opened, lid.cells, held_out, options, on_step).best(lid.prediction)
         before = opened
         if found.error <= options.share * lid.prediction.error and found.seen >= options.seen * lid.prediction.seen:
             opened = seen_part(opened, shape, held_out.photos, options.photos)
@@ -112,8 +111,8 @@ class _Proposal:
 class _Hollow:
     """Proposals for the hollow under one lid, `lid` (n, n, n), of a `hull`."""
 
-    def __init__(self, hull: Hull, lid: Cells, held_out: HeldOut, options: HollowOptions) -> None:
-        self.hull, self.held_out, self.options = hull, held_out, options
+    def __init__(self, hull: Hull, lid: Cells, held_out: HeldOut, options: HollowOptions, on_step: Callable[[], None]) -> None:
+        self.hull, self.held_out, self.options, self.on_step = hull, held_out, options, on_step
         surface = surface_cells(hull.occupancy)
         self.lid = lid & surface
         # Below all of the surface but the lid, and where that is nearest.
@@ -145,6 +144,7 @@ class _Hollow:
 
     def _propose(self, air: Cells, thickness: NDArray[np.floating]) -> _Proposal:
         """What of the `air` (n, n, n) is below walls of this thickness, one value or that of each cell (n, n, n)."""
+        self.on_step()
         below = np.asarray(self.depth - thickness, np.float32)
         air = air & (below > 0)
         distance = np.clip(np.where(air, np.maximum(below, 0.2), np.minimum(below, -0.05)), -3, 3)

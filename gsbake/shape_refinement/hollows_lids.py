@@ -44,17 +44,25 @@ def surface_cells(solid: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return np.asarray(solid & ~ndimage.binary_erosion(solid))
 
 
-def hull_mesh(hull: Hull) -> tuple[Doubles, Faces]:
-    """Vertices and faces of the hull on blocks of cells."""
+def _blocks(hull: Hull) -> Hull:
+    """The hull on blocks of cells; empty where it is thinner than one."""
     n = hull.field.shape[0] // BLOCK
     clipped = np.clip(hull.field, -4 * hull.cell, 4 * hull.cell)
     field = np.asarray(clipped.reshape(n, BLOCK, n, BLOCK, n, BLOCK).mean((1, 3, 5)), np.float32)
-    vertices, faces = Hull(field < 0, hull.lower, BLOCK * hull.cell, field).triangles()
+    return Hull(field < 0, hull.lower, BLOCK * hull.cell, field)
+
+
+def hull_mesh(hull: Hull) -> tuple[Doubles, Faces]:
+    """Vertices and faces of the hull on blocks of cells."""
+    vertices, faces = _blocks(hull).triangles()
     return np.ascontiguousarray(vertices), np.ascontiguousarray(faces, np.int32)
 
 
 def find_lids(hull: Hull, softness: NDArray[np.float32], held_out: HeldOut) -> Iterator[Lid]:
-    """The lids of the hull, the largest first; `softness` (n, n, n) as from `surface_softness`."""
+    """The lids of the hull, the largest first, none of one that is thinner than a block; `softness` (n, n, n) as from
+    `surface_softness`."""
+    if _blocks(hull).empty:
+        return
     vertices, faces = hull_mesh(hull)
     surface = Surface(len(vertices), faces)
     errors = np.fmin(*(held_out.errors(vertices, faces, reflections) for reflections in (True, False)))

@@ -17,6 +17,7 @@ from gsbake.capture.sfm.process import JobCallbacks, run_job
 from gsbake.errors import BadInputError, InterruptedRun
 from gsbake.geometry.cameras import Camera, CameraSet
 from gsbake.geometry.ply import write_cloud
+from gsbake.imaging.png import read_grey, write_png
 from tests.capture.conftest import Done, Runner
 from tests.support.cameras import look_at
 from tests.support.slow import slow
@@ -138,7 +139,8 @@ def test_only_the_region_is_kept(tmp_path: Path, runner: Runner, masked: bool) -
         for camera in true:
             Image.fromarray(np.full((camera.height, camera.width), 255, np.uint8)).save(tmp_path / "cap/masks" / f"{camera.name}.png")
     runner.ingest(tmp_path / "cap", poses=tmp_path / "cap/cameras.xml")
-    results, done = runner.poses(max_features=1000)
+    settings: dict[str, Any] = {"max_features": 1000, "cache": tmp_path / "features"}
+    results, done = runner.poses(**settings)
     posed = PosedPhotos.open(done.out)
     region, to_world = posed.region, posed.cameras.to_world
     assert region is not None and done.decisions["region"][0] == "from the file of the cameras"
@@ -151,12 +153,17 @@ def test_only_the_region_is_kept(tmp_path: Path, runner: Runner, masked: bool) -
     else:
         assert mask is None and np.allclose(results["centre"], [0.5, 0, 0.4]) and results["radius"] == pytest.approx(np.sqrt(5.09) / 2)
     box = (0.5, 0.0, 0.4, 0.5, 0.5, 0.5, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
-    _, other = runner.poses(out="by hand", max_features=1000, region_box=box)
+    _, other = runner.poses(out="by hand", **settings, region_box=box)
     assert other.decisions["region"][0] == "set by --region" and '"size": [0.5, 0.5, 0.5]' in other.decisions["region"][1]
-    _, whole = runner.poses(out="whole", max_features=1000, region="none")
+    _, whole = runner.poses(out="whole", **settings, region="none")
     assert not (whole.out / "region.json").exists() and whole.decisions["region"][0] == "none"
     with pytest.raises(BadInputError, match="the region lies in no photo"):
-        runner.poses(out="beside", max_features=1000, region_box=(50.0, *box[1:]))
+        runner.poses(out="beside", **settings, region_box=(50.0, *box[1:]))
+    if masked:
+        for path in (runner.root / "ingest" / "masks").iterdir():  # the object is at the left edge of all photos
+            write_png(path, np.where(np.arange(320) < 4, read_grey(path), 0).astype(np.uint8))
+        with pytest.raises(BadInputError, match="beside the object in all masks"):
+            runner.poses(out="off", **settings, region_box=(0.6, 0.0, 0.4, 0.1, 0.1, 0.1, *box[6:]))
 
 
 def test_given_poses_keep_their_frame_and_points_are_triangulated(tmp_path: Path, runner: Runner) -> None:

@@ -58,6 +58,11 @@ def test_its_file_comes_back_and_what_is_none_is_refused(tmp_path: Path) -> None
         ('{"centre": [0, 0, 1]}', "is no region"),
         ('{"centre": [0, 0, 1], "size": [1, 2, -3]}', "is no box"),
         ('{"centre": [0, 0, NaN], "size": [1, 2, 3]}', "is no box"),
+        ('{"centre": [0, 0, 1e300], "size": [1, 2, 3]}', "is no box"),
+        ('{"centre": [0, 0, 1], "size": [1, 2, 1e-320]}', "is no box"),
+        (f'{{"centre": [0, 0, 1{400 * "0"}], "size": [1, 2, 3]}}', "is no region"),
+        ('{"centre": [0, 0, 1, 1], "size": [2, 3]}', "is no region"),
+        ('{"centre": [0, 0, 1], "size": [1, 2, 3], "rotation": [[1e200,0,0],[0,1e200,0],[0,0,1]]}', "is no box"),
         ('{"centre": [0, 0, 1], "size": [1, 2, 3], "rotation": [[1,0,0],[0,1,0],[0,0,-1]]}', "scales, shears or mirrors"),
     ):
         path.write_text(text)

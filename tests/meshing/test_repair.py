@@ -140,6 +140,32 @@ def test_a_mesh_without_faults_is_the_same_mesh() -> None:
     assert found.vertices is vertices and found.faces is opened and found.faults == ""
 
 
+def test_holes_that_meet_at_a_vertex_are_closed_too() -> None:
+    """Five boxes, as pages of a book, that share one edge: all but one lose their faces there, and all are whole again."""
+    box = trimesh.creation.box((1.0, 0.05, 1.0))
+    corners, back = box.vertices + [0.5, 0.025, 0], []
+    for angle in 2 * np.pi * np.arange(5) / 5:
+        turn = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
+        back.append(np.round(corners @ turn.T, 9) + 0.0)
+    faces = np.concatenate([box.faces + 8 * k for k in range(5)]).astype(np.int32)
+    found = repair_foreign(np.concatenate(back), faces, 100)
+    after = topology(found.vertices, found.faces)
+    assert found.non_manifold == 1 and found.cut == found.filled == 8
+    assert after.border_edges == after.non_manifold_edges == 0
+
+
+def test_thousands_of_faces_at_one_edge() -> None:
+    """Both directions alternate, all edges are free: the largest face of each direction stays. One face a round would take minutes."""
+    count = 30_000
+    angle, length = np.arange(count), 1 + np.arange(count) / count
+    vertices = np.array([[0, 0, -1], [0, 0, 1], *np.stack([np.cos(angle) * length, np.sin(angle) * length, 0 * angle], 1)])
+    faces = np.column_stack([angle % 2, 1 - angle % 2, 2 + angle]).astype(np.int32)
+    found = repair_foreign(vertices, faces, 100)
+    assert (found.non_manifold, found.cut, len(found.faces)) == (1, count - 2, 2)
+    assert np.abs(found.vertices).max() > 0.9 and np.hypot(*found.vertices[:, :2].T).max() == pytest.approx(2, abs=1e-3)
+    assert topology(found.vertices, found.faces).non_manifold_edges == 0
+
+
 @pytest.mark.parametrize("faces", [np.zeros((0, 3), np.int32), np.array([[0, 0, 0]], np.int32), np.array([[0, 1, 2]] * 3, np.int32)])
 def test_nothing_and_almost_nothing(faces: np.ndarray) -> None:
     vertices, left = repair(np.eye(3), faces)

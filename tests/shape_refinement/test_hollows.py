@@ -137,6 +137,14 @@ def test_a_bowl_opens(bowl_scene: tuple[Hull, np.ndarray, list[Photo]]) -> None:
     assert (opened.field >= hull.field).all()
 
 
+def test_a_stop_ends_between_proposals(bowl_scene: tuple[Hull, np.ndarray, list[Photo]]) -> None:
+    hull, softness, photos = bowl_scene
+    steps = iter(range(3))
+    with pytest.raises(StopIteration):
+        open_hollows(hull, softness, lambda size: photos, OPTIONS, on_step=lambda: next(steps) and None)
+    assert len(list(find_lids(hull, softness, HeldOut.split(photos)))) < 3  # it ended inside of one lid
+
+
 def test_a_glossy_box_stays_closed() -> None:
     box = trimesh.creation.box((1.1, 0.7, 0.5))
     for _ in range(4):
@@ -168,6 +176,15 @@ def test_without_photos_that_see_it_the_hull_stays(bowl_scene: tuple[Hull, np.nd
     blind = [Photo(photo.camera, photo.rgb, np.zeros_like(photo.mask)) for photo in photos]
     opened, verdicts = open_hollows(hull, softness, lambda size: blind, OPTIONS)
     assert (opened.field == hull.field).all() and not verdicts
+
+
+def test_a_leaf_has_no_hollows(bowl_scene: tuple[Hull, np.ndarray, list[Photo]]) -> None:
+    """A hull of one layer of cells, as of a leaf or a sheet of paper: nothing of it is left on blocks of cells."""
+    hull, softness, photos = bowl_scene
+    field = np.full(hull.field.shape, 2 * hull.cell)
+    field[16:48, 16:48, 32] = -0.1 * hull.cell
+    opened, verdicts = open_hollows(with_field(hull, field), softness, lambda size: photos, OPTIONS)
+    assert opened.occupancy.sum() == 32 * 32 and not verdicts
 
 
 def test_the_mesh_of_a_hull_has_its_size(bowl_scene: tuple[Hull, np.ndarray, list[Photo]]) -> None:

@@ -20,21 +20,21 @@ _HEADER, _ENTRY = 128, 12
 _MAX_TAGS = 200
 
 
-def tags(profile: bytes) -> dict[bytes, bytes]:
-    """Content of each tag of a profile; {} for what is none."""
+def tags(profile: bytes) -> dict[bytes, memoryview]:
+    """Content of each tag of a profile, without a copy, since tags may overlap; {} for what is none."""
     if len(profile) < _HEADER + 4:
         return {}
     count = min(int.from_bytes(profile[_HEADER : _HEADER + 4], "big"), _MAX_TAGS)
     found = {}
     for place in range(_HEADER + 4, min(_HEADER + 4 + _ENTRY * count, len(profile) - _ENTRY + 1), _ENTRY):
         name, offset, size = struct.unpack_from(">4sII", profile, place)
-        found[name] = profile[offset : offset + size]
+        found[name] = memoryview(profile)[offset : offset + size]
     return found
 
 
 def coding(profile: bytes) -> tuple[int, int] | None:
     """Primaries and transfer, codes of H.273, that a profile's tag `cicp` states; None where it has none."""
-    content = tags(profile).get(b"cicp", b"")
+    content = tags(profile).get(b"cicp", memoryview(b""))
     return (content[8], content[9]) if len(content) >= 12 else None
 
 
@@ -47,14 +47,15 @@ def linear_light(profile: bytes, coded: Floats) -> Floats | None:
     try:
         columns = [struct.unpack_from(">4s4x3i", found[name]) for name in (b"rXYZ", b"gXYZ", b"bXYZ")]
         matrix = np.linalg.inv(_SRGB_D50) @ np.array([column[1:] for column in columns]).T / 65536
-        planes = [_curve(found[name], coded[..., k]) for k, name in enumerate((b"rTRC", b"gTRC", b"bTRC"))]
+        with np.errstate(all="ignore"):  # curves of strangers; what is not finite is refused below
+            planes = [_curve(found[name], coded[..., k]) for k, name in enumerate((b"rTRC", b"gTRC", b"bTRC"))]
+            out = np.stack(planes, -1) @ matrix.T
     except (KeyError, struct.error, ValueError):
         return None
-    out = np.stack(planes, -1) @ matrix.T
     return out.astype(np.float32) if np.isfinite(out).all() else None
 
 
-def _curve(content: bytes, x: NDArray[Any]) -> NDArray[Any]:
+def _curve(content: memoryview, x: NDArray[Any]) -> NDArray[Any]:
     """Values of a curve (`curv` or `para`) at x in 0..1. Raises struct.error or ValueError for one that is none."""
     if content[:4] == b"curv":
         (count,) = struct.unpack_from(">I", content, 8)

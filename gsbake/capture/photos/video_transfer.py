@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 #: Largest description of tracks that is read, and most boxes beside it.
@@ -23,6 +24,7 @@ def video_transfer(path: Path) -> int | None:
 def _description(path: Path) -> bytes:
     """Content of the box `moov`; empty where there is none."""
     with path.open("rb") as file:
+        whole = os.fstat(file.fileno()).st_size
         for _ in range(MAX_BOXES):
             header = file.read(16)
             if len(header) < 8:
@@ -34,7 +36,7 @@ def _description(path: Path) -> bytes:
             file.seek(start - len(header), 1)
             if kind == b"moov":
                 return file.read(min(size - start, MAX_DESCRIPTION)) if size > start else b""
-            if size < start or size >= 1 << 62:
+            if size < start or size > whole:
                 break
             file.seek(size - start, 1)
     return b""
@@ -50,12 +52,12 @@ def _boxes(data: bytes, start: int, end: int) -> Iterator[tuple[bytes, int, int]
         start += size
 
 
-def _transfers(data: bytes, start: int, end: int) -> Iterator[int]:
-    """Codes in the descriptions of samples inside these boxes."""
+def _transfers(data: bytes, start: int, end: int, containers: Sequence[bytes] = _CONTAINERS) -> Iterator[int]:
+    """Codes in the descriptions of samples inside these boxes, which lie in `containers`, one in the other."""
     for kind, first, last in _boxes(data, start, end):
-        if kind in _CONTAINERS:
-            yield from _transfers(data, first, last)
-        elif kind == b"stsd":
+        if containers and kind == containers[0]:
+            yield from _transfers(data, first, last, containers[1:])
+        elif not containers and kind == b"stsd":
             for _, sample, sample_end in _boxes(data, first + 8, last):
                 for inner, colour, _ in _boxes(data, sample + _VIDEO_SAMPLE, sample_end):
                     if inner == b"colr" and data[colour : colour + 4] in (b"nclx", b"nclc"):

@@ -19,7 +19,7 @@ from gsbake.text import missing_list
 
 class _Frame(Strict):
     file_path: str = Field(min_length=1, max_length=4096)
-    mask_path: str | None = Field(None, min_length=1, max_length=4096)
+    mask_path: str | None = Field(None, max_length=4096)
 
 
 class _File(Strict):
@@ -37,12 +37,12 @@ def frame_masks(poses: Path | None) -> dict[str, Path]:
         body = TypeAdapter(_File).validate_json(read_json_text(poses))
     except ValidationError:
         return {}
-    root = poses.parent.resolve()
+    root = Path(os.path.realpath(poses.parent))
     found, outside = {}, []
     for frame in body.frames:
-        if frame.mask_path is not None:
+        if frame.mask_path:
             path = root / frame.mask_path.replace("\\", "/").replace("\0", "?")
-            found[frame.file_path] = path = path.parent.resolve() / path.name
+            found[frame.file_path] = path = Path(os.path.realpath(path.parent)) / path.name
             if not path.is_relative_to(root):
                 outside.append(frame.mask_path)
     if outside:
@@ -55,7 +55,7 @@ def frame_masks(poses: Path | None) -> dict[str, Path]:
 
 def mask_folder(masks: Mapping[str, Path]) -> Path | None:
     """The folder that all of these mask files share; None where none of them exists."""
-    return Path(os.path.commonpath({path.parent for path in masks.values()})) if any(map(Path.is_file, masks.values())) else None
+    return Path(os.path.commonpath({path.parent for path in masks.values()})) if any(map(os.path.isfile, masks.values())) else None
 
 
 def masks_by_photo(masks: Mapping[str, Path], folder: Path | None, photos: Iterable[str], poses: Path) -> dict[str, Path]:
@@ -68,7 +68,7 @@ def masks_by_photo(masks: Mapping[str, Path], folder: Path | None, photos: Itera
         photo = index.match(frame)
         if photo is not None and (folder is None or path.is_relative_to(folder.resolve())):
             found[photo] = path
-    missing = sorted({path.relative_to(poses.parent.resolve()).as_posix() for path in found.values() if not path.is_file()})
+    missing = sorted({path.relative_to(poses.parent.resolve()).as_posix() for path in found.values() if not os.path.isfile(path)})
     if missing:
         raise BadInputError(
             f"{len(missing)} masks that {poses} names do not exist ({missing_list(missing)}); export them again, remove mask_path, or give "

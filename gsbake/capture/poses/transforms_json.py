@@ -62,6 +62,7 @@ class _Intrinsics(Strict):
 class _Frame(_Intrinsics):
     file_path: str = Field(min_length=1, max_length=4096)
     transform_matrix: list[list[Coordinate]] = Field(max_length=4)
+    mask_path: str | None = Field(None, max_length=4096)
     depth_file_path: Any = None
 
 

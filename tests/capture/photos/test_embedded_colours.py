@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+import tracemalloc
 import zlib
 from pathlib import Path
 from typing import Any
@@ -87,6 +88,13 @@ def test_broken_profiles_do_not_make_a_photo_unusable() -> None:
     for length in range(0, len(whole), 7):
         tags = {"ICCProfile": np.frombuffer(whole[:length], np.uint8), "ICCProfile:color_space": "RGB"}
         assert to_srgb(pixels, tags).shape == pixels.shape
+    entries = b"".join(struct.pack(">III", k, k + 1, 1 << 31) for k in range(200))  # each tag is nearly the whole file
+    overlapping = bytes(128) + struct.pack(">I", 200) + entries + bytes(1 << 20)
+    tracemalloc.start()
+    assert len(icc.tags(overlapping)) == 200 and tracemalloc.get_traced_memory()[1] < 1 << 20
+    tracemalloc.stop()
+    infinite = profile(struct.pack(">4s4xHxxi", b"para", 0, -(2 << 16)))  # black has no light by it
+    assert icc.linear_light(infinite, np.zeros((1, 1, 3), np.float32)) is None
 
 
 def hlg(scene: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -102,6 +102,17 @@ def test_a_video_says_how_it_is_coded(tmp_path: Path) -> None:
         assert video_transfer(cut) in (None, 18)
 
 
+def test_a_hostile_video_says_nothing(tmp_path: Path) -> None:
+    """Boxes that lie one in the other thousands of times, and sizes that lead beyond all files."""
+    nested = b""
+    for _ in range(3000):
+        nested = struct.pack(">I4s", 8 + len(nested), b"trak") + nested
+    path = tmp_path / "a.mp4"
+    for content in (struct.pack(">I4s", 8 + len(nested), b"moov") + nested, struct.pack(">I4sQ", 1, b"free", (1 << 62) - 1) * 5):
+        path.write_bytes(content)
+        assert video_transfer(path) is None
+
+
 def test_frames_follow_the_motion() -> None:
     """Half of the frames show a camera at rest: nearly all that are chosen come from the other half, each the sharpest of its stretch."""
     motion = np.concatenate([np.zeros(50), np.ones(50)])

@@ -149,6 +149,25 @@ def test_masks_outside_the_folder_are_not_read(tmp_path: Path, name: str) -> Non
         discover(root)
 
 
+@pytest.mark.parametrize("name", ["n" * 300, "n" * 300 + "/a.png", "loop/a.png"])
+def test_masks_that_no_system_can_open_do_not_exist(tmp_path: Path, runner: Runner, name: str) -> None:
+    capture(tmp_path, [frame(camera, mask_path=name) for camera in cameras()])
+    (tmp_path / "loop").symlink_to("loop")
+    with pytest.raises(BadInputError, match="1 masks that .* do not exist"):
+        runner.ingest(tmp_path)
+
+
+def test_one_frame_without_a_mask_does_not_hide_those_of_others(tmp_path: Path, runner: Runner) -> None:
+    """An empty name is none; what is no name is refused, not passed over with all masks of the file."""
+    names = ["", *write_masks(tmp_path, [f"cut/{k}.png" for k in range(3)])]
+    frames = [frame(camera, mask_path=name) for camera, name in zip(cameras(), names, strict=True)]
+    capture(tmp_path, frames)
+    assert runner.ingest(tmp_path)[0]["masks"] == 3
+    (tmp_path / "transforms.json").write_text(json.dumps({"frames": [frames[0] | {"mask_path": 5}, *frames[1:]]}))
+    with pytest.raises(BadInputError, match=r"frames\.0\.mask_path: input should be a valid string"):
+        Runner(tmp_path / "again").ingest(tmp_path)
+
+
 def test_depths_of_frames_are_said_to_be_unused(tmp_path: Path, runner: Runner) -> None:
     frames = [frame(camera) for camera in cameras()]
     capture(tmp_path, [frames[0] | {"depth_file_path": "depth/a.png"}, frames[1] | {"depth_file_path": 7}, *frames[2:]])
