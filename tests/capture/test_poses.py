@@ -129,7 +129,7 @@ def metashape(folder: Path, cameras: list[Camera], region: str) -> None:
     )
 
 
-@pytest.mark.parametrize("masked", [True, False])
+@pytest.mark.parametrize("masked", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_only_the_region_is_kept(tmp_path: Path, runner: Runner, masked: bool) -> None:
     """Metashape's region around the board's right half: masks show no more of it, tie points lie in it, and it gives the frame."""
     true = board_capture(tmp_path / "cap")
