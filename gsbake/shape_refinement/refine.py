@@ -53,7 +53,7 @@ class RefinementOptions:
     first: StepOptions = field(default_factory=lambda: StepOptions(curvature=6.0, slope=8.0, move=3.0))
     confirmed: float = 0.07
     #: Least share of what changes between held-out photos that reflections fitted to the others must predict.
-    predicted: float = 0.05
+    predicted: float = 0.1
     levels: tuple[Level, ...] = (
         Level(16, 2, 2.0, held=False), Level(16, 2, 2.0), Level(24, 4, 1.4), Level(32, 6, 0.8), Level(48, 3, 0.6),
     )  # fmt: skip
