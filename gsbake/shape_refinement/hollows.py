@@ -50,6 +50,8 @@ class HollowOptions:
     #: other parts .12 and more. At least so many vertices, as a share of the lid's, have to be seen: others 0 to .3.
     share: float = 0.07
     seen: float = 0.6
+    #: The largest error of a hollow's surface, a tenth of the brightness squared: hollows reach .006, other parts .02 and more.
+    error: float = 0.01
     #: A thicker wall, or one of uneven thickness, is preferred up to this factor on the least error.
     tolerance: float = 1.2
     #: Thicknesses end at this factor on the least error.
@@ -84,7 +86,8 @@ def open_hollows(
     for lid in find_lids(hull, softness, held_out):
         shape, found = _Hollow(opened, lid.cells, held_out, options, on_step).best(lid.prediction)
         before = opened
-        if found.error <= options.share * lid.prediction.error and found.seen >= options.seen * lid.prediction.seen:
+        better = found.error <= min(options.share * lid.prediction.error, options.error)
+        if better and found.seen >= options.seen * lid.prediction.seen:
             opened = seen_part(opened, shape, held_out.photos, options.photos)
         verdicts.append(Verdict(lid.vertices, lid.prediction.error, found.error, int((before.occupancy & ~opened.occupancy).sum())))
     return opened, verdicts
