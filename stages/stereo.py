@@ -20,8 +20,8 @@ def run(ctx: Context) -> dict[str, Any]:
 #: Modules with the kernels of this stage.
 KERNELS = (
     "gsbake.mvs.patchmatch", "gsbake.mvs.depth_bounds", "gsbake.capture.hull.softness", "gsbake.mvs.consistency", "gsbake.mvs.fusion",
-    "gsbake.mvs.mirror_images", "gsbake.mvs.carving", "gsbake.shape_refinement.hollows_kernel", "gsbake.shape_refinement.samples_kernel",
-    "gsbake.shape_refinement.reflection_kernel",
+    "gsbake.mvs.mirror_images", "gsbake.mvs.carving", "gsbake.shape_refinement.samples_kernel",
+    "gsbake.shape_refinement.reflection_kernel", "gsbake.shape_refinement.surface",
 )  # fmt: skip
 
 
