@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.hull import finished_stages
 from benchmarks.truth import Surface, align, read_centres, read_truth
 from gsbake.capture.hull.visual_hull import Hull, read_masks, unit_hull
 from gsbake.capture.posed_photos import PosedPhotos
@@ -66,19 +67,15 @@ def measure_run(run: Path, capture: Path) -> list[tuple[str, float, float]]:
 
     Raises UsageError when a stage is not finished or has no hull.
     """
-    store = Store(run)
-    known = {name: store.manifests(name) for name in ("poses", "stereo", "mesh")}
-    if missing := [name for name in ("poses", "stereo") if not known[name]]:
-        raise UsageError(f"{run} has no finished stage {missing[0]}; run `gsbake stereo` first.")
-    poses, stereo = known["poses"][0][0], known["stereo"][0][0]
+    poses, stereo = finished_stages(run)
     if not (stereo / "hull.npz").exists():
         raise UsageError(f"{stereo} has no visual hull: not all photos have masks.")
     posed, truth = PosedPhotos.open(poses), read_truth(capture)
     hull = unit_hull(*read_masks(posed))
     found = {"visual hull": Surface(*hull.triangles()), "after stereo": Surface(*Hull.load(stereo / "hull.npz").triangles())}
-    if known["mesh"]:
+    if meshes := Store(run).manifests("mesh"):
         for name in ("dense", "mesh"):
-            vertices, faces = read_mesh(known["mesh"][0][0] / f"{name}.ply")
+            vertices, faces = read_mesh(meshes[0][0] / f"{name}.ply")
             found[f"{name}.ply"] = Surface(np.asarray(vertices, float), np.asarray(faces, np.int64))
     frame = posed.cameras.to_world
     if posed.cameras.poses != "given":

@@ -43,11 +43,16 @@ class HullFigures:
 
 def measure_hulls(run: Path, capture: Path) -> HullFigures:
     """Figures of a run. Raises UsageError when a stage is not finished or has no hull."""
+    return measure_folders(*finished_stages(run), capture)
+
+
+def finished_stages(run: Path) -> tuple[Path, Path]:
+    """Folders of the run's stages poses and stereo. Raises UsageError when one is not finished."""
     store = Store(run)
     known = {name: store.manifests(name) for name in ("poses", "stereo")}
     if missing := [name for name in known if not known[name]]:
         raise UsageError(f"{run} has no finished stage {missing[0]}; run `gsbake stereo` first.")
-    return measure_folders(known["poses"][0][0], known["stereo"][0][0], capture)
+    return known["poses"][0][0], known["stereo"][0][0]
 
 
 def measure_folders(poses: Path, stereo: Path, capture: Path) -> HullFigures:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import tempfile
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +23,7 @@ from gsbake.mvs.mirror_images import without_mirror_images
 from gsbake.mvs.outliers import find_outliers, without_points
 from gsbake.mvs.point_cloud import StereoCloud
 from gsbake.mvs.pyramids import single_threaded_opencv
-from gsbake.shape_refinement.hollows import open_hollows
+from gsbake.shape_refinement.hollows import open_hollows, with_field
 from gsbake.shape_refinement.samples import Photo, load_photos
 
 #: Minimum number of photos and longer side in pixels; below, matching finds too few depths.
@@ -152,7 +151,7 @@ def _open_hollows(
 
     with monitor.part("hollows"):
         opened, verdicts = open_hollows(hull, softness, load, on_step=monitor.check_stop)
-    share = float((hull.occupancy & ~opened.occupancy).sum() / max(hull.occupancy.sum(), 1))
+    share = sum(one.cells for one in verdicts) / max(int(hull.occupancy.sum()), 1)
     evidence = f"{sum(one.cells > 0 for one in verdicts)} of {len(verdicts)} places where photos disagree about the hull's colour"
     if errors := "; ".join(f"{one.closed:.4f}, opened {one.opened:.4f}" for one in verdicts):
         evidence += f"; relative squared errors of photos that the colours were not fitted to: {errors}"
@@ -164,8 +163,7 @@ def _carve(run: StereoRun, softness: NDArray[np.float32], opened: Hull, out: Pat
     """Carve the hull where photos see through it, and write what neither that nor its hollows, which are `opened`, removes."""
     with monitor.part("carving"):
         carved = run.carved_hull(softness)
-    field = np.maximum(carved.hull.field, opened.field)
-    replace(carved.hull, field=field, occupancy=field < 0).save(out / "hull.npz")
+    with_field(carved.hull, np.maximum(carved.hull.field, opened.field)).save(out / "hull.npz")
     monitor.decide(
         "visual hull carving",
         f"{carved.carved_regions} regions carved",

@@ -19,7 +19,7 @@ from scipy import ndimage
 from gsbake.capture.hull.visual_hull import Hull
 from gsbake.geometry.raycast import RayCaster
 from gsbake.shape_refinement.hollows_lids import BLOCK, find_lids, hull_mesh, surface_cells
-from gsbake.shape_refinement.hollows_prediction import FLOOR, HeldOut, Prediction
+from gsbake.shape_refinement.hollows_prediction import FLOOR, Prediction, diffuse_errors
 from gsbake.shape_refinement.samples import Photo
 from gsbake.shape_refinement.surface import Doubles
 
@@ -47,10 +47,11 @@ class HollowOptions:
     #: Least cells of a hollow.
     cells: int = 100
     #: The error of a hollow's surface, as a share of the lid's, up to which it is opened: hollows of development objects reach .001 to .04,
-    #: other parts .12 and more. At least so many vertices, as a share of the lid's, have to be seen: others 0 to .3.
+    #: other parts .06 and more. At least so many vertices, as a share of the lid's, have to be seen: others 0 to .3.
     share: float = 0.07
     seen: float = 0.6
-    #: The largest error of a hollow's surface, a tenth of the brightness squared: hollows reach .006, other parts .02 and more.
+    #: The largest error of a hollow's surface, a tenth of the brightness squared: hollows reach .006; other parts have
+    #: .02 and more, or .12 of their lid's.
     error: float = 0.01
     #: A thicker wall, or one of uneven thickness, is preferred up to this factor on the least error.
     tolerance: float = 1.2
@@ -81,14 +82,14 @@ def open_hollows(
     with masks. `on_step` is called before each proposal, and may raise.
     """
     options = options or HollowOptions()
-    held_out = HeldOut.split(load_photos(options.size))
+    photos = load_photos(options.size)
     opened, verdicts = hull, []
-    for lid in find_lids(hull, softness, held_out):
-        shape, found = _Hollow(opened, lid.cells, held_out, options, on_step).best(lid.prediction)
+    for lid in find_lids(hull, softness, photos):
+        shape, found = _Hollow(opened, lid.cells, photos, options, on_step).best(lid.prediction)
         before = opened
         better = found.error <= min(options.share * lid.prediction.error, options.error)
         if better and found.seen >= options.seen * lid.prediction.seen:
-            opened = seen_part(opened, shape, held_out.photos, options.photos)
+            opened = seen_part(opened, shape, photos, options.photos)
         verdicts.append(Verdict(lid.vertices, lid.prediction.error, found.error, int((before.occupancy & ~opened.occupancy).sum())))
     return opened, verdicts
 
@@ -114,8 +115,8 @@ class _Proposal:
 class _Hollow:
     """Proposals for the hollow under one lid, `lid` (n, n, n), of a `hull`."""
 
-    def __init__(self, hull: Hull, lid: Cells, held_out: HeldOut, options: HollowOptions, on_step: Callable[[], None]) -> None:
-        self.hull, self.held_out, self.options, self.on_step = hull, held_out, options, on_step
+    def __init__(self, hull: Hull, lid: Cells, photos: Sequence[Photo], options: HollowOptions, on_step: Callable[[], None]) -> None:
+        self.hull, self.photos, self.options, self.on_step = hull, photos, options, on_step
         surface = surface_cells(hull.occupancy)
         self.lid = lid & surface
         # Below all of the surface but the lid, and where that is nearest.
@@ -154,7 +155,7 @@ class _Hollow:
         near = ndimage.binary_dilation(air, iterations=3) & self.hull.occupancy
         shape = with_field(self.hull, np.where(near, np.maximum(self.hull.field, distance * self.hull.cell), self.hull.field))
         vertices, faces = hull_mesh(shape)
-        errors = self.held_out.errors(vertices, faces, reflections=False)
+        errors = diffuse_errors(vertices, faces, self.photos)
         inside = (self.hull.signed_distance(vertices) < -INSIDE * self.hull.cell) & np.isfinite(errors)
         inside &= ndimage.binary_dilation(air, iterations=3)[self.hull.cells_of(vertices)]
         return _Proposal(shape, air, float(thickness.flat[0]), vertices[inside], errors[inside], Prediction.of(errors[inside]))

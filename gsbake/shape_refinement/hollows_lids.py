@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,7 +13,8 @@ from scipy.spatial import cKDTree
 
 from gsbake.capture.hull.softness import SOFT
 from gsbake.capture.hull.visual_hull import Hull
-from gsbake.shape_refinement.hollows_prediction import HeldOut, Prediction
+from gsbake.shape_refinement.hollows_prediction import Prediction, diffuse_errors, reflected_errors
+from gsbake.shape_refinement.samples import Photo
 from gsbake.shape_refinement.surface import Doubles, Faces, Surface
 
 #: Cells along the edge of a block of which the hull's mesh is made.
@@ -53,19 +54,19 @@ def _blocks(hull: Hull) -> Hull:
 
 
 def hull_mesh(hull: Hull) -> tuple[Doubles, Faces]:
-    """Vertices and faces of the hull on blocks of cells."""
+    """Vertices and faces of the hull on blocks of cells. Raises ValueError where it is thinner than one."""
     vertices, faces = _blocks(hull).triangles()
     return np.ascontiguousarray(vertices), np.ascontiguousarray(faces, np.int32)
 
 
-def find_lids(hull: Hull, softness: NDArray[np.float32], held_out: HeldOut) -> Iterator[Lid]:
+def find_lids(hull: Hull, softness: NDArray[np.float32], photos: Sequence[Photo]) -> Iterator[Lid]:
     """The lids of the hull, the largest first, none of one that is thinner than a block; `softness` (n, n, n) as from
     `surface_softness`."""
     if _blocks(hull).empty:
         return
     vertices, faces = hull_mesh(hull)
     surface = Surface(len(vertices), faces)
-    errors = np.fmin(*(held_out.errors(vertices, faces, reflections) for reflections in (True, False)))
+    errors = np.fmin(reflected_errors(vertices, faces, photos), diffuse_errors(vertices, faces, photos))
     known = np.isfinite(errors)
     total, count = surface.averaged(np.stack([np.where(known, np.minimum(errors, 1), 0), known], 1), AVERAGING).T
     disagree = total > LEAST_ERROR * np.maximum(count, 1e-3)

@@ -46,27 +46,10 @@ class Prediction:
         return cls(float(np.exp(np.log(np.minimum(errors, 1) + FLOOR).mean())), len(errors))
 
 
-@dataclass(frozen=True)
-class HeldOut:
-    """Photos in linear RGB, and which of them are `held` out (photos,)."""
-
-    photos: Sequence[Photo]
-    held: NDArray[np.bool_]
-
-    @classmethod
-    def split(cls, photos: Sequence[Photo]) -> HeldOut:
-        """The photos with a quarter held out."""
-        return cls(photos, np.arange(len(photos)) % EVERY == FIRST)
-
-    def errors(self, vertices: Doubles, faces: NDArray[np.int32], reflections: bool) -> Floats:
-        """Squared error (v,) of photos over the squared brightness, mean over photos and channels, of what other photos say; NaN where too
-        few see a vertex."""
-        return (reflected_errors if reflections else diffuse_errors)(vertices, faces, self)
-
-
-def diffuse_errors(vertices: Doubles, faces: NDArray[np.int32], held_out: HeldOut) -> Floats:
-    """See `HeldOut.errors`: each photo is predicted by the mean of all others, in closed form."""
-    samples = sample_photos(vertices, Surface(len(vertices), faces).normals(vertices), faces, held_out.photos)
+def diffuse_errors(vertices: Doubles, faces: NDArray[np.int32], photos: Sequence[Photo]) -> Floats:
+    """Squared error (v,) of photos, linear RGB, over the squared brightness, mean over photos and channels, when each is predicted by the
+    mean of all others; NaN where too few see a vertex."""
+    samples = sample_photos(vertices, Surface(len(vertices), faces).normals(vertices), faces, photos)
     weight = samples.weight
     total = np.maximum(weight.sum(1), 1e-9)
     mean = np.einsum("vp,vpc->vc", weight, samples.colour) / total[:, None]
@@ -76,9 +59,9 @@ def diffuse_errors(vertices: Doubles, faces: NDArray[np.int32], held_out: HeldOu
     return np.where((weight > 0).sum(1) > LEAST_VIEWS, error, np.nan).astype(np.float32)
 
 
-def reflected_errors(vertices: Doubles, faces: NDArray[np.int32], held_out: HeldOut) -> Floats:
-    """See `HeldOut.errors`: the held-out photos are predicted by diffuse colour, reflectance and light fitted to the others."""
-    photos, held = held_out.photos, held_out.held
+def reflected_errors(vertices: Doubles, faces: NDArray[np.int32], photos: Sequence[Photo]) -> Floats:
+    """As `diffuse_errors`, when every fourth photo is predicted by diffuse colour, reflectance and light fitted to the others."""
+    held = np.arange(len(photos)) % EVERY == FIRST
     surface = Surface(len(vertices), faces)
     normals = surface.normals(vertices)
     geometry = Geometry(vertices, normals, np.stack([photo.camera.centre for photo in photos]))

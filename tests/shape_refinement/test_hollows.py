@@ -15,7 +15,7 @@ from gsbake.geometry.raycast import RayCaster
 from gsbake.shape_refinement.appearance import BLACK
 from gsbake.shape_refinement.hollows import HollowOptions, open_hollows, seen_part, with_field
 from gsbake.shape_refinement.hollows_lids import find_lids, hull_mesh, surface_cells
-from gsbake.shape_refinement.hollows_prediction import FLOOR, HeldOut, Prediction
+from gsbake.shape_refinement.hollows_prediction import FLOOR, Prediction, diffuse_errors, reflected_errors
 from gsbake.shape_refinement.samples import Photo, sample_photos
 from gsbake.shape_refinement.surface import Surface
 from tests.shape_refinement.conftest import pattern, smooth_light
@@ -82,7 +82,7 @@ def test_each_photo_is_predicted_by_the_others() -> None:
     *_, photos = scene(ball, lambda point, normal, ray: np.full(point.shape, 0.4), size=60)
     uneven = [Photo(one.camera, one.rgb * np.float32(1 + 0.1 * (k % 3)), one.mask) for k, one in enumerate(photos)]
     vertices, faces = 0.95 * ball.vertices, np.ascontiguousarray(ball.faces, np.int32)
-    errors = HeldOut.split(uneven).errors(vertices, faces, reflections=False)
+    errors = diffuse_errors(vertices, faces, uneven)
     samples = sample_photos(vertices, Surface(len(vertices), faces).normals(vertices), faces, uneven)
     for v in range(0, len(vertices), 9):
         seen = np.flatnonzero(samples.weight[v] > 0)
@@ -92,14 +92,14 @@ def test_each_photo_is_predicted_by_the_others() -> None:
             left_out = [np.average(np.delete(x, j, 0), axis=0, weights=np.delete(w, j)) for j in range(len(seen))]
             expected = np.average(((x - left_out) ** 2).mean(1), weights=w) / (np.average(x, axis=0, weights=w).mean() + BLACK) ** 2
             assert errors[v] == pytest.approx(expected, rel=1e-3)
-    assert np.nanmedian(HeldOut.split(photos).errors(vertices, faces, reflections=False)) < 1e-9
+    assert np.nanmedian(diffuse_errors(vertices, faces, photos)) < 1e-9
 
 
 def test_reflections_predict_a_glossy_ball() -> None:
     ball = trimesh.creation.icosphere(4, 0.6)
     *_, photos = scene(ball, glossy, count=32)
     vertices, faces = np.asarray(ball.vertices), np.ascontiguousarray(ball.faces, np.int32)
-    reflected, diffuse_only = (HeldOut.split(photos).errors(vertices, faces, reflections) for reflections in (True, False))
+    reflected, diffuse_only = (errors(vertices, faces, photos) for errors in (reflected_errors, diffuse_errors))
     both = np.isfinite(reflected) & np.isfinite(diffuse_only)
     assert both.mean() > 0.3
     assert Prediction.of(reflected[both]).error < 0.3 * Prediction.of(diffuse_only[both]).error
@@ -114,7 +114,7 @@ def test_prediction_is_the_geometric_mean() -> None:
 
 def test_the_lid_of_a_bowl_is_found(bowl_scene: tuple[Hull, np.ndarray, list[Photo]]) -> None:
     hull, softness, photos = bowl_scene
-    lid = next(find_lids(hull, softness, HeldOut.split(photos)))
+    lid = next(find_lids(hull, softness, photos))
     cells = np.argwhere(lid.cells)
     places = hull.lower + (cells + 0.5) * hull.cell
     assert (lid.cells <= surface_cells(hull.occupancy)).all()
@@ -142,7 +142,7 @@ def test_a_stop_ends_between_proposals(bowl_scene: tuple[Hull, np.ndarray, list[
     steps = iter(range(3))
     with pytest.raises(StopIteration):
         open_hollows(hull, softness, lambda size: photos, OPTIONS, on_step=lambda: next(steps) and None)
-    assert len(list(find_lids(hull, softness, HeldOut.split(photos)))) < 3  # it ended inside of one lid
+    assert len(list(find_lids(hull, softness, photos))) < 3  # it ended inside of one lid
 
 
 def test_a_glossy_box_stays_closed() -> None:
