@@ -32,26 +32,30 @@ HULL_MARGIN = 1.5
 
 @dataclass(frozen=True)
 class DepthMap:
-    """One photo's depth map: `camera`, `plane` (h, w, 3), `confidence` (h, w) in 0..1 (0 = no depth), consistent `views` (h, w)."""
+    """One photo's depth map: `camera`, `plane` (h, w, 3), `confidence` (h, w) in 0..1 (0 = no depth), consistent `views` (h, w), and where
+    (h, w) the depth was found by local phase, not by brightness; None: nowhere."""
 
     camera: Camera
     plane: Floats
     confidence: Floats
     views: NDArray[np.uint8]
+    by_phase: NDArray[np.bool_] | None = None
 
     def depth(self) -> Floats:
         """z-depth (h, w), 0 = none."""
         return z_depth(self.camera, self.plane, self.confidence > 0)
 
     def save(self, path: Path) -> None:
-        """Write depth and confidence as a NumPy archive."""
-        np.savez(path, depth=self.depth(), confidence=self.confidence.astype(np.float16))
+        """Write depth, confidence and where local phase found them as a NumPy archive."""
+        by_phase = np.zeros(self.confidence.shape, bool) if self.by_phase is None else self.by_phase
+        np.savez(path, depth=self.depth(), confidence=self.confidence.astype(np.float16), by_phase=by_phase)
 
 
-def read_depth(path: Path) -> tuple[Floats, Floats]:
-    """z-depth (h, w; 0 = none) and confidence (h, w) in 0..1 that `DepthMap.save` wrote."""
+def read_depth(path: Path, *, with_phase: bool = True) -> tuple[Floats, Floats]:
+    """z-depth (h, w; 0 = none) and confidence (h, w) in 0..1 that `DepthMap.save` wrote; without those of local phase if so asked."""
     with np.load(path) as body:
-        return body["depth"], body["confidence"].astype(np.float32)
+        keep = np.True_ if with_phase else ~body["by_phase"]
+        return np.where(keep, body["depth"], 0), np.where(keep, body["confidence"], 0).astype(np.float32)
 
 
 def inverse_depth(camera: Camera, plane: Floats) -> Floats:

@@ -34,5 +34,5 @@ def complete(first: DepthMap, second: DepthMap) -> DepthMap:
     add = (first.confidence == 0) & (second.confidence > 0)
     return replace(
         first, plane=np.where(add[..., None], second.plane, first.plane), confidence=np.where(add, second.confidence, first.confidence),
-        views=np.where(add, second.views, first.views),
+        views=np.where(add, second.views, first.views), by_phase=add,
     )  # fmt: skip

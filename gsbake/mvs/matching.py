@@ -155,13 +155,11 @@ class StereoRun:
         return self.parallel(final_check, "consistency", MAX_CONSISTENCY_THREADS)
 
     def completed(self, maps: Sequence[DepthMap]) -> list[DepthMap]:
-        """The depth maps with what matching the photos' local phase adds. Completes `consistent_depths` too."""
+        """The depth maps with what matching the photos' local phase adds. `consistent_depths` stay those of brightness."""
         pyramids = self.parallel(lambda i: image_pyramid(local_phase(self.pyramids[i][-1])), "local phase")
         second = replace(self, pyramids=pyramids, planes_folder=self.planes_folder.with_name("phase"))
         second.match()
         added = second.filter_depths()
-        pairs = zip(self.consistent_depths, second.consistent_depths, strict=True)
-        self.consistent_depths = [np.where(one > 0, one, other) for one, other in pairs]
         return [complete(one, other) for one, other in zip(maps, added, strict=True)]
 
     def carved_hull(self, softness: NDArray[np.float32]) -> CarvedHull:

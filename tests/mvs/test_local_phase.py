@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import numpy as np
 
-from gsbake.mvs.depth_maps import DepthMap, inverse_depth
+from gsbake.mvs.depth_maps import DepthMap, inverse_depth, read_depth
 from gsbake.mvs.local_phase import complete, local_phase
 from gsbake.mvs.pyramids import Photo, image_pyramid
 from tests.mvs.scenes import arc, photo, sphere_depth
@@ -50,7 +51,7 @@ def test_weak_texture_under_moving_highlights() -> None:
     assert by_phase > max(0.6, 1.5 * by_brightness)
 
 
-def test_confirmed_depths_stay() -> None:
+def test_confirmed_depths_stay(tmp_path: Path) -> None:
     camera = arc(1, width=4, height=1)[0]
     maps = [
         DepthMap(camera, np.full((1, 4, 3), plane, np.float32), np.array([sure], np.float32), np.array([views], np.uint8))
@@ -60,3 +61,8 @@ def test_confirmed_depths_stay() -> None:
     np.testing.assert_allclose(both.confidence, [[0.9, 0.7, 0.2, 0]])
     np.testing.assert_array_equal(both.plane[0, :3, 0], [1, 2, 1])
     np.testing.assert_array_equal(both.views, [[5, 4, 2, 0]])
+    both.save(tmp_path / "both.npz")
+    for phase in (True, False):
+        depth, confidence = read_depth(tmp_path / "both.npz", with_phase=phase)
+        np.testing.assert_array_equal(depth > 0, [[True, phase, True, False]])
+        np.testing.assert_array_equal(confidence > 0, depth > 0)
