@@ -327,6 +327,8 @@ class _Ingestion:
         without = [photo.entry["name"] for relative, photo in self.read.items() if relative not in given.cameras]
         for note in given.notes:
             self.monitor.decide(*note)
+        for warning in given.warnings:
+            self.monitor.warn(warning)
         if without:
             self.monitor.warn(f"{len(without)} photos have no pose in {path.name} ({missing_list(without)}) and will not be used.")
         if given.missing:
