@@ -315,7 +315,9 @@ class _Builder:
         """Write the surfels as splats."""
         from gsbake.targets.splats import write_splats
 
-        count = write_splats(self.folders["refine"] / "surfels.safetensors", self.out / "surfels.ply", self.frame)
+        profile = self.extras.get("profile")
+        maps = self.maps if isinstance(profile, dict) and profile.get("materials") in ("fit", "surfels") else None
+        count = write_splats(self.folders["refine"] / "surfels.safetensors", self.out / "surfels.ply", self.frame, maps)
         size = (self.out / "surfels.ply").stat().st_size
         return {"surfels.ply": {"target": SURFELS, "level": 0, "bytes": size, "splats": count}}
 
