@@ -118,8 +118,8 @@ class PoseSolver:
                 self.monitor.warn("If they show the object in another position, too few of its features join both: bake each by itself.")
         if together := self._coinciding(found):
             self.monitor.warn(
-                f"{len(together)} cameras coincide with others, but their photos differ ({shortlist(together)}): if the object moved before "
-                "a camera that stood, give masks of it (--masks)."
+                f"{len(together)} cameras coincide with others, but their photos differ ({shortlist(together)}); if the object moved "
+                "before a camera that stood, give masks of it (--masks)."
             )
         if len(result["steps"]) > 1:
             gains = ", ".join(f"{step}: {photos}" for step, photos in result["steps"])
