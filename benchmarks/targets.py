@@ -27,12 +27,11 @@ import numpy as np
 from benchmarks.csv_rows import today
 from gsbake.capture.posed_photos import PosedPhotos
 from gsbake.geometry.ply import read_mesh
-from gsbake.gltf.frame import read_transforms_json
+from gsbake.gltf.frame import frame_between, read_transforms_json
 from gsbake.gltf.scene import open_scene
 from gsbake.gltf.write import GltfMesh, GltfTextures, build_glb
 from gsbake.imaging.encoded import decode_image
 from gsbake.imaging.png import encode_png
-from gsbake.targets.build import frame_between
 from gsbake.viewing.compare import Surface, compare_surfaces, surface_of
 
 RESULTS = Path(__file__).parent / "results" / "targets.csv"

@@ -18,7 +18,7 @@ def run(ctx: Context) -> dict[str, Any]:
 
 STAGE = Stage(
     name="ingest",
-    version=5,
+    version=6,
     title="Photos",
     run=run,
     summary="{photos} photos, {masks} masks, {skipped} skipped",

@@ -24,7 +24,7 @@ KERNELS = ("gsbake.capture.hull.visual_hull", "gsbake.capture.sfm.matching", "gs
 
 STAGE = Stage(
     name="poses",
-    version=14,
+    version=15,
     title="Camera poses",
     run=run,
     summary="{registered} photos registered, {points} tie points, {reprojection_px:px} reprojection error",

@@ -18,7 +18,7 @@ def run(ctx: Context) -> dict[str, Any]:
 
 STAGE = Stage(
     name="targets",
-    version=4,
+    version=5,
     title="Targets",
     run=run,
     summary="{files} files",

@@ -75,6 +75,20 @@ def root_of(item: bpy.types.Object) -> bpy.types.Object:
     return item
 
 
+def darken(objects: list[bpy.types.Object], factor: float) -> None:
+    """Multiply the base colours of the objects by a factor, which glTF's exporter writes as that of the material."""
+    for material in {slot.material for item in objects for slot in item.material_slots if slot.material}:
+        nodes, links = material.node_tree.nodes, material.node_tree.links
+        base = next(node for node in nodes if node.type == "BSDF_PRINCIPLED").inputs["Base Color"]
+        base.default_value = tuple(factor * x for x in base.default_value[:3]) + (1.0,)
+        for link in list(base.links):
+            mix = nodes.new("ShaderNodeMix")
+            mix.data_type, mix.blend_type = "RGBA", "MULTIPLY"
+            mix.inputs[0].default_value, mix.inputs[7].default_value = 1.0, (factor, factor, factor, 1.0)
+            links.new(link.from_socket, mix.inputs[6])
+            links.new(mix.outputs[2], base)
+
+
 def furnish(size: float, floor: float, rng: np.random.Generator) -> None:
     """Walls, floor and clutter around the turntable, which stands at the origin on a table of height `floor`."""
     half = ROOM * size
@@ -113,6 +127,7 @@ def main() -> None:
     parser.add_argument("--test-views", type=int, default=4)
     parser.add_argument("--test-res", type=int, default=240)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--dark", type=float, default=1.0, help="factor on the base colours of the object")
     options = parser.parse_args()
     sys.path.insert(0, str(options.scorer))
     import blender_render as scorer
@@ -127,7 +142,7 @@ def main() -> None:
     fit = np.diag([*[size / np.linalg.norm(high - low)] * 3, 1.0])
     fit[:3, 3] = -fit[0, 0] * (low + high) / 2
     scorer.reset(resolution, options.samples)
-    scorer.load_asset(options.asset, fit)
+    darken(scorer.load_asset(options.asset, fit), options.dark)
     bpy.ops.export_scene.gltf(filepath=str(truth / "asset.glb"), export_format="GLB", use_selection=False)
     for light in options.relight:
         shutil.copy(light, truth / "hdri" / light.name)

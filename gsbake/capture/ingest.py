@@ -220,8 +220,10 @@ class _Ingestion:
             self.monitor.warn(f"{len(outliers)} photos are much more blurred than the rest ({names}).")
 
     def _report_gain_maps(self) -> None:
-        """Warn about photos with gain maps: what they add is brighter than white, which 8-bit working photos do not hold."""
-        names = [entry["name"] for entry in self._entries if entry["gain_map"]]
+        """Report photos whose gain maps were applied, and warn about others."""
+        applied, names = ([e["name"] for e in self._entries if e["gain_map"] == state] for state in ("applied", "not used"))
+        if applied:
+            self.monitor.decide("gain maps", f"applied to {len(applied)} photos", "tone mapping is undone; 1 is white of ordinary screens")
         if names:
             self.monitor.warn(
                 f"{len(names)} photos have a gain map for HDR screens, which is not used ({shortlist(names)}): highlights clip as they do "
@@ -327,6 +329,8 @@ class _Ingestion:
         without = [photo.entry["name"] for relative, photo in self.read.items() if relative not in given.cameras]
         for note in given.notes:
             self.monitor.decide(*note)
+        for warning in given.warnings:
+            self.monitor.warn(warning)
         if without:
             self.monitor.warn(f"{len(without)} photos have no pose in {path.name} ({missing_list(without)}) and will not be used.")
         if given.missing:

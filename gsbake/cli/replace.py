@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import tempfile
 from pathlib import Path
 
 from gsbake.api import Session
 from gsbake.cli.options import Options
 from gsbake.cli.output import print_json, print_text
+from gsbake.cli.replace_mesh import is_lowpoly, write_lowpoly
 from gsbake.errors import BadInputError, UsageError
 from gsbake.own_files import SET_ASIDE
 from gsbake.pipeline.files import disk_error, path_error
@@ -41,17 +43,27 @@ def _replace(options: Options, session: Session, stage: str, paths: list[Path], 
         _print_result(options, store, {"stage": stage, "undone": True}, f"{stage}: its own output is used again")
         return
     base = current_output(session, stage)
-    files = _replacement_files(stage, paths, base)
-    if options.dry_run:
-        names = sorted(files)
-        _print_result(options, store, {"stage": stage, "would_replace": names}, f"{stage}: would replace {', '.join(names)}")
-        return
-    artifact = replace_output(store, stage, files, base)
+    with tempfile.TemporaryDirectory(prefix="gsbake-replace-") as scratch:
+        origin: dict[str, Path] = {}
+        notes: tuple[str, ...] = ()
+        if stage == "mesh" and any(map(is_lowpoly, paths)):
+            needed = {"poses", "refine", "export"} & set(session.engine.registry.references)
+            current = {name: current_output(session, name) for name in needed}
+            files, origin, notes = write_lowpoly(paths, base, current, Path(scratch))
+        else:
+            files = _replacement_files(stage, paths, base)
+        names, said = sorted(files), f" ({'; '.join(notes)})" if notes else ""
+        extra = {"notes": list(notes)} if notes else {}
+        if options.dry_run:
+            text = f"{stage}: would replace {', '.join(names)}{said}"
+            _print_result(options, store, {"stage": stage, "would_replace": names, **extra}, text)
+            return
+        artifact = replace_output(store, stage, files, base, origin)
     _print_result(
         options,
         store,
-        {"stage": stage, "replaced": sorted(files), "folder": str(artifact.folder)},
-        f"{stage}: {', '.join(sorted(files))} replaced; `gsbake run` continues from there",
+        {"stage": stage, "replaced": names, "folder": str(artifact.folder), **extra},
+        f"{stage}: {', '.join(names)} replaced{said}; `gsbake run` continues from there",
     )
 
 

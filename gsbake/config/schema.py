@@ -42,6 +42,14 @@ def _target(text: str) -> str:
     return parse_target(text).text
 
 
+def _box(numbers: tuple[float, ...]) -> tuple[float, ...]:
+    if len(numbers) not in (0, 15) or any(edge <= 0 for edge in numbers[3:6]):
+        raise ValueError("it must be empty, or 15 numbers: a centre, three positive edges and a rotation by rows, as --region sets them")
+    return numbers
+
+
+#: Box of a region, empty for none.
+BoxNumbers = Annotated[tuple[float, ...], Field(max_length=15), AfterValidator(_box)]
 #: A target that can be parsed, in its usual spelling.
 TargetText = Annotated[str, AfterValidator(_target)]
 #: A known distance that can be parsed.
@@ -81,7 +89,7 @@ class Poses(Section):
     )
     max_size: int = Field(1600, ge=64, le=16_384, description="Longer side in pixels of the photos in which features are detected.")
     region: Literal["auto", "none"] = Field("auto", description="auto: what lies outside the box of poses.region_box, or else of Metashape's cameras, is not baked; none: no box.")
-    region_box: tuple[float, ...] = Field((), max_length=15, description="Box that is baked, in the cameras' frame: centre, size, rotation by rows; --region takes it from a file.")
+    region_box: BoxNumbers = Field((), description="Box that is baked, in the cameras' frame: centre, size, rotation by rows; --region takes it from a file.")
     fine_features: bool | Literal["auto"] = Field(
         "auto", description="Also detect features in photos upsampled by 2 (5 times the time). auto: only where features are few or photos fail to register."
     )

@@ -6,7 +6,9 @@ The reader, trimesh, opens what a file names (materials, textures) when it has t
 from __future__ import annotations
 
 import io
+import re
 import tempfile
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -25,8 +27,21 @@ MEMORY_FACTOR, SPARE_MEMORY = 24, 1 << 30
 MIN_SECONDS, SECONDS_PER_BYTE = 60.0, 2e-6
 
 
-def read_foreign_mesh(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Vertices (v, 3), all finite, and triangles (f, 3) of a mesh. Raises BadInputError."""
+@dataclass(frozen=True)
+class ForeignMesh:
+    """`vertices` (v, 3), all finite, triangles `faces` (f, 3), texture coordinates `uv` (v, 2) with the origin bottom left.
+
+    NaN where a part has no texture coordinates, None where none has; `materials` is the number of those that the file names, at least 1.
+    """
+
+    vertices: NDArray[np.float64]
+    faces: NDArray[np.int64]
+    uv: NDArray[np.float64] | None = None
+    materials: int = 1
+
+
+def read_foreign_mesh(path: Path) -> ForeignMesh:
+    """A mesh of another program; its polygons are triangulated. Raises BadInputError."""
     name = f"'{path}'"
     if path.suffix.lower() not in SUFFIXES:
         raise BadInputError(f"{name} is not a readable mesh; give a GLB, glTF, {', '.join(s[1:].upper() for s in SUFFIXES)} file.")
@@ -41,7 +56,8 @@ def read_foreign_mesh(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int64
         request = {"path": str(path.absolute()), "name": name, "target": str(target), "needed": needed}
         read_in_child(child, request, MIN_SECONDS + SECONDS_PER_BYTE * size, name)
         with np.load(target, allow_pickle=False) as body:
-            return body["vertices"], body["faces"]
+            uv = body["uv"]
+            return ForeignMesh(body["vertices"], body["faces"], None if np.isnan(uv).all() else uv, int(body["materials"]))
 
 
 def answer(request: dict[str, Any]) -> dict[str, Any]:
@@ -52,9 +68,15 @@ def answer(request: dict[str, Any]) -> dict[str, Any]:
     limit_memory(child_limit(int(request["needed"]), SPARE_MEMORY))
     try:
         options: dict[str, Any] = {"skip_materials": True} if path.suffix.lower() == ".obj" else {}
-        content = io.BytesIO(path.read_bytes())  # an open file has a name, from which the reader would go on
-        mesh: Any = trimesh.load(content, file_type=path.suffix.lower()[1:], force="mesh", process=False, **options)
-        vertices, faces = np.asarray(mesh.vertices, np.float64).reshape(-1, 3), np.asarray(mesh.faces, np.int64).reshape(-1, 3)
+        content = path.read_bytes()  # given without a name: with an open file the reader would go on to others
+        loaded: Any = trimesh.load(io.BytesIO(content), file_type=path.suffix.lower()[1:], process=False, **options)
+        parts = [part for part in getattr(loaded, "geometry", {"": loaded}).values() if isinstance(part, trimesh.Trimesh)]
+        start = np.cumsum([0, *(len(part.vertices) for part in parts)])
+        vertices = np.concatenate([np.zeros((0, 3)), *(np.asarray(part.vertices, np.float64).reshape(-1, 3) for part in parts)])
+        corners = (np.asarray(part.faces, np.int64).reshape(-1, 3) + first for part, first in zip(parts, start, strict=False))
+        faces = np.concatenate([np.zeros((0, 3), np.int64), *corners])
+        uv = np.concatenate([np.zeros((0, 2)), *(_texture_coordinates(part) for part in parts)])
+        materials = len(set(re.findall(rb"^usemtl[ \t]+(.*?)\s*$", content, re.MULTILINE))) if options else 1
     except OSError as error:
         return {"error": f"{name} cannot be read: {error.strerror or error}."}
     except MemoryError:
@@ -63,8 +85,15 @@ def answer(request: dict[str, Any]) -> dict[str, Any]:
         return {"error": f"{name} is not a readable mesh ({' '.join(repr(error).split())[:120]})."}
     if len(faces) == 0 or not np.isfinite(vertices).all() or faces.min() < 0 or faces.max() >= len(vertices):
         return {"error": f"{name} holds no triangles, or vertices that are not finite."}
-    np.savez(Path(request["target"]), vertices=vertices, faces=faces)
+    np.savez(Path(request["target"]), vertices=vertices, faces=faces, uv=uv, materials=max(1, materials))
     return {}
+
+
+def _texture_coordinates(part: Any) -> NDArray[np.float64]:
+    """Those (v, 2) of a mesh of trimesh; NaN where it has none."""
+    found = getattr(part.visual, "uv", None)
+    missing = np.full((len(part.vertices), 2), np.nan)
+    return missing if found is None or np.shape(found) != missing.shape else np.asarray(found, np.float64)
 
 
 def main() -> None:

@@ -14,6 +14,11 @@ PROPERTIES = {"position": ("x", "y", "z"), "normal": ("nx", "ny", "nz"), "colour
 #: PLY names of the supported scalar types.
 TYPES = {"<f4": "float", "|u1": "uchar"}
 
+#: Names of texture coordinates that programs write; those of corners are the list `texcoord`.
+TEXTURE_COORDINATES = (("s", "t"), ("u", "v"), ("texture_u", "texture_v"))
+#: Longest header that is looked at, in bytes.
+MAX_HEADER = 1 << 16
+
 #: Record of a coloured point.
 COLOURED_POINT = np.dtype([("position", "<f4", 3), ("colour", "u1", 3)])
 
@@ -56,23 +61,40 @@ def read_cloud(path: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
     return rows["position"].astype(np.float64), rows["colour"].copy()
 
 
-def write_mesh(path: Path, vertices: ArrayLike, faces: ArrayLike) -> None:
-    """Write `vertices` (v, 3), in single precision, and triangles `faces` (f, 3)."""
+def write_mesh(path: Path, vertices: ArrayLike, faces: ArrayLike, uv: ArrayLike | None = None) -> None:
+    """Write `vertices` (v, 3), in single precision, triangles `faces` (f, 3), and texture coordinates `uv` (v, 2), origin bottom left."""
     points = np.asarray(vertices, "<f4").reshape(-1, 3)
+    coordinates = "" if uv is None else "property float s\nproperty float t\n"
+    if uv is not None:
+        points = np.ascontiguousarray(np.concatenate([points, np.asarray(uv, "<f4").reshape(-1, 2)], 1))
     corners = np.asarray(faces, "<i4").reshape(-1, 3)
     rows = np.zeros(len(corners), np.dtype([("count", "u1"), ("corners", "<i4", 3)]))
     rows["count"] = 3
     rows["corners"] = corners
     header = (
         "ply\nformat binary_little_endian 1.0\n"
-        f"element vertex {len(points)}\nproperty float x\nproperty float y\nproperty float z\n"
+        f"element vertex {len(points)}\nproperty float x\nproperty float y\nproperty float z\n{coordinates}"
         f"element face {len(corners)}\nproperty list uchar int vertex_indices\nend_header\n"
     )
     path.write_bytes(header.encode("ascii") + points.tobytes() + rows.tobytes())
 
 
+def has_texture_coordinates(path: Path) -> bool:
+    """Whether the header of a PLY names texture coordinates of its vertices or of its corners."""
+    with path.open("rb") as file:
+        header = file.read(MAX_HEADER).partition(b"end_header")[0]
+    found = {line.split()[-1].decode("latin-1") for line in header.splitlines() if line.startswith(b"property ")}
+    return "texcoord" in found or any(found.issuperset(names) for names in TEXTURE_COORDINATES)
+
+
 def read_mesh(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Read vertices (v, 3) and triangles (f, 3) of any PLY mesh.
+    """Vertices (v, 3) and triangles (f, 3) of any PLY mesh. Raises ValueError as `read_textured_mesh`."""
+    vertices, faces, _ = read_textured_mesh(path)
+    return vertices, faces
+
+
+def read_textured_mesh(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.float64] | None]:
+    """Read vertices (v, 3), triangles (f, 3) and texture coordinates (v, 2), origin bottom left, None without any, of any PLY mesh.
 
     It is read in this process: its counts are checked against its length by the reader, and a stage that a person has replaced a file of is
     a process of its own. Raises ValueError for an unreadable file, no triangles, corners that are no vertices, or non-finite positions.
@@ -92,4 +114,5 @@ def read_mesh(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
         raise ValueError(f"{path} has no triangles or has non-finite positions")
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise ValueError(f"{path} has triangles with corners that are no vertices")
-    return vertices, faces
+    uv = getattr(mesh.visual, "uv", None)
+    return vertices, faces, None if uv is None or np.shape(uv) != (len(vertices), 2) else np.asarray(uv, np.float64)

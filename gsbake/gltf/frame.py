@@ -7,6 +7,7 @@ poses is arbitrary, so the origin moves to the bottom centre of the object.
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -77,3 +78,17 @@ def read_transforms_json(path: Path) -> tuple[Camera, ...]:
     except (OSError, ValueError, LookupError, TypeError, OverflowError, RecursionError) as error:
         raise BadInputError(f"{path} is not a camera file in nerfstudio's format ({error}); export the asset again.") from error
     return tuple(out)
+
+
+def frame_between(unit: tuple[Camera, ...], asset: tuple[Camera, ...]) -> Similarity:
+    """The map from the frame of the cameras `unit` to that of the same cameras `asset`. Raises BadInputError when they do not match."""
+    if len(unit) != len(asset) or len(unit) < 2:
+        raise BadInputError(f"cameras.json of the export lists {len(asset)} cameras for {len(unit)} photos; export the asset again.")
+    one, two = (np.array([c.centre for c in cameras]) for cameras in (unit, asset))
+    spread_one, spread_two = (float(np.linalg.norm(centres - centres.mean(0))) for centres in (one, two))
+    scale = spread_two / max(spread_one, 1e-30)
+    frame = Similarity(scale, asset[0].R.T @ unit[0].R)
+    moved = replace(frame, translation=two.mean(0) - frame.apply(one).mean(0))
+    if np.abs(moved.apply(one) - two).max() > 1e-4 * float(np.linalg.norm(np.ptp(two, axis=0))):
+        raise BadInputError("cameras.json of the export does not belong to these poses; export the asset again.")
+    return moved

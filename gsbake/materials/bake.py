@@ -14,7 +14,7 @@ from safetensors.numpy import save_file
 from gsbake.capture.posed_photos import PosedPhotos
 from gsbake.config.schema import Bake
 from gsbake.errors import BadInputError
-from gsbake.geometry.ply import read_mesh
+from gsbake.geometry.ply import read_textured_mesh
 from gsbake.geometry.raycast import RayCaster
 from gsbake.imaging.exr import write_exr
 from gsbake.kernels.threads import configure
@@ -24,6 +24,7 @@ from gsbake.meshing.repair import repair_foreign
 from gsbake.monitor import SILENT, Monitor, Rule, decide_skip
 from gsbake.text import number
 from gsbake.texturing.atlas import make_atlas
+from gsbake.texturing.given_uvs import given_atlas, given_uvs
 from gsbake.texturing.inpainting import fill_empty_texels, inpaint_surface
 from gsbake.texturing.normal_map import DenseSamples, normal_map, sample_dense_mesh, vertex_normals
 from gsbake.texturing.occlusion_map import bake_occlusion
@@ -43,6 +44,8 @@ MAX_UNOBSERVED = 0.25
 MAX_HOLE_EDGES = 400
 #: Share of the texture under charts, below which a warning is given.
 MIN_FILL = 0.35
+#: Share of the texels of a mesh with given UVs whose rays may miss the dense mesh without a warning.
+MAX_MISSED = 0.02
 
 
 @dataclass(frozen=True)
@@ -122,11 +125,14 @@ class _Baking:
                 'bake: bake.materials is "surfels", but the surfels have none; set surfels.shading to "pbr" or bake.materials to "fit".'
             )
         with monitor.part("repair"):
-            vertices, faces = self._mesh()
-        surface = self._unwrap(vertices, faces)
+            vertices, faces, uv = self._mesh()
+        surface = self._unwrap(vertices, faces, uv)
         monitor.check_stop()
         with monitor.part("normals"):
             dense, detail = self._dense(surface)
+        missed = 1 - float(detail.found.mean())
+        if uv is not None and missed > MAX_MISSED:
+            monitor.warn(f"bake: the rays of {missed:.0%} of the texels missed the dense mesh; they are flat (the report shows where).")
         monitor.check_stop()
         with monitor.part("occlusion"):
             occlusion = self._occlusion(surface, dense, detail)
@@ -137,53 +143,64 @@ class _Baking:
         with monitor.part("inpainting"):
             image, emissive = self._image(surface, textures.projected, occlusion, coded, faces, len(vertices))
         with monitor.part("write"):
-            self._write(surface, textures.projected, image, coded is not None, emissive)
+            self._write(surface, textures.projected, detail, image, coded is not None, emissive)
         return self._figures(surface, detail, textures)
 
-    def _read(self, name: str) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-        """Vertices and faces of a PLY of the mesh stage."""
+    def _read(self, name: str) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.float64] | None]:
+        """Vertices, faces and texture coordinates of a PLY of the mesh stage."""
         try:
-            return read_mesh(self.mesh / name)
+            return read_textured_mesh(self.mesh / name)
         except ValueError as error:
             raise BadInputError(f"{error}; run the mesh stage again or replace the file.") from error
 
-    def _mesh(self) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-        """Vertices and faces of the low-poly mesh, which may come from another program, without its faults."""
-        vertices, faces = self._read("mesh.ply")
+    def _mesh(self) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.float64] | None]:
+        """Vertices and faces of the low-poly mesh, which may come from another program, without its faults; its UVs (f, 3, 2), if any."""
+        vertices, faces, uv = self._read("mesh.ply")
+        try:
+            given = given_uvs(vertices, faces, uv)
+        except ValueError as error:
+            raise BadInputError(f"bake: the mesh {error}.") from error
+        if given is not None:
+            self.monitor.decide("UVs", "kept", "; ".join([f"{number(len(given.faces))} triangles have some", *given.notes]))
+            for fault in given.faults:
+                self.monitor.warn(f"bake: {fault}.")
+            self._check_count(len(given.faces))
+            return given.vertices, given.faces, given.uv
         found = repair_foreign(vertices, faces.astype(np.int32), MAX_HOLE_EDGES)
         if found.joined:
             self.monitor.decide("mesh", "vertices joined", f"{found.joined} of {len(vertices)} lay at the place of another")
         if found.faults:
             self.monitor.warn(f"bake: the mesh was repaired; left out were {found.faults}.")
+        self._check_count(len(found.faces))
+        return found.vertices, found.faces.astype(np.int64), None
+
+    def _check_count(self, triangles: int) -> None:
         most = self.options.max_triangles
-        if len(found.faces) > most:
+        if triangles > most:
             raise BadInputError(
-                f"bake: the mesh has {number(len(found.faces))} triangles, but export.max_triangles allows {number(most)}; decimate it and "
+                f"bake: the mesh has {number(triangles)} triangles, but export.max_triangles allows {number(most)}; decimate it and "
                 f"give it as mesh.ply, this one as dense.ply, whose details become the normal map, or raise the limit."
             )
-        return found.vertices, found.faces.astype(np.int64)
 
-    def _unwrap(self, vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> UnwrappedMesh:
-        """The low-poly mesh unwrapped into charts, with its texels."""
+    def _unwrap(self, vertices: NDArray[np.float64], faces: NDArray[np.int64], uv: NDArray[np.float64] | None) -> UnwrappedMesh:
+        """The low-poly mesh with its texels, unwrapped into charts unless the UVs (f, 3, 2) of its corners are given."""
         size = self.options.bake.size
         with self.monitor.part("atlas"):
             self.monitor.progress(0, len(faces), "unwrapping")
             try:
-                atlas = make_atlas(vertices, faces, size)
+                atlas = make_atlas(vertices, faces, size) if uv is None else given_atlas(faces, uv, size)
             except ValueError as error:
                 raise BadInputError(f"bake: {error}.") from error
         if atlas.fill < MIN_FILL:
-            self.monitor.warn(
-                f"bake: {number(atlas.charts)} charts use {atlas.fill:.0%} of the texture, the rest is padding; raise bake.size, or join "
-                "the mesh's pieces."
-            )
+            advice = "padding; raise bake.size, or join the mesh's pieces" if uv is None else "empty; pack them tighter"
+            self.monitor.warn(f"bake: {number(atlas.charts)} charts use {atlas.fill:.0%} of the texture, the rest is {advice}.")
         with self.monitor.part("texels"):
             surface = UnwrappedMesh.of(vertices, faces, atlas, size, self.threads)
         return surface
 
     def _dense(self, surface: UnwrappedMesh) -> tuple[tuple[RayCaster, NDArray[np.float64]], DenseSamples]:
         """The dense mesh with its vertex normals, and its points at the texels."""
-        vertices, faces = self._read("dense.ply")
+        vertices, faces, _ = self._read("dense.ply")
         caster, normals = RayCaster(vertices, faces, self.threads), vertex_normals(vertices, faces)
         return (caster, normals), sample_dense_mesh(surface.texel_position, surface.texel_normal, caster, normals, surface.diagonal)
 
@@ -272,7 +289,15 @@ class _Baking:
         image = fill_empty_texels(texels.image(np.concatenate(parts, 1)), texels.covered(), gutter=max(2, settings.size // 256))
         return image, values.shape[1] == 8
 
-    def _write(self, surface: UnwrappedMesh, projected: ProjectedTexture, image: Floats, normals: bool, emissive: bool) -> None:
+    def _write(
+        self,
+        surface: UnwrappedMesh,
+        projected: ProjectedTexture,
+        detail: DenseSamples,
+        image: Floats,
+        normals: bool,
+        emissive: bool,
+    ) -> None:
         """Write the images, the coverage and the unwrapped mesh."""
         write_exr(self.out / "base_color.exr", image[..., 0:3])
         write_exr(self.out / "orm.exr", image[..., 3:6])
@@ -281,7 +306,8 @@ class _Baking:
         if emissive:
             write_exr(self.out / "emissive.exr", image[..., -3:])
         count = len(surface.texels)
-        coverage = np.stack([np.ones(count, np.float32), projected.observed.astype(np.float32), projected.confidence], 1)
+        known = np.ones(count), projected.observed, projected.confidence, detail.found
+        coverage = np.stack([np.asarray(channel, np.float32) for channel in known], 1)
         write_exr(self.out / "coverage.exr", surface.texels.image(coverage))
         arrays = {"position": surface.position, "normal": surface.normal, "tangent": surface.tangent, "uv": surface.atlas.uv}
         body = {name: np.ascontiguousarray(array, np.float32) for name, array in arrays.items()}

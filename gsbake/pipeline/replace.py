@@ -17,8 +17,10 @@ from gsbake.pipeline.store import MANIFEST, REPLACEMENT, REPLACEMENT_PREFIX, Art
 from gsbake.system.names import unusable_name
 
 
-def replace_output(store: Store, stage: str, files: Mapping[str, Path], base: Artifact | None) -> Artifact:
-    """Replace a stage's output by `files` ({name in the artifact: the user's file}).
+def replace_output(
+    store: Store, stage: str, files: Mapping[str, Path], base: Artifact | None, origin: Mapping[str, Path] | None = None
+) -> Artifact:
+    """Replace a stage's output by `files` ({name in the artifact: the user's file, or what was made of the one in `origin`}).
 
     Files of `base` (the current output) that are not replaced are kept. The user's files are copied, so they may be edited or deleted
     afterwards. Those of an earlier replacement are set aside, for they may be the only copy; `store.take_moved` says where. Raises
@@ -27,6 +29,7 @@ def replace_output(store: Store, stage: str, files: Mapping[str, Path], base: Ar
     bad = unusable_name([*files, MANIFEST])
     if bad is not None:
         raise UsageError(f"{bad} cannot be the name of a file in a stage's output on every system; rename it.")
+    own = {**files, **(origin or {})}
     with _lease(store, stage):
         store.remove_leftovers(stage, REPLACEMENT_PREFIX)
         temporary = store.temporary(stage, REPLACEMENT_PREFIX)
@@ -40,14 +43,14 @@ def replace_output(store: Store, stage: str, files: Mapping[str, Path], base: Ar
             final = store.stage_folder(stage) / f"{REPLACEMENT_PREFIX}-{digest[:8]}"
             manifest = {
                 "stage": stage,
-                "replaced": {name: str(path) for name, path in files.items()},
+                "replaced": {name: str(path) for name, path in own.items()},
                 "kept": sorted(kept),
                 "finished": now(),
                 "seconds": 0.0,
                 "peak_bytes": 0,
                 "parts": {},
                 "results": {},
-                "decisions": [{"what": "output", "choice": "replaced by the user", "evidence": ", ".join(str(p) for p in files.values())}],
+                "decisions": [{"what": "output", "choice": "replaced by the user", "evidence": ", ".join(str(p) for p in own.values())}],
                 "warnings": [],
             }
             artifact = store.publish(temporary, final, manifest)

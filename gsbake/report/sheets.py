@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import colorsys
+from pathlib import Path
 
 import cv2
 import numpy as np
 import scipy.sparse
 from numpy.typing import NDArray
 
+from gsbake.errors import BadInputError
+from gsbake.imaging.exr import read_exr
 from gsbake.imaging.srgb import encode
 from gsbake.report.html import Panel, image_uri
 from gsbake.report.render import Asset, Floats
@@ -16,6 +19,8 @@ from gsbake.text import number
 
 #: Longer side of a map in the page in pixels.
 MAX_MAP_SIZE = 768
+#: Share of the texels whose rays missed the dense mesh from which on they are shown.
+MIN_MISSED = 0.002
 
 
 def downsample(image: Floats, longest: int = MAX_MAP_SIZE) -> Floats:
@@ -81,3 +86,21 @@ def map_panels(asset: Asset) -> tuple[Panel, ...]:
     charts = int(face_charts(asset.faces, len(asset.uv)).max()) + 1 if len(asset.faces) else 0
     out.append(panel("UV atlas", f"{charts} charts, {number(len(asset.faces))} triangles", uv_atlas_image(asset)))
     return tuple(out)
+
+
+def missed_panel(asset: Asset, coverage: Path) -> tuple[Panel, ...]:
+    """Where the rays of texels missed the dense mesh, by the bake's `coverage`: red on the grey base colour. Nothing where few did."""
+    try:
+        image = read_exr(coverage)
+    except BadInputError:  # none, as for a file of the user's
+        return ()
+    if image.shape[2] < 4 or image.shape[:2] != asset.base_color.shape[:2]:
+        return ()
+    inside, missed = image[..., 0] > 0.5, (image[..., 0] > 0.5) & (image[..., 3] < 0.5)
+    share = missed.sum() / max(inside.sum(), 1)
+    if share < MIN_MISSED:
+        return ()
+    grey = np.repeat(encode(asset.base_color).mean(2, keepdims=True), 3, axis=2) * np.where(inside, 0.7, 0.3)[..., None]
+    drawn = np.where(missed[..., None], np.array([0.9, 0.1, 0.1]), grey).astype(np.float32)
+    caption = f"red: {share:.1%} of the texels, whose rays met no dense surface; they are flat"
+    return (Panel("Missed rays", caption, image_uri(downsample(drawn))),)

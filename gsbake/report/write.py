@@ -14,7 +14,7 @@ from gsbake.capture.photos.roles import test_photos
 from gsbake.capture.posed_photos import PosedPhotos
 from gsbake.config.schema import Report
 from gsbake.errors import BadInputError
-from gsbake.gltf.frame import read_transforms_json
+from gsbake.gltf.frame import frame_between, read_transforms_json
 from gsbake.monitor import SILENT, Monitor
 from gsbake.report import compose, coverage, manifests
 from gsbake.report.advice import advice
@@ -24,9 +24,8 @@ from gsbake.report.masks import mask_panels
 from gsbake.report.page_model import page_model
 from gsbake.report.quality import select_views
 from gsbake.report.render import Asset, Renderer
-from gsbake.report.sheets import map_panels
+from gsbake.report.sheets import map_panels, missed_panel
 from gsbake.shading.light_motion import LightMotion
-from gsbake.targets.build import frame_between
 from gsbake.text import number
 
 #: Bytes of the page, which mail and messengers still take; the asset's images in it are stored in fewer where it would exceed them.
@@ -177,7 +176,7 @@ class _ReportWriter:
             relit_note="The learnt environment map is that of the photos; studio and sunset are procedural."
             if lit
             else "The base colour contains the shading of the photos, as this profile sets; it is shown unlit.",
-            maps=map_panels(renders.asset),
+            maps=map_panels(renders.asset) + missed_panel(renders.asset, self.folders["bake"] / "coverage.exr"),
             maps_note="The textures of the GLB, downsampled for this page; click to enlarge.",
             audit=manifests.audit_rows(self.folders["export"] / "audit.json"),
             curves=manifests.training_charts(logs),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -16,12 +16,11 @@ from gsbake.capture.posed_photos import PosedPhotos
 from gsbake.config.schema import Export, Targets
 from gsbake.config.targets import BUDGETS, SURFELS, Budget, Target, parse_target, require_packages
 from gsbake.errors import BadInputError
-from gsbake.geometry.cameras import Camera, Similarity
 from gsbake.geometry.ply import read_mesh
 from gsbake.gltf.audit import as_json, audit, failed
 from gsbake.gltf.baked import load_mesh_arrays, mesh_in_frame
 from gsbake.gltf.container import unpack_glb
-from gsbake.gltf.frame import read_transforms_json
+from gsbake.gltf.frame import frame_between, read_transforms_json
 from gsbake.gltf.write import Geometry, GltfMesh, GltfTextures, Level, build_glb
 from gsbake.meshing.decimation import Deviation, surface_deviation
 from gsbake.meshing.decimator_choice import Decimator
@@ -316,23 +315,11 @@ class _Builder:
         """Write the surfels as splats."""
         from gsbake.targets.splats import write_splats
 
-        count = write_splats(self.folders["refine"] / "surfels.safetensors", self.out / "surfels.ply", self.frame)
+        profile = self.extras.get("profile")
+        maps = self.maps if isinstance(profile, dict) and profile.get("materials") in ("fit", "surfels") else None
+        count = write_splats(self.folders["refine"] / "surfels.safetensors", self.out / "surfels.ply", self.frame, maps)
         size = (self.out / "surfels.ply").stat().st_size
         return {"surfels.ply": {"target": SURFELS, "level": 0, "bytes": size, "splats": count}}
-
-
-def frame_between(unit: tuple[Camera, ...], asset: tuple[Camera, ...]) -> Similarity:
-    """The map from the frame of the cameras `unit` to that of the same cameras `asset`. Raises BadInputError when they do not match."""
-    if len(unit) != len(asset) or len(unit) < 2:
-        raise BadInputError(f"cameras.json of the export lists {len(asset)} cameras for {len(unit)} photos; export the asset again.")
-    one, two = (np.array([c.centre for c in cameras]) for cameras in (unit, asset))
-    spread_one, spread_two = (float(np.linalg.norm(centres - centres.mean(0))) for centres in (one, two))
-    scale = spread_two / max(spread_one, 1e-30)
-    frame = Similarity(scale, asset[0].R.T @ unit[0].R)
-    moved = replace(frame, translation=two.mean(0) - frame.apply(one).mean(0))
-    if np.abs(moved.apply(one) - two).max() > 1e-4 * float(np.linalg.norm(np.ptp(two, axis=0))):
-        raise BadInputError("cameras.json of the export does not belong to these poses; export the asset again.")
-    return moved
 
 
 def _geometry(target: Target) -> Geometry:

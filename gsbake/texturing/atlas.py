@@ -81,7 +81,7 @@ def make_atlas(vertices: NDArray[Any], faces: NDArray[Any], size: int, padding: 
     points = _normalised(np.asarray(vertices, np.float64), triangles)
     wanted = max(MIN_PADDING, size // 128) if padding is None else padding
     source, uv, corner = _chart(_smoothed_when_noisy(points, triangles), triangles)
-    chart = _islands(len(uv), corner)
+    chart = islands(len(uv), corner)
     uv = _normalise_charts(points, triangles, uv, corner, chart)
     if not np.abs(signed_areas(uv, corner)).sum() > 0:
         raise ValueError(f"the triangles of the mesh are too thin to unwrap; {_REPLACE}")
@@ -91,7 +91,7 @@ def make_atlas(vertices: NDArray[Any], faces: NDArray[Any], size: int, padding: 
         if not folded.any():
             break
         source, uv, corner = _detach(source, uv, corner, folded, alone)
-        chart = _islands(len(uv), corner)
+        chart = islands(len(uv), corner)
         packed = pack(uv, corner, chart, size, _padding(chart, size, wanted))
     final = packed.uv / size
     fill = float(np.abs(signed_areas(final, corner)).sum())
@@ -119,7 +119,7 @@ def _padding(chart: Ints, size: int, wanted: int) -> int:
     return min(wanted, max(MIN_PADDING, int(np.sqrt(PADDING_SHARE / (int(chart.max()) + 1)) * size)))
 
 
-def _islands(count: int, corner: Ints) -> Ints:
+def islands(count: int, corner: Ints) -> Ints:
     """Chart (f,) of each face: faces that share a vertex of the atlas belong together."""
     links = coo_matrix((np.ones(2 * len(corner)), (corner[:, [0, 1]].ravel(), corner[:, [1, 2]].ravel())), shape=(count, count))
     label = connected_components(links, directed=False)[1][corner[:, 0]]
@@ -129,7 +129,7 @@ def _islands(count: int, corner: Ints) -> Ints:
 def _detach(source: Ints, uv: Floats, corner: Ints, folded: NDArray[np.bool_], alone: bool) -> tuple[Ints, Floats, Ints]:
     """Make charts of the folded faces (f,), with vertices of their own: one per connected group, or one per face if `alone`."""
     index = np.flatnonzero(folded)
-    group = np.arange(len(index)) if alone else _islands(len(uv), corner[index])
+    group = np.arange(len(index)) if alone else islands(len(uv), corner[index])
     pairs = np.stack([np.repeat(group, 3), corner[index].ravel()], 1)
     unique, inverse = np.unique(pairs, axis=0, return_inverse=True)
     out = corner.copy()

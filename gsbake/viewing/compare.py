@@ -77,7 +77,8 @@ def open_surface(path: Path) -> Surface:
     """A mesh from a glTF, PLY, OBJ or STL file. Raises BadInputError."""
     if path.suffix.lower() in (".glb", ".gltf"):
         return surface_of(open_scene(path))
-    return Surface(*read_foreign_mesh(path))
+    mesh = read_foreign_mesh(path)
+    return Surface(mesh.vertices, mesh.faces)
 
 
 def compare_surfaces(first: Surface, second: Surface, points: int = SURFACE_POINTS) -> dict[str, float]:

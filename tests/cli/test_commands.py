@@ -11,8 +11,11 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+import trimesh
+import xatlas
 
 from gsbake.errors import BadInputError
+from gsbake.geometry.ply import has_texture_coordinates, write_mesh
 from gsbake.stages import ORDER
 from tests.cli.conftest import Run
 
@@ -109,6 +112,30 @@ def test_replace_and_undo(run: Run, capture: Path, tmp_path: Path) -> None:
     assert run("replace", "mesh", "--out", "o").code == 2
     wrong = run("replace", "export", mine, "--out", "o")
     assert wrong.code == 2 and "it has asset.glb, cameras.json, light.hdr" in wrong.err
+
+
+def test_replace_by_a_low_poly_mesh_with_uvs(run: Run, capture: Path, tmp_path: Path) -> None:
+    """A GLB or OBJ takes the place of mesh.ply alone; its UVs are kept, and what it was made of is recorded."""
+    run("run", capture, "--out", "o")
+    ball = trimesh.creation.icosphere(subdivisions=3)
+    write_mesh(tmp_path / "dense.ply", ball.vertices, ball.faces)
+    coarse = trimesh.creation.icosphere(subdivisions=1)
+    source, faces, uv = xatlas.parametrize(coarse.vertices, coarse.faces)
+    mine = trimesh.Trimesh(coarse.vertices[source], faces, process=False, visual=trimesh.visual.TextureVisuals(uv=uv))
+    mine.export(tmp_path / "mine.glb")
+    dry = run("replace", "mesh", "mine.glb", "dense.ply", "--out", "o", "--dry-run", "--json").json
+    assert dry["would_replace"] == ["dense.ply", "mesh.ply"] and dry["notes"][1] == "their UVs are kept"
+    end = run("replace", "mesh", "mine.glb", "dense.ply", "--out", "o")
+    assert end.code == 0 and "mine.glb: 80 triangles in the frame of mesh.ply" in end.out, end.err
+    (folder,) = (tmp_path / "o" / "stages" / "mesh").glob("by-hand*/")
+    assert has_texture_coordinates(folder / "mesh.ply")
+    assert json.loads((folder / "manifest.json").read_text())["replaced"]["mesh.ply"].endswith("mine.glb")
+    assert run("replace", "mesh", "mine.glb", "--out", "o").code == 0  # on the dense mesh that is there now
+    assert run("replace", "mesh", "mine.glb", "mine.glb", "--out", "o").code == 2
+    mine.apply_translation([9, 0, 0])
+    mine.export(tmp_path / "mine.obj")
+    away = run("replace", "mesh", "mine.obj", "--out", "o")
+    assert away.code == 42 and "does not lie on the dense mesh" in away.err and away.err.count("\n") == 1
 
 
 @pytest.fixture

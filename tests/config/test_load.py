@@ -159,6 +159,12 @@ def test_mistakes_in_a_file(tmp_path: Path, text: str, says: list[str]) -> None:
         ("mesh.faces=abc", BadInputError, "--set: mesh.faces = 'abc' is not a number: it must be a whole number from 100 to 10 000 000."),
         ("poses.fine_features=on?", BadInputError, "--set: poses.fine_features = 'on?' is invalid: it must be one of true, false, auto."),
         ("poses.region_box=[nan]", BadInputError, "--set: poses.region_box = nan is invalid: it must be a list of at most 15 numbers."),
+        (
+            "poses.region_box=[1,2,3]",
+            BadInputError,
+            "--set: poses.region_box = [1, 2, 3] is invalid: it must be empty, or 15 numbers: a centre, three positive edges and a "
+            "rotation by rows, as --region sets them.",
+        ),
         ("targets.files=7", BadInputError, "--set: targets.files = 7 is invalid: it must be a list of at most 32 texts."),
         ("train.iterations", UsageError, "--set takes section.key=value, not 'train.iterations'."),
     ],

@@ -7,10 +7,12 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+import fast_simplification
 import numpy as np
 import pytest
 import torch
 import trimesh
+import xatlas
 from safetensors.numpy import load_file
 from scipy.spatial import cKDTree
 
@@ -20,6 +22,7 @@ from gsbake.geometry.cameras import Camera, CameraSet, Similarity
 from gsbake.geometry.ply import read_mesh, write_mesh
 from gsbake.geometry.tangents import frame_to_world
 from gsbake.gltf.export import ExportOptions, export_asset
+from gsbake.gltf.lowpoly import read_lowpoly
 from gsbake.gltf.read import GltfAsset, read_glb
 from gsbake.imaging.exr import read_exr, write_exr
 from gsbake.imaging.srgb import decode_bytes, encode_bytes
@@ -164,7 +167,8 @@ def test_base_colour_is_at_its_position(asset: GltfAsset) -> None:
     assert image.min() > 20  # no black texels, not even outside the charts
 
 
-def test_normal_map_gives_the_true_normals_in_the_asset_frame(asset: GltfAsset) -> None:
+def normal_errors(asset: GltfAsset) -> np.ndarray:
+    """Degrees between the true normals and those of the asset's normal map in its tangent frames, at each texel."""
     p, texels, _ = unit_points(asset)
     n = texels.interpolate(asset.attributes["NORMAL"], asset.faces)
     t = texels.interpolate(asset.attributes["TANGENT"], asset.faces)
@@ -181,8 +185,46 @@ def test_normal_map_gives_the_true_normals_in_the_asset_frame(asset: GltfAsset) 
     gradient = np.stack([outside(q + 1e-5 * e) - outside(q - 1e-5 * e) for e in np.eye(3)], 1) @ TO_WORLD.rotation.T
     true = np.stack([gradient[:, 0], gradient[:, 2], -gradient[:, 1]], 1)
     cosine = (shaded * true).sum(1) / np.linalg.norm(true, axis=1)
-    angle = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
+    return np.asarray(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
+
+
+def test_normal_map_gives_the_true_normals_in_the_asset_frame(asset: GltfAsset) -> None:
+    angle = normal_errors(asset)
     assert angle.mean() < 1.5 and np.quantile(angle, 0.99) < 4
+
+
+def test_a_mesh_unwrapped_elsewhere_keeps_its_topology_and_uvs(run: Path, tmp_path: Path) -> None:
+    """Decimated and unwrapped outside, edited in the frame of the asset, half of its charts mirrored."""
+    points, faces = read_mesh(run / "mesh/dense.ply")
+    points, faces = fast_simplification.simplify(points.astype(np.float32), faces, target_count=1500)
+    source, corners, uv = xatlas.parametrize(points, faces)
+    uv = np.where(np.arange(2) == 0, 1 - uv, uv)
+    placed = TO_WORLD.apply(points[source].astype(float))
+    mine = trimesh.Trimesh(
+        placed @ np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]), corners, process=False, visual=trimesh.visual.TextureVisuals(uv=uv)
+    )
+    mine.export(tmp_path / "mine.glb")
+    to_asset = TO_WORLD.then(Similarity(1.0, np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])))
+    lowpoly = read_lowpoly(tmp_path / "mine.glb", run / "mesh/dense.ply", to_asset)
+    assert lowpoly.notes == (f"{len(faces)} triangles in the frame of asset.glb", "their UVs are kept")
+    folder = tmp_path / "run"
+    (folder / "mesh").mkdir(parents=True)
+    write_mesh(folder / "mesh/mesh.ply", *lowpoly.split())
+    for name in ("ingest", "poses", "refine"):
+        (folder / name).symlink_to(run / name)
+    (folder / "mesh/dense.ply").symlink_to(run / "mesh/dense.ply")
+    result = bake(folder, folder / "bake")
+    assert result["faces"] == len(faces) and result["detail_share"] > 0.99
+    monitor = Recorder()
+    export(folder, folder / "export", monitor)
+    assert monitor.warnings == []
+    asset = read_glb(folder / "export/asset.glb")
+    made, given = asset.attributes["TEXCOORD_0"][asset.faces], (uv * (1, -1) + (0, 1))[corners]
+    away, which = cKDTree(given.mean(1)).query(made.mean(1))
+    assert away.max() < 1e-6 and len(np.unique(which)) == len(made) == len(given)
+    assert np.allclose(np.sort(made, axis=1), np.sort(given[which], axis=1), atol=1e-6)
+    angle = normal_errors(asset)
+    assert angle.mean() < 2 and np.quantile(angle, 0.99) < 6
 
 
 def test_occlusion_only_texture_with_constant_roughness_and_metallic(run: Path, asset: GltfAsset) -> None:

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import base64
 import json
+from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -14,6 +17,7 @@ from gsbake.imaging.exr import write_exr
 from gsbake.report.advice import advice
 from gsbake.report.coverage import SurfacePoints, in_words, map_json, proposals, surface_points
 from gsbake.report.render import Asset
+from gsbake.report.sheets import missed_panel
 from tests.report.shapes import ball
 from tests.support.cameras import look_at
 
@@ -67,6 +71,22 @@ def test_points_are_read_from_the_coverage_of_the_bake(asset: Asset, tmp_path: P
     assert np.allclose(np.linalg.norm(points.position, axis=1), 0.7, atol=0.02)
     write_exr(tmp_path / "other.exr", 0 * coverage)  # of another atlas
     assert surface_points(asset, tmp_path / "other.exr") is None and surface_points(asset, tmp_path / "none.exr") is None
+
+
+def test_where_rays_missed_the_dense_mesh_is_shown_in_red(asset: Asset, tmp_path: Path) -> None:
+    asset = replace(asset, base_color=np.full((64, 64, 3), 0.4, np.float32))
+    coverage = np.ones((64, 64, 4), np.float32)
+    write_exr(tmp_path / "coverage.exr", coverage)
+    assert missed_panel(asset, tmp_path / "coverage.exr") == ()
+    coverage[:16, :, 3] = 0
+    write_exr(tmp_path / "coverage.exr", coverage)
+    (panel,) = missed_panel(asset, tmp_path / "coverage.exr")
+    assert "25.0% of the texels" in panel.caption
+    data = base64.b64decode(panel.image.partition(",")[2])
+    shown = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)[..., ::-1].astype(int)
+    red = shown[..., 0] > 2 * shown[..., 1]
+    assert red[:14].all() and not red[18:].any()
+    assert missed_panel(asset, tmp_path / "none.exr") == ()
 
 
 def test_the_map_marks_weak_views_and_cannot_leave_its_element(asset: Asset) -> None:

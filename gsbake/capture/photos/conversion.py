@@ -120,7 +120,7 @@ def convert(what: Conversion) -> ConvertedPhoto:
         "camera_model": camera_key(photo.tags),
         "camera_body": camera_body(photo.tags),
         "written_size": written_size(photo.tags),
-        "gain_map": has_gain_map(what.path),
+        "gain_map": "applied" if photo.gain_map else "not used" if has_gain_map(what.path) else None,
         "gps": gps_position(photo.tags),
         "blur": quality.blur,
         "exposure": quality.exposure,

@@ -12,7 +12,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +23,9 @@ from numpy.typing import NDArray
 
 from gsbake.capture.photos import heic_and_raw
 from gsbake.capture.photos.embedded_colours import to_srgb
+from gsbake.capture.photos.gain_map import SUFFIXES as GAIN_MAP_SUFFIXES
+from gsbake.capture.photos.gain_map import read_gain_map
+from gsbake.capture.photos.hdr import has_gain_map
 from gsbake.imaging.srgb import decode_bytes, encode_bytes
 
 Bytes = NDArray[np.uint8]
@@ -46,12 +49,14 @@ class UnreadablePhotoError(Exception):
 
 @dataclass(frozen=True)
 class RawPhoto:
-    """A decoded, upright photo: `pixels` (h, w, 3) 8-bit sRGB or 32-bit linear, `alpha` (h, w) 8-bit or None, and its metadata."""
+    """A decoded, upright photo: `pixels` (h, w, 3) 8-bit sRGB or 32-bit linear, `alpha` (h, w) 8-bit or None, and its metadata;
+    `gain_map`, whether one was applied."""
 
     pixels: Bytes | Floats
     alpha: Bytes | None
     orientation: int
     tags: dict[str, Any]
+    gain_map: bool = False
 
     @property
     def width(self) -> int:
@@ -117,9 +122,11 @@ def read_header(path: Path, max_megapixels: float = MAX_MEGAPIXELS) -> ImageHead
             return _checked(ImageHeader(*heic_and_raw.upright_size(path)), max_megapixels)
         handle = _open(path)
         try:
-            return _header(handle.spec(), max_megapixels)
+            header = _header(handle.spec(), max_megapixels)
         finally:
             handle.close()
+        brightened = path.suffix.lower() in GAIN_MAP_SUFFIXES and has_gain_map(path)
+        return replace(header, sample_bytes=4) if brightened else header
 
 
 def _is_developed(path: Path) -> bool:
@@ -238,10 +245,13 @@ def _read_photo(path: Path, max_megapixels: float) -> RawPhoto:
             alpha = np.rint(np.clip(alpha, 0, 1) * 255).astype(np.uint8)
     else:
         colour = to_srgb(colour, tags)
+    gain_map = read_gain_map(path, colour.shape[0] * colour.shape[1]) if colour.dtype == np.uint8 else None
+    if gain_map is not None:
+        colour = gain_map.apply(np.asarray(colour, np.uint8))
     orientation = _orientation(tags.get("Orientation", 1))
     if alpha is not None:
         alpha = None if alpha.min() == 255 else apply_orientation(alpha, orientation)  # an opaque alpha channel is no mask
-    return RawPhoto(apply_orientation(colour, orientation), alpha, orientation, tags)
+    return RawPhoto(apply_orientation(colour, orientation), alpha, orientation, tags, gain_map is not None)
 
 
 def read_mask(path: Path, max_megapixels: float = MAX_MEGAPIXELS) -> tuple[Bytes, int]:

@@ -36,7 +36,7 @@ class GivenPoses:
 
     `cameras` by the photo's path inside the photo folder, at the size of the upright source photo; `missing` frames without a photo;
     `points` (n, 3) and `colours` (n, 3) 8-bit, and the `region` to be baked, when the file has them; `notes`, what the reader changed or
-    did not use, as the arguments of `Monitor.decide`.
+    did not use, as the arguments of `Monitor.decide`; `warnings`, what it could not use.
     """
 
     cameras: dict[str, Camera]
@@ -45,6 +45,7 @@ class GivenPoses:
     colours: Array | None = None
     region: Region | None = None
     notes: tuple[tuple[str, str, str], ...] = ()
+    warnings: tuple[str, ...] = ()
 
 
 def checked_rigid(rotation: Array, translation: Array, frame: str, source: str) -> tuple[Array, Array]:

@@ -61,7 +61,10 @@ def read_metashape(path: Path, sizes: Mapping[str, PhotoSize]) -> GivenPoses:
     if not frames:
         raise BadInputError(f"{path} holds no aligned camera; align the photos in Metashape and export the cameras as Agisoft XML.")
     cameras, missing = match_cameras(frames, sizes, str(path))
-    return GivenPoses(cameras, missing, region=_region(document, scale, path))
+    try:
+        return GivenPoses(cameras, missing, region=_region(document, scale, path))
+    except BadInputError as error:
+        return GivenPoses(cameras, missing, warnings=(f"{error} No region is used.",))
 
 
 def _parse(path: Path) -> ElementTree.Element:
@@ -72,16 +75,16 @@ def _parse(path: Path) -> ElementTree.Element:
 
 
 def _region(document: ElementTree.Element, scale: float, path: Path) -> Region | None:
-    """The box of the chunk's region; None without one."""
+    """The box of the chunk's region; None without one. Raises BadInputError for one that is no box."""
     found = document.find("chunk/region")
     if found is None:
         return None
     try:
         parts = [np.array(found.findtext(name, "").split(), float) for name in ("center", "size", "R")]
     except ValueError as error:
-        raise BadInputError(f"The region in {path} holds other things than numbers; export the cameras again.") from error
+        raise BadInputError(f"The region in {path} holds other things than numbers.") from error
     if [len(part) for part in parts] != [3, 3, 9]:
-        raise BadInputError(f"The region in {path} is not a centre, a size and a rotation; export the cameras again.")
+        raise BadInputError(f"The region in {path} is not a centre, a size and a rotation.")
     return Region.of(np.concatenate([scale * parts[0], scale * parts[1], parts[2]]).tolist(), str(path))
 
 

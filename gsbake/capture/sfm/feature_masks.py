@@ -56,8 +56,11 @@ class FeatureMasks:
             return 0.0
         return (guess_agreement if self.guessed else mask_agreement)(cameras, self.files)
 
-    def write(self, moving: Path | None = None) -> Path:
-        """Write the masks under COLMAP's file names at the size of the photos, limited to those in the folder `moving`; their folder."""
+    def write(self, moving: Path | None = None, outside: bool = False) -> Path:
+        """Write the masks under COLMAP's file names at the size of the photos, limited to those in the folder `moving`; their folder.
+
+        With `outside` features are limited to what they do not show.
+        """
         self.folder.mkdir(parents=True, exist_ok=True)
         files = self.files
         for entry in (e for e in self.entries if e["name"] in files):
@@ -67,6 +70,8 @@ class FeatureMasks:
                 disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
                 mask = cv2.dilate(255 * (mask > 127).astype(np.uint8), np.asarray(disc, np.uint8))
                 mask = cv2.resize(mask, (entry["width"], entry["height"]), interpolation=cv2.INTER_NEAREST)
+            if outside:
+                mask = 255 - mask
             if moving is not None:
                 mask = np.minimum(mask, read_grey(moving / f"{entry['name']}.png.png"))
             write_png(self.folder / f"{entry['name']}.png.png", np.asarray(mask, np.uint8))

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from gsbake.capture.colmap import pycolmap, repeatable_mapping
 from gsbake.capture.sfm import pairs as pairing
 from gsbake.capture.sfm.feature_cache import Descriptors, FeatureCache, Keypoints, photo_key
+from gsbake.capture.sfm.mapping_gain import FIRST_PHOTOS, MappingGain
 from gsbake.capture.sfm.matching import Matches, match_pairs
 from gsbake.capture.sfm.merging import merge_all, new_photos
 from gsbake.capture.sfm.verification import verify
@@ -298,26 +299,37 @@ class SfmPipeline:
             initial_folder.mkdir()
             initial.write(str(initial_folder))
         total = len(self.names)
-        count = initial.num_reg_images() if initial is not None else 2
-        lock = threading.Lock()
+        gain = MappingGain(total, initial.num_reg_images() if initial is not None else FIRST_PHOTOS)
+        lock, end = threading.Lock(), pycolmap.CancellationToken()
+
+        def begun() -> None:
+            with lock:
+                if gain.model_begins():
+                    end.cancel()
 
         def registered() -> None:
-            nonlocal count
             with lock:
-                count = min(count + 1, total)
-                self.tick("mapping", count, total)
+                if gain.photo_registered():
+                    end.cancel()
+                self.tick("mapping", min(gain.registered, total), total)
 
         with self._timed("mapping", total):
-            models = pycolmap.incremental_mapping(
-                str(self.database),
-                str(self.folder),
-                str(out),
-                self._mapper(relaxed),
-                input_path=str(initial_folder) if initial is not None else "",
-                next_image_callback=registered,
-            )
-        self._models += models.values()
-        return largest(list(models.values()))
+            try:
+                found = pycolmap.incremental_mapping(
+                    str(self.database),
+                    str(self.folder),
+                    str(out),
+                    self._mapper(relaxed),
+                    input_path=str(initial_folder) if initial is not None else "",
+                    initial_image_pair_callback=begun,
+                    next_image_callback=registered,
+                    cancellation_token=end,
+                )
+                models = list(found.values())
+            except InterruptedError:  # by the token; the models are written, the present one too
+                models = [pycolmap.Reconstruction(str(path)) for path in sorted(out.iterdir(), key=lambda path: int(path.name))]
+        self._models += models
+        return largest(models)
 
     def _models_beside(self, model: Any | None) -> list[Any]:
         """Models with photos that `model`, one of the present features, does not register."""
@@ -350,9 +362,13 @@ class SfmPipeline:
         return [i for i, name in enumerate(self.names) if name not in registered]
 
     def solve(self, kind: str, mapper: str) -> Any | None:
-        """The largest reconstruction found, or None. With fine "auto", a poor one is repeated with the finest octave of features."""
+        """The largest reconstruction found, or None. With fine "auto", a poor one is repeated with the finest octave of features.
+
+        The `mapper` "trial" maps once, with weak thresholds.
+        """
         model = self._solve(kind, mapper, None)
-        if self.options.fine == "auto" and not self.upsampled and len(self.missing(model)) > MAX_UNREGISTERED_SHARE * len(self.names):
+        poor = len(self.missing(model)) > MAX_UNREGISTERED_SHARE * len(self.names)
+        if poor and mapper != "trial" and self.options.fine == "auto" and not self.upsampled:
             self._clear()
             self.options.fine = True
             model = self._solve(kind, mapper, model)
@@ -374,6 +390,8 @@ class SfmPipeline:
             marker.touch()
         if mapper == "global":
             return tried("global mapping", self._global())
+        if mapper == "trial":
+            return tried("weaker thresholds from the start", self._incremental(True, None))
         first = self._incremental(False, None)
         model = tried("strict thresholds", first)
         missing = self.missing(first)

@@ -8,20 +8,23 @@ from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 from urllib.parse import quote
 
 import numpy as np
 
 from gsbake.capture.photos.undistortion import distort, pinhole_camera
+from gsbake.capture.sfm.coincidence import MAX_COINCIDING, coinciding
 from gsbake.capture.sfm.feature_masks import FeatureMasks
 from gsbake.capture.sfm.lenses import given_lenses, solved_lenses
 from gsbake.capture.sfm.pairs import choose_matching
 from gsbake.capture.sfm.process import JobCallbacks, run_job
 from gsbake.capture.sfm.standing_background import StandingBackground, find_standing_background
+from gsbake.capture.sfm.trial import FEATURES, MIN_CAPTURE, SIZE, TRIED, Region, Trial, best_region, write_small_photos
 from gsbake.config.schema import Poses
 from gsbake.errors import BadInputError, InterruptedRun
 from gsbake.geometry.cameras import Camera, CameraSet
+from gsbake.geometry.ply import read_cloud
 from gsbake.monitor import Monitor, PartSequence
 from gsbake.text import shortlist
 
@@ -33,9 +36,11 @@ MIN_PLACED_SHARE = 0.85
 #: Largest shift that a lens's distortion plausibly causes at the corner of a photo, as a share of the corner's distance from the centre;
 #: wide-angle lenses reach a quarter.
 MAX_DISTORTION = 0.35
-#: Where features are detected.
-Region = Literal["whole photos", "moving parts", "masks"]
-_FEATURES: dict[Region, str] = {"whole photos": "in whole photos", "moving parts": "on what moves", "masks": "inside the masks"}
+_FEATURES: dict[Region, str] = {
+    "whole photos": "in whole photos", "moving parts": "on what moves", "masks": "inside the masks",
+    "outside the masks": "outside the masks",
+}  # fmt: skip
+_FOLDERS: dict[Region, str] = {"whole photos": "", "moving parts": "_moving", "masks": "_masked", "outside the masks": "_outside"}
 
 
 @dataclass(frozen=True)
@@ -111,6 +116,11 @@ class PoseSolver:
             self.monitor.warn(f"{len(missing)} of {len(names)} photos could not be registered and were dropped ({shortlist(missing)}).")
             if found.masked and len(missing) > (1 - MIN_PLACED_SHARE) * len(names):
                 self.monitor.warn("If they show the object in another position, too few of its features join both: bake each by itself.")
+        if together := self._coinciding(found):
+            self.monitor.warn(
+                f"{len(together)} cameras coincide with others, but their photos differ ({shortlist(together)}); if the object moved "
+                "before a camera that stood, give masks of it (--masks)."
+            )
         if len(result["steps"]) > 1:
             gains = ", ".join(f"{step}: {photos}" for step, photos in result["steps"])
             self.monitor.decide("registration", f"{count} of {len(names)} photos after {len(result['steps'])} steps", f"photos by {gains}")
@@ -143,7 +153,7 @@ class PoseSolver:
     ) -> _Attempt:
         """Structure from motion with features in a `region` of the photos, whose mask `files` are in a folder; each region has a database
         of its own. What stands in photos of one round before a `background` is not matched."""
-        suffix = {"whole photos": "", "moving parts": "_moving", "masks": "_masked"}[region]
+        suffix = _FOLDERS[region]
         folder = self.scratch / f"solve{suffix}"
         job = self._job("solve", self.entries, files, [] if background is None else background.pairs)
         job |= {"matching": matching, "mapper": self.options.mapper, "work": str(self.scratch / f"colmap{suffix}")}
@@ -165,21 +175,26 @@ class PoseSolver:
             background = compared if compared.stands else None
             moving = None if background is None else background.write_moving_parts(self.scratch / "moving_parts")
 
-        def attempt(masked: bool) -> _Attempt:
-            if masked:
-                return self._attempt(matching, "masks", masks.write(moving), background)
-            return self._attempt(matching, "whole photos" if moving is None else "moving parts", moving, background)
+        def attempt(region: Region) -> _Attempt:
+            if region in ("masks", "outside the masks"):
+                return self._attempt(matching, region, masks.write(moving, region != "masks"), background)
+            return self._attempt(matching, region, moving, background)
 
         if setting is True and masks.files:
-            return attempt(True)
-        self.monitor.decide("features", _FEATURES["whole photos" if background is None else "moving parts"], compared.evidence)
-        attempts = [attempt(False)]
+            return attempt("masks")
+        plain: Region = "whole photos" if background is None else "moving parts"
+        first, evidence = plain, compared.evidence
+        if background is None and masks.complete and len(self.entries) >= MIN_CAPTURE:
+            first, tried = self._trial(masks)
+            evidence = f"{evidence}; {tried}"
+        self.monitor.decide("features", _FEATURES[first], evidence)
+        attempts = [attempt(first)]
         if not masks.complete:
             return attempts[0]
         agreement = [self._agreement(attempts[0], masks)]
         if agreement[0] >= masks.min_agreement and not self._lost(attempts[0]):
             return attempts[0]
-        attempts.append(attempt(True))
+        attempts.append(attempt("masks" if first != "masks" else plain))
         agreement.append(self._agreement(attempts[1], masks))
         # A right model of one position of the object is worth more than a wrong one of both.
         score = [(a >= masks.min_agreement, a * len(found.cameras)) for a, found in zip(agreement, attempts, strict=True)]
@@ -197,9 +212,38 @@ class PoseSolver:
         """Whether so many photos are missing that other features may place more of them."""
         return len(attempt.cameras) < MIN_PLACED_SHARE * len(self.entries)
 
+    def _trial(self, masks: FeatureMasks) -> tuple[Region, str]:
+        """The region of the features to begin with, by trial on small photos, and the evidence."""
+        folder = self.scratch / "trial"
+        shutil.rmtree(folder, ignore_errors=True)
+        entries = write_small_photos(self.ingest, self.entries, folder / "photos")
+        trials: list[Trial] = []
+        for region in TRIED:
+            small = FeatureMasks(self.ingest, entries, folder / f"masks{_FOLDERS[region]}")
+            job = self._job("solve", entries, None if region == "whole photos" else small.write(outside=region != "masks"))
+            job |= {"photos": str(folder / "photos"), "work": str(folder / f"colmap{_FOLDERS[region]}"), "cache": None, "max_size": SIZE}
+            job |= {"matching": "exhaustive", "mapper": "trial", "max_features": min(FEATURES, self.options.max_features)}
+            out = folder / f"solve{_FOLDERS[region]}"
+            result = self._run(job, out, part="trial")
+            cameras = list(CameraSet.load(out / "cameras.json").cameras) if result["registered"] else []
+            agreement = self._agreement(_Attempt(result, cameras, out, region, False), masks)
+            trials.append(Trial(region, len(cameras), len(entries), agreement, result["reprojection_px"] or 0.0))
+            if trials[-1].usable(masks.min_agreement, MIN_PLACED_SHARE):
+                break
+        shutil.rmtree(folder, ignore_errors=True)
+        return best_region(trials, masks.min_agreement), f"{len(entries)} small photos: {'; '.join(trial.text for trial in trials)}"
+
     def _agreement(self, attempt: _Attempt, masks: FeatureMasks) -> float:
-        """Agreement of the registered cameras with the masks; 0 where their lens cannot exist."""
-        return masks.agreement(attempt.cameras) if all(map(is_plausible_lens, attempt.cameras)) else 0.0
+        """Agreement of the registered cameras with the masks; 0 where their lens cannot exist, or cameras of different photos coincide."""
+        if not all(map(is_plausible_lens, attempt.cameras)) or len(self._coinciding(attempt)) > MAX_COINCIDING * len(attempt.cameras):
+            return 0.0
+        return masks.agreement(attempt.cameras)
+
+    def _coinciding(self, attempt: _Attempt) -> list[str]:
+        """Names of cameras that coincide although their photos differ."""
+        cloud = attempt.folder / "points.ply"
+        files = {e["name"]: self.ingest / e["file"] for e in self.entries}
+        return coinciding(attempt.cameras, read_cloud(cloud)[0], files) if cloud.exists() else []
 
     def triangulate(self) -> Solved:
         """Tie points for given poses, from the given model or triangulated. Raises BadInputError with fewer than 3 poses."""
@@ -242,8 +286,8 @@ class PoseSolver:
             "seed": self.seed,
         }
 
-    def _run(self, job: dict[str, Any], folder: Path, limit: float | None = None) -> dict[str, Any]:
-        """Run the COLMAP process, with its results in `folder`, and time its parts.
+    def _run(self, job: dict[str, Any], folder: Path, limit: float | None = None, part: str = "") -> dict[str, Any]:
+        """Run the COLMAP process, with its results in `folder`, and time its parts, or all of it as one `part`.
 
         Raises what `run_job` raises, and what the monitor raises on a stop request.
         """
@@ -255,9 +299,9 @@ class PoseSolver:
         shutil.rmtree(folder, ignore_errors=True)
         with PartSequence(self.monitor) as parts:
 
-            def progress(part: str, done: int, total: int) -> None:
-                parts.start(part)
-                self.monitor.progress(done, total, part)
+            def progress(step: str, done: int, total: int) -> None:
+                parts.start(part or step)
+                self.monitor.progress(done, total, f"{part}: {step}" if part else step)
 
             result = run_job(job, folder, JobCallbacks(progress, self.monitor.stop_requested), limit)
         if result is None:

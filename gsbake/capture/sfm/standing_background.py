@@ -99,6 +99,12 @@ def find_standing_background(files: Mapping[str, Path]) -> StandingBackground:
     return StandingBackground(files, partners)
 
 
+def moved_between(first: Path, second: Path) -> bool:
+    """Whether two photos differ in more than noise; those of other sizes do."""
+    blocks = [_blocks(_shrunk(read_grey(path), SIZE)) for path in (first, second)]
+    return blocks[0].shape != blocks[1].shape or bool(_same_share(np.stack(blocks))[0, 1] <= MAX_SAME_SHARE)
+
+
 def _shrunk(grey: NDArray[np.uint8], size: int) -> Floats:
     """A photo's grey levels (h, w), resampled so that the longer side has `size` pixels."""
     scale = size / max(grey.shape)

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import io
 import struct
 import tracemalloc
 import zlib
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -154,6 +156,64 @@ def test_gain_maps_are_said_to_be_unused(tmp_path: Path, runner: Runner, name: s
     _, done = runner.ingest(tmp_path)
     found = [w for w in done.warnings if w.startswith("3 photos have a gain map for HDR screens, which is not used (p0, p1, p2)")]
     assert len(found) == bool(name)
+
+
+def ultra_hdr(path: Path, light: np.ndarray, attributes: str = "", damage: Callable[[bytes], bytes] = bytes) -> np.ndarray:
+    """Write linear `light` (h, w, 3), up to 4, as Ultra HDR: tone-mapped, and a gain map of half the size; the tone-mapped light."""
+    base = light / (1 + light.mean(2, keepdims=True))
+    stops = np.log2((light + 1 / 64) / (base + 1 / 64)).mean(2)
+    coded = np.rint(255 * np.clip(stops / 2.5, 0, 1)).astype(np.uint8)
+    main, extra = io.BytesIO(), io.BytesIO()
+    Image.fromarray(encode_bytes(base.astype(np.float32))).save(main, "JPEG", quality=98, subsampling=0)
+    Image.fromarray(coded[::2, ::2]).save(extra, "JPEG", quality=98)
+    name = b"http://ns.adobe.com/xap/1.0/\0"
+    declared = 'xmlns:hdrgm="http://ns.adobe.com/hdr-gain-map/1.0/" hdrgm:Version="1.0"'
+
+    def with_xmp(data: bytes, more: str) -> bytes:
+        body = name + f"<rdf:Description {declared} {more}/>".encode()
+        return data[:2] + b"\xff\xe1" + struct.pack(">H", len(body) + 2) + body + data[2:]
+
+    usual = 'hdrgm:GainMapMin="0" hdrgm:GainMapMax="2.5" hdrgm:Gamma="1" hdrgm:OffsetSDR="0.015625" hdrgm:OffsetHDR="0.015625"'
+    path.write_bytes(damage(with_xmp(main.getvalue(), "") + with_xmp(extra.getvalue(), attributes or usual)))
+    return np.asarray(base)
+
+
+def steps() -> np.ndarray:
+    """Light from 0 to 4 in fields of 32 pixels, coloured in its lower half."""
+    grey = np.repeat(np.repeat(np.array([[0.02, 0.2, 0.6, 0.9], [1.2, 2.0, 3.0, 4.0]]), 32, 0), 32, 1)[..., None]
+    return grey * np.where(np.arange(64)[:, None, None] % 32 < 16, np.ones(3), np.array([1.0, 0.8, 0.5]))
+
+
+def test_gain_maps_of_jpeg_are_applied_in_linear_light(tmp_path: Path, runner: Runner) -> None:
+    light = steps()
+    (tmp_path / "images").mkdir()
+    for k in (2, 1, 0):
+        base = ultra_hdr(tmp_path / "images" / f"p{k}.jpg", (1 - 0.2 * k) * light)
+    photo = read_photo(tmp_path / "images" / "p0.jpg")
+    header = read_header(tmp_path / "images" / "p0.jpg")
+    assert photo.gain_map and photo.pixels.dtype == np.float32 and header.sample_bytes == 4
+    inner = np.ix_(*(np.flatnonzero((np.arange(n) % 16 > 4) & (np.arange(n) % 16 < 12)) for n in light.shape[:2]))
+    assert photo.pixels[inner] == pytest.approx(light[inner], rel=0.05, abs=0.01)
+    assert np.abs(base[inner] - light[inner]).max() > 2  # what it was before
+    _, done = runner.ingest(tmp_path)
+    assert done.decisions["gain maps"][0] == "applied to 3 photos" and not [w for w in done.warnings if "gain map" in w]
+
+
+@pytest.mark.parametrize(
+    ("attributes", "damage"),
+    [
+        ('hdrgm:GainMapMax="2.5" hdrgm:BaseRenditionIsHDR="True"', bytes),
+        ('hdrgm:GainMapMax="nan"', bytes),
+        ('hdrgm:GainMapMax="99"', bytes),
+        ('hdrgm:GainMapMax="2,5"', bytes),
+        ("", lambda data: data[:-300]),
+        ("", lambda data: data.replace(b"GainMapMax", b"GainMapMix")),
+    ],
+)
+def test_gain_maps_that_cannot_be_used_leave_the_photo(tmp_path: Path, attributes: str, damage: Callable[[bytes], bytes]) -> None:
+    ultra_hdr(tmp_path / "a.jpg", steps(), attributes, damage)
+    photo = read_photo(tmp_path / "a.jpg")
+    assert not photo.gain_map and photo.pixels.dtype == np.uint8
 
 
 def test_heic_for_hdr_screens(tmp_path: Path) -> None:

@@ -136,3 +136,20 @@ def test_a_right_model_of_one_position_beats_a_wrong_one_of_both(tmp_path: Path,
     solved = run.solve()
     assert solved.figures["masked_features"] is True and len(solved.cameras) == COUNT // 2
     assert "8 of 16 photos registered by features inside the masks" in run.monitor.line("features")  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize("right", ["whole photos", "masks"])
+def test_a_trial_on_small_photos_decides_what_is_mapped_at_full_size(
+    right: str, tmp_path: Path, answers: Callable[..., Jobs], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One job at full size, of the features that the trial found right; no trial after a right one."""
+    monkeypatch.setattr(solve, "MIN_CAPTURE", COUNT)
+    entries = write_capture(tmp_path / "ingest", ring(), "guess")
+    jobs = answers(lambda job: ring() if (job["masks"] is not None) == (right == "masks") else ring(0.3))
+    run = solver(tmp_path, entries)
+    solved = run.solve()
+    trials, full = [job for job in jobs if job["mapper"] == "trial"], [job for job in jobs if job["mapper"] != "trial"]
+    assert len(full) == 1 and solved.figures["masked_features"] is (right == "masks")
+    assert [job["masks"] is not None for job in trials] == ([False, True] if right == "masks" else [False])
+    assert all(Path(job["photos"]).parent.name == "trial" for job in trials) and not (tmp_path / "scratch" / "trial").exists()
+    assert "16 small photos: whole photos: 16 registered" in run.monitor.line("features")  # type: ignore[attr-defined]

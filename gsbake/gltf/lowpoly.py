@@ -1,0 +1,115 @@
+"""A low-poly mesh of another program (GLB, glTF, OBJ, PLY), with its UVs, in the unit frame of the run that it belongs to.
+
+Programs turn +Z up into +Y up or back on export, and people start from `mesh.ply` (unit frame) or from `asset.glb` (asset frame). Of these
+frames the one is taken in which the mesh lies on the dense mesh.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gsbake.errors import BadInputError
+from gsbake.geometry.cameras import Similarity
+from gsbake.geometry.mesh_process import ForeignMesh, read_foreign_mesh
+from gsbake.geometry.ply import read_mesh
+from gsbake.geometry.surface_distance import surface_distances
+from gsbake.gltf.frame import Y_UP
+from gsbake.gltf.scene import open_scene
+from gsbake.texturing.given_uvs import GivenUVs, given_uvs
+
+#: Suffixes of the formats.
+GLTF_SUFFIXES = (".glb", ".gltf")
+SUFFIXES = (*GLTF_SUFFIXES, ".obj", ".ply")
+#: Points whose distances to the dense mesh are measured.
+POINTS = 3000
+#: Largest median distance to the dense mesh, as a share of its diagonal.
+MAX_DISTANCE = 0.02
+#: A frame is preferred to others up to this many times as far, and up to this share of the diagonal.
+TIE_FACTOR, TIE_DISTANCE = 2.0, 1e-3
+
+
+@dataclass(frozen=True)
+class LowPoly:
+    """A mesh in the unit frame; `uv` are those of its corners, None without any; `notes` say what was read."""
+
+    vertices: NDArray[np.float64]
+    faces: NDArray[np.int64]
+    uv: NDArray[np.float64] | None
+    notes: tuple[str, ...]
+
+    def split(self) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.float64] | None]:
+        """Vertices, faces and UVs of vertices (origin bottom left), with vertices split at seams."""
+        if self.uv is None:
+            return self.vertices, self.faces, None
+        rows = np.concatenate([self.faces.reshape(-1, 1), self.uv.reshape(-1, 2).astype(np.float32)], 1)
+        unique, inverse = np.unique(rows, axis=0, return_inverse=True)
+        return self.vertices[unique[:, 0].astype(np.int64)], inverse.reshape(-1, 3), unique[:, 1:] * (1, -1) + (0, 1)
+
+
+def read_lowpoly(path: Path, dense: Path, asset: Similarity | None) -> LowPoly:
+    """The mesh in `path`, placed on the dense mesh in the PLY `dense` (unit frame).
+
+    `asset` is the map from the unit frame to that of the asset, None where there is no asset yet. Raises BadInputError where the mesh lies
+    in none of the frames, or has UVs that the asset cannot have.
+    """
+    mesh = _read(path)
+    try:
+        given = given_uvs(mesh.vertices, mesh.faces, mesh.uv, mesh.materials)
+    except ValueError as error:
+        raise BadInputError(f"'{path}' {error}.") from error
+    try:
+        surface = read_mesh(dense)
+    except ValueError as error:
+        raise BadInputError(f"{error}; run the mesh stage again.") from error
+    found = given or GivenUVs(mesh.vertices, mesh.faces, np.zeros((0, 3, 2)))
+    frame, to_unit = _frame(found, path, surface, asset)
+    triangles = f"{len(found.faces)} triangles in {frame}"
+    kept = "their UVs are kept" if given is not None else "they have no UVs and are unwrapped"
+    notes = triangles, kept, *found.notes, *found.faults
+    return LowPoly(to_unit.apply(found.vertices), found.faces, None if given is None else found.uv, notes)
+
+
+def _read(path: Path) -> ForeignMesh:
+    """Any of the formats; parts of glTF files at the places of their nodes."""
+    if path.suffix.lower() not in GLTF_SUFFIXES:
+        return read_foreign_mesh(path)
+    scene = open_scene(path)
+    sets = [part.uv[min(part.uv)] if part.uv else np.full((len(part.position), 2), np.nan, np.float32) for part in scene.parts]
+    uv = np.concatenate(sets).astype(np.float64) * (1, -1) + (0, 1)
+    materials = len({part.material for part in scene.parts})
+    return ForeignMesh(scene.vertices, scene.faces.astype(np.int64), None if np.isnan(uv).all() else uv, materials)
+
+
+def _frame(
+    mesh: GivenUVs, path: Path, dense: tuple[NDArray[np.float64], NDArray[np.int64]], asset: Similarity | None
+) -> tuple[str, Similarity]:
+    """Name of the frame of the mesh, and the map from it to the unit frame. Raises BadInputError."""
+    frames = _frames(path, asset)
+    points = np.concatenate([mesh.vertices, mesh.vertices[mesh.faces].mean(1)])
+    points = points[:: max(1, len(points) // POINTS)]
+    diagonal = float(np.linalg.norm(np.ptp(dense[0], axis=0)))
+    away = {name: float(np.median(surface_distances(frame.apply(points), *dense))) for name, frame in frames.items()}
+    nearest = min(away.values())
+    if not nearest <= MAX_DISTANCE * diagonal:
+        raise BadInputError(
+            f"'{path}' does not lie on the dense mesh: half of it is more than {nearest / diagonal:.0%} of the object's size away, in the "
+            "frame of mesh.ply as in that of asset.glb, with +Y or +Z up; export it where the mesh lay that you started from."
+        )
+    name = next(name for name, far in away.items() if far <= max(TIE_FACTOR * nearest, TIE_DISTANCE * diagonal))
+    return name, frames[name]
+
+
+def _frames(path: Path, asset: Similarity | None) -> Mapping[str, Similarity]:
+    """{name: map to the unit frame}, the likeliest first: glTF and OBJ have +Y up, and PLY is what the stage writes."""
+    y_up, same = Similarity(1.0, Y_UP.T), Similarity()
+    unit = {"the frame of mesh.ply": same, "the frame of mesh.ply, +Y up": y_up}
+    of_asset = {}
+    if asset is not None:
+        back = asset.inverse()
+        of_asset = {"the frame of asset.glb": back, "the frame of asset.glb, +Z up": Similarity(1.0, Y_UP).then(back)}
+    return {**unit, **of_asset} if path.suffix.lower() == ".ply" else {**of_asset, **dict(reversed(unit.items()))}

@@ -1,0 +1,121 @@
+"""Low-poly meshes of other programs: formats, nodes, materials, and the frame that they were made in."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+import xatlas
+
+from gsbake.errors import BadInputError
+from gsbake.geometry.cameras import Similarity
+from gsbake.geometry.ply import has_texture_coordinates, read_textured_mesh, write_mesh
+from gsbake.gltf.frame import Y_UP
+from gsbake.gltf.lowpoly import read_lowpoly
+
+ASSET = Similarity(0.2, Y_UP, np.array([0.0, 0.3, 0.0]))
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the dense mesh of an L-shaped body without symmetry about its axes."""
+    out = tmp_path_factory.mktemp("mesh")
+    dense = body().subdivide().subdivide()
+    write_mesh(out / "dense.ply", dense.vertices, dense.faces)
+    return out
+
+
+def body() -> trimesh.Trimesh:
+    bounds = [[-0.5, -0.2, -0.6], [0.5, 0.3, -0.3]], [[0.1, -0.2, -0.2], [0.5, 0.1, 0.6]]
+    return trimesh.util.concatenate([trimesh.creation.box(bounds=box) for box in bounds])
+
+
+def unwrapped(frame: Similarity) -> trimesh.Trimesh:
+    """The body, unwrapped and moved."""
+    mesh = body()
+    source, faces, uv = xatlas.parametrize(mesh.vertices, mesh.faces)
+    return trimesh.Trimesh(frame.apply(mesh.vertices[source]), faces, process=False, visual=trimesh.visual.TextureVisuals(uv=uv))
+
+
+@pytest.mark.parametrize(
+    ("suffix", "frame", "name"),
+    [
+        (".glb", ASSET, "the frame of asset.glb"),
+        (".obj", ASSET, "the frame of asset.glb"),
+        (".ply", ASSET.then(Similarity(1.0, Y_UP.T)), "the frame of asset.glb, +Z up"),
+        (".glb", Similarity(1.0, Y_UP), "the frame of mesh.ply, +Y up"),
+        (".obj", Similarity(), "the frame of mesh.ply"),
+        (".ply", Similarity(), "the frame of mesh.ply"),
+    ],
+)
+def test_the_frame_is_found(folder: Path, tmp_path: Path, suffix: str, frame: Similarity, name: str) -> None:
+    mine = unwrapped(frame)
+    mine.export(tmp_path / f"mine{suffix}")
+    found = read_lowpoly(tmp_path / f"mine{suffix}", folder / "dense.ply", ASSET)
+    assert found.notes == (f"{len(mine.faces)} triangles in {name}", "their UVs are kept")
+    corners = {tuple(np.round(p, 4) + 0.0) for p in found.vertices}
+    assert corners == {tuple(np.round(p, 4) + 0.0) for p in body().vertices}
+    write_mesh(tmp_path / "mesh.ply", *found.split())
+    assert has_texture_coordinates(tmp_path / "mesh.ply") and not has_texture_coordinates(folder / "dense.ply")
+    vertices, faces, uv = read_textured_mesh(tmp_path / "mesh.ply")
+    assert uv is not None
+    made, given = (
+        {tuple(sorted(map(tuple, np.round(values[f], 4).tolist()))) for f in triangles}
+        for values, triangles in ((uv, faces), (mine.visual.uv, mine.faces))
+    )
+    assert made == given
+
+
+def test_nodes_are_placed_and_materials_joined(folder: Path, tmp_path: Path) -> None:
+    """Two boxes of one atlas as two nodes of two materials, one of them mirrored by its node."""
+    whole = unwrapped(Similarity(1.0, Y_UP))
+    scene = trimesh.Scene()
+    mirror = np.diag([-1.0, 1, 1, 1])
+    for k, part in enumerate(np.array_split(np.arange(len(whole.faces)), 2)):
+        piece = whole.submesh([part], append=True)
+        material = trimesh.visual.material.PBRMaterial(name=f"m{k}")
+        piece.visual = trimesh.visual.TextureVisuals(uv=piece.visual.uv, material=material)
+        if k:
+            piece.apply_transform(mirror)
+        scene.add_geometry(piece, node_name=f"n{k}", transform=mirror if k else np.eye(4))
+    scene.export(tmp_path / "mine.glb")
+    found = read_lowpoly(tmp_path / "mine.glb", folder / "dense.ply", None)
+    assert found.notes[1:] == ("their UVs are kept", "2 materials become one")
+    mesh = trimesh.Trimesh(found.vertices, found.faces)
+    assert mesh.is_winding_consistent and mesh.volume == pytest.approx(body().volume, rel=1e-3)
+
+
+def test_without_uvs_it_is_unwrapped(folder: Path, tmp_path: Path) -> None:
+    (tmp_path / "mine.obj").write_text(trimesh.exchange.obj.export_obj(body(), include_normals=False))
+    found = read_lowpoly(tmp_path / "mine.obj", folder / "dense.ply", None)
+    assert found.uv is None and "they have no UVs and are unwrapped" in found.notes
+    assert found.split()[2] is None
+
+
+def test_a_mesh_elsewhere_and_a_damaged_one(folder: Path, tmp_path: Path) -> None:
+    unwrapped(Similarity(7.0)).export(tmp_path / "large.glb")
+    with pytest.raises(BadInputError, match="large.glb' does not lie on the dense mesh: .* with .Y or .Z up"):
+        read_lowpoly(tmp_path / "large.glb", folder / "dense.ply", ASSET)
+    (tmp_path / "bad.obj").write_text("v 0 0\nf 1 2 3\n")
+    with pytest.raises(BadInputError, match="bad.obj"):
+        read_lowpoly(tmp_path / "bad.obj", folder / "dense.ply", ASSET)
+
+
+def test_uvs_of_corners_in_a_ply_are_kept(folder: Path, tmp_path: Path) -> None:
+    """MeshLab's form: a list of UVs at each face, vertices shared across seams."""
+    mine = unwrapped(Similarity())
+    points, joined = np.unique(np.round(mine.vertices, 5), axis=0, return_inverse=True)
+    lines = [
+        "ply", "format ascii 1.0", f"element vertex {len(points)}", *(f"property float {axis}" for axis in "xyz"),
+        f"element face {len(mine.faces)}", "property list uchar int vertex_indices", "property list uchar float texcoord", "end_header",
+        *(" ".join(map(str, p)) for p in points),
+        *(" ".join(map(str, [3, *joined.ravel()[f], 6, *mine.visual.uv[f].ravel()])) for f in mine.faces),
+    ]  # fmt: skip
+    (tmp_path / "mine.ply").write_text("\n".join(lines) + "\n")
+    assert has_texture_coordinates(tmp_path / "mine.ply")
+    found = read_lowpoly(tmp_path / "mine.ply", folder / "dense.ply", None)
+    assert found.uv is not None and len(found.vertices) == len(points)
+    made = {tuple(np.round(corner, 4)) for corner in found.uv.reshape(-1, 2)}
+    assert made == {tuple(np.round(corner * (1, -1) + (0, 1), 4)) for corner in mine.visual.uv}
