@@ -19,7 +19,6 @@ The light's intensity is not observable: the median shading is set to 1, and no 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,7 +50,7 @@ class Irradiance:
 
     coefficients: Floats
 
-    def at(self, normal: NDArray[Any]) -> Floats:
+    def at(self, normal: NDArray[np.floating]) -> Floats:
         """Irradiance over its mean (n,) at unit normals (n, 3), clamped to `MAX_IRRADIANCE_RATIO`."""
         return np.clip(1 + harmonics(normal) @ self.coefficients, 1 / MAX_IRRADIANCE_RATIO, MAX_IRRADIANCE_RATIO)
 
@@ -66,13 +65,15 @@ class Irradiance:
         return EnvironmentLight.from_function(radiance, size)
 
 
-def harmonics(direction: NDArray[Any]) -> Floats:
+def harmonics(direction: NDArray[np.floating]) -> Floats:
     """Spherical harmonics (n, 8) of orders 1 and 2 at unit directions (n, 3), not normalised: x, y, z, xy, yz, zx, x²−y², 3z²−1."""
     x, y, z = np.asarray(direction, np.float64).T
     return np.stack([x, y, z, x * y, y * z, z * x, x * x - y * y, 3 * z * z - 1], 1)
 
 
-def find_irradiance(colour: NDArray[Any], normal: NDArray[Any], position: NDArray[Any], occlusion: NDArray[Any]) -> Irradiance:
+def find_irradiance(
+    colour: NDArray[np.floating], normal: NDArray[np.floating], position: NDArray[np.floating], occlusion: NDArray[np.floating]
+) -> Irradiance:
     """The irradiance that best explains the differences between n points of the surface; uniform without usable pairs.
 
     `colour` (n, 3) linear, `normal` (n, 3) unit, `position` (n, 3), `occlusion` (n,) ambient occlusion, 1 = open.
@@ -100,7 +101,7 @@ def find_irradiance(colour: NDArray[Any], normal: NDArray[Any], position: NDArra
 
 
 def remove_shading(
-    colour: NDArray[Any], normal: NDArray[Any], occlusion: NDArray[Any], irradiance: Irradiance
+    colour: NDArray[np.floating], normal: NDArray[np.floating], occlusion: NDArray[np.floating], irradiance: Irradiance
 ) -> tuple[NDArray[np.float32], float]:
     """Base colours (n, 3) of texels with the projected `colour` (n, 3), and the light intensity that belongs to them."""
     shading = irradiance.at(normal) * np.maximum(occlusion, MIN_OCCLUSION)

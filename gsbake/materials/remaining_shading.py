@@ -22,15 +22,23 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
+import torch
 from numba import njit, prange
 from numpy.typing import NDArray
 
 from gsbake.kernels.declaration import kernel
 from gsbake.materials.delighting import harmonics, nearby_pairs
+from gsbake.materials.descent import Steps, descend
+from gsbake.materials.passes import Scene
+from gsbake.materials.state import State
 from gsbake.shading.cubemap import directions
+from gsbake.shading.environment import EnvironmentLight
+from gsbake.shading.light_tables import irradiance
 
 Doubles = NDArray[np.float64]
 
@@ -53,6 +61,49 @@ MATCHED_POINTS, MATCHING_STEPS, MATCHING_RIDGE, MAX_EXPONENT = 4000, 4, 1e-3, 1.
 _1, _THIRD = np.float32(1), np.float32(1 / 3)
 #: Where pairs differ so much that they count e⁻³⁰; smaller float32 numbers are denormal and slow.
 _MAX_CHROMATICITY = np.float32(30)
+
+
+@dataclass(frozen=True)
+class RemainingShading:
+    """Moves shading left in base colours to the light, `rounds` times and once more; between these texels adapt to it in the gradient
+    `steps`.
+
+    From there the light is given: gradient steps would move it back, as that base colours have no shading is not part of their loss.
+    """
+
+    steps: Steps
+    rounds: int = 4
+
+    def applies(self, scene: Scene, state: State) -> bool:
+        """Where most is dielectric and the light stands: over all photos under a moving one there is hardly any."""
+        return state.mostly_dielectric and not state.level.moving
+
+    def run(self, scene: Scene, state: State) -> State:
+        """The state under the light that is given from here on."""
+        state = replace(state, light_given=True)
+        for turn in range(self.rounds + 1):
+            if turn:
+                state = descend(scene, state, self.steps, scene.each("remaining shading"))
+            seed = scene.seed + turn
+            state = moved_to_light(state, shading_of(state, seed), seed)
+        return state
+
+
+def shading_of(state: State, seed: int) -> Doubles:
+    """Coefficients (8, 3) of the log shading that is left in the base colours of dielectrics."""
+    texel, surface = np.flatnonzero(state.dielectric), state.level.surface
+    position = np.asarray(surface.position)[texel]
+    return remaining_shading(state.materials.base_color[texel], surface.unit_normals[texel], position, np.random.default_rng(seed))
+
+
+@torch.no_grad()
+def moved_to_light(state: State, shading: Doubles, seed: int) -> State:
+    """The state with the shading of these coefficients (8, 3) moved from the base colours of dielectrics to the light."""
+    texel = np.flatnonzero(state.dielectric)
+    chosen = np.random.default_rng(seed).choice(texel, min(MATCHED_POINTS, len(texel)), replace=False)
+    matched = state.level.surface.unit_normals[chosen]
+    light = with_irradiance_factor(state.radiance, shading, matched, partial(irradiance, normals=matched))
+    return state.under_light(EnvironmentLight.from_radiance(light), texel)
 
 
 class _Pairs(NamedTuple):
@@ -78,7 +129,9 @@ class _Pairs(NamedTuple):
         return cls(first, second, points, share.astype(np.float32), scale.astype(np.float32))
 
 
-def remaining_shading(base_color: NDArray[Any], normal: NDArray[Any], position: NDArray[Any], generator: np.random.Generator) -> Doubles:
+def remaining_shading(
+    base_color: NDArray[np.floating], normal: NDArray[np.floating], position: NDArray[np.floating], generator: np.random.Generator
+) -> Doubles:
     """Coefficients e (8, 3) of the log shading that is left in the linear base colours (n, 3) of points with unit normals (n, 3) and
     positions (n, 3); zeros where there are fewer than two points."""
     if len(base_color) < 2:
@@ -111,7 +164,8 @@ def _solve(pairs: _Pairs, widening: float) -> tuple[Doubles, float]:
 
 @kernel(
     "i4[::1], i4[::1], f4[:, ::1], f4[::1], f4[::1], f4[:, ::1], f8, f8[:, :, :, ::1], f8[:, :, ::1], f8[:, ::1], f8[::1]",
-    parallel=True, nogil=True,
+    parallel=True,
+    nogil=True,
 )
 def normal_equations(
     first: Any, second: Any, points: Any, share: Any, scale: Any, found: Any, wider: Any, matrices: Any, rights: Any, weights: Any,
@@ -192,7 +246,10 @@ def _sum_pairs(
 
 
 def with_irradiance_factor(
-    radiance: NDArray[Any], coefficients: Doubles, normal: NDArray[Any], irradiance: Callable[[NDArray[np.float32]], NDArray[Any]]
+    radiance: NDArray[np.floating],
+    coefficients: Doubles,
+    normal: NDArray[np.floating],
+    irradiance: Callable[[NDArray[np.float32]], NDArray[np.floating]],
 ) -> NDArray[np.float32]:
     """The environment `radiance` (6, s, s, 3) changed smoothly so that its irradiance is multiplied by exp(Σ_k e_k Y_k(n)), with the mean
     over the unit normals (n, 3) kept.
