@@ -129,8 +129,7 @@ class _Tried:
             return descend(scene, state, steps, scene.each("trials of metal and dielectric"))
 
         base = adapt(state)
-        after = adapt(base)
-        return cls(adapt, _carry(base.restarted(), after), after.error)
+        return cls(adapt, base.restarted(), adapt(base).error)
 
     def with_trial(self, models: _Models, metal: bool, groups: Groups, observed: NDArray[np.bool_]) -> _Tried:
         """After a trial of `groups` (m,) of texels as `metal` or dielectric, which is kept where validation photos prefer it."""
@@ -149,15 +148,9 @@ class _Tried:
         trial = self.adapt(changed)
         decrease = 1 - trial.error / max(self.error, 1e-12)
         if not decrease > (max(MIN_DECREASE, MIN_OWN_DECREASE * share) if metal or len(groups) > 1 else 0):
-            return replace(self, count=self.count + 1, base=_carry(self.base, trial))
-        after = self.adapt(trial)
-        base = _carry(trial.restarted(), after)
-        return replace(self, base=base, error=after.error, count=self.count + 1, turns=(*self.turns, Turn(metal, share, decrease)))
-
-
-def _carry(base: State, after: State) -> State:
-    first, second = (np.concatenate([0 * m[:, :5], m[:, 5:]], 1) for m in after.moments)
-    return replace(base, steps=after.steps, moments=(first, second))
+            return replace(self, count=self.count + 1)
+        turns = (*self.turns, Turn(metal, share, decrease))
+        return replace(self, base=trial.restarted(), error=self.adapt(trial).error, count=self.count + 1, turns=turns)
 
 
 def _candidates(state: State, observed: NDArray[np.bool_]) -> tuple[_Models, list[Trial]]:

@@ -1,21 +1,28 @@
-"""Shading that a fit has left in base colours, found by comparing points of the surface, and moved to the light.
+"""Shading in colours of a surface, found by comparing its points: in photos' colours (delighting), and what a fit has left in base colours.
 
-Photos of a rough object under one light fit as well with shading in the base colours as in the light: for any irradiance E'(n), base
-colours times E / E' give the same diffuse colours. Most objects have few base colours, though, whatever their orientation. So the error of
-the light's irradiance, log E'(n)/E(n) = Σ_k e_k Y_k(n) in each channel with the eight spherical harmonics of orders 1 and 2 (Ramamoorthi
-& Hanrahan, JOSA A 2001), is where
+A colour is c = ρ · a · E(n): base colour, ambient occlusion, and the irradiance of a distant environment, whose logarithm is
 
-    Σ_ij w_ij |log b_i/b_j − Σ_k e_k (Y_k(n_i) − Y_k(n_j))| + ridge |e|²
+    log E(n) = Σ_k e_k Y_k(n),   Y: the eight spherical harmonics of orders 1 and 2
+
+in each channel (Ramamoorthi & Hanrahan, *On the relationship between radiance and irradiance*, JOSA A 2001: a diffuse surface hardly
+reflects higher orders). Photos of a rough object under one light fit as well with shading in the base colours as in the light, but most
+objects have few base colours, whatever their orientation. So the shading is where
+
+    Σ_ij w_ij |log c_i/c_j − Σ_k e_k (Y_k(n_i) − Y_k(n_j))| + ridge |e|²
 
 is least over pairs of points, half of them near each other and half anywhere on the object. Weights w_ij fall with the difference of
 chromaticity and of brightness that is left (Geman–McClure), so that pairs of different base colours do not take part (Retinex with
-chromaticity: Grosse et al., ICCV 2009; global sparsity of reflectance: Gehler et al., *Recovering intrinsic images with a global sparsity
-prior on reflectance*, NIPS 2011). Gauss-Newton with iteratively reweighted least squares.
+chromaticity: Grosse et al., *Ground truth dataset and baseline evaluations for intrinsic image algorithms*, ICCV 2009; global sparsity of
+reflectance: Gehler et al., *Recovering intrinsic images with a global sparsity prior on reflectance*, NIPS 2011). Gauss-Newton with
+iteratively reweighted least squares.
 
 That is not convex: where shading is strong, pairs across it look like different base colours and drop out before it is found. So it is
 solved twice, once with scales that start wide (graduated non-convexity: Blake & Zisserman, *Visual Reconstruction*, 1987), and the
 solution with which more pairs agree is taken; the wide one must win clearly, as it may take a base colour that varies with the normal
 for shading.
+
+Delighting takes the light as white. Its intensity is not observable: the median shading is set to 1, and no base colour may exceed that of
+white paper.
 """
 
 from __future__ import annotations
@@ -30,9 +37,9 @@ import numpy as np
 import torch
 from numba import njit, prange
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from gsbake.kernels.declaration import kernel
-from gsbake.materials.delighting import harmonics, nearby_pairs
 from gsbake.materials.descent import Steps, descend
 from gsbake.materials.passes import Scene
 from gsbake.materials.state import State
@@ -55,6 +62,9 @@ RIDGE, ROUNDS, DAMPING = 1e-3, 25, 0.7
 WIDENING, WIDENED_SHARE, MIN_AGREEMENT_GAIN = 20.0, 0.6, 0.01
 #: Partial sums of the pairs: a fixed number, so that results do not depend on threads; and pairs that are summed at a time.
 CHUNKS, BLOCK = 16, 64
+#: Delighting: the irradiance is clamped to within this factor of its mean; lower bound of ambient occlusion, as indirect light fills cavities
+#: and photos show them least reliably; this quantile of base colour is at most that of white paper.
+MAX_IRRADIANCE_RATIO, MIN_OCCLUSION, ALBEDO_QUANTILE, MAX_ALBEDO = 3.0, 0.5, 0.995, 0.9
 #: Points at which the irradiance of a changed light is matched, Gauss-Newton steps, their ridge weight and largest exponent.
 MATCHED_POINTS, MATCHING_STEPS, MATCHING_RIDGE, MAX_EXPONENT = 4000, 4, 1e-3, 1.0
 
@@ -104,6 +114,49 @@ def moved_to_light(state: State, shading: Doubles, seed: int) -> State:
     matched = state.level.surface.unit_normals[chosen]
     light = with_irradiance_factor(state.radiance, shading, matched, partial(irradiance, normals=matched))
     return state.under_light(EnvironmentLight.from_radiance(light), texel)
+
+
+@dataclass(frozen=True)
+class Irradiance:
+    """`coefficients` (8,) of the logarithm of the irradiance, in the order of `harmonics`."""
+
+    coefficients: Doubles
+
+    def at(self, normal: NDArray[np.floating]) -> Doubles:
+        """Irradiance (n,) at unit normals (n, 3), over that of a light without direction, clamped to `MAX_IRRADIANCE_RATIO`."""
+        return np.clip(np.exp(harmonics(normal) @ self.coefficients), 1 / MAX_IRRADIANCE_RATIO, MAX_IRRADIANCE_RATIO)
+
+    def light(self, size: int, intensity: float) -> EnvironmentLight:
+        """A white environment, cube map of edge `size`, with this irradiance (over π) times `intensity`."""
+        around = directions(4).reshape(-1, 3)
+        even, coefficients = np.ones((6, size, size, 3), np.float32), np.repeat(self.coefficients[:, None], 3, 1)
+        radiance = with_irradiance_factor(even, coefficients, around, partial(irradiance, normals=around))
+        wanted = intensity * self.at(around).mean()
+        return EnvironmentLight.from_radiance(radiance * np.float32(wanted / irradiance(radiance, around).mean()))
+
+
+def find_irradiance(
+    colour: NDArray[np.floating], normal: NDArray[np.floating], position: NDArray[np.floating], occlusion: NDArray[np.floating]
+) -> Irradiance:
+    """The white irradiance that best explains the differences between n points of the surface; uniform without usable pairs.
+
+    `colour` (n, 3) linear, `normal` (n, 3) unit, `position` (n, 3), `occlusion` (n,) ambient occlusion, 1 = open.
+    """
+    unoccluded = colour / np.maximum(occlusion, MIN_OCCLUSION)[:, None]
+    return Irradiance(remaining_shading(unoccluded, normal, position, np.random.default_rng(0)).mean(1))
+
+
+def remove_shading(
+    colour: NDArray[np.floating], normal: NDArray[np.floating], occlusion: NDArray[np.floating], irradiance: Irradiance
+) -> tuple[NDArray[np.float32], float]:
+    """Base colours (n, 3) of texels with the projected `colour` (n, 3), and the light intensity that belongs to them."""
+    shading = irradiance.at(normal) * np.maximum(occlusion, MIN_OCCLUSION)
+    intensity = float(1 / np.median(shading)) if len(shading) else 1.0
+    base = np.asarray(colour, np.float64) / (intensity * shading)[:, None]
+    brightest = float(np.quantile(base.max(1), ALBEDO_QUANTILE)) if len(base) else 0.0
+    if brightest > MAX_ALBEDO:
+        base, intensity = base * (MAX_ALBEDO / brightest), intensity * brightest / MAX_ALBEDO
+    return np.clip(base, 0, 1).astype(np.float32), intensity
 
 
 class _Pairs(NamedTuple):
@@ -276,3 +329,26 @@ def with_irradiance_factor(
             q = np.linalg.solve(slope.T @ slope + ridge, slope.T @ error[:, channel])
             light[:, channel] *= np.exp(np.clip(basis @ q, -MAX_EXPONENT, MAX_EXPONENT))
     return light.reshape(shape).astype(np.float32)
+
+
+def harmonics(direction: NDArray[np.floating]) -> Doubles:
+    """Spherical harmonics (n, 8) of orders 1 and 2 at unit directions (n, 3), not normalised: x, y, z, xy, yz, zx, x²−y², 3z²−1."""
+    x, y, z = np.asarray(direction, np.float64).T
+    return np.stack([x, y, z, x * y, y * z, z * x, x * x - y * y, 3 * z * z - 1], 1)
+
+
+def nearby_pairs(position: Doubles, neighbours: int, radius_share: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Indices (m,), (m,) of points at `position` (n, 3) that are among the nearest `neighbours` of one another within `radius_share` of the
+    diagonal, every pair once."""
+    if len(position) < 2:
+        return np.zeros(0, np.int64), np.zeros(0, np.int64)
+    radius = radius_share * float(np.linalg.norm(np.ptp(position, axis=0)))
+    count = min(neighbours + 1, len(position))
+    near = cKDTree(position).query(position, k=count, distance_upper_bound=radius)[1].astype(np.int64)
+    own = np.repeat(np.arange(len(position)), count)
+    other = near.ravel()
+    # The relation is not symmetric: a pair that either point found is taken once.
+    low, high = np.minimum(own, other), np.maximum(own, other)
+    valid = (other < len(position)) & (low != high)
+    once = np.unique(low[valid] * len(position) + high[valid])
+    return once // len(position), once % len(position)

@@ -236,8 +236,7 @@ class State:
 
     def restarted(self) -> State:
         """The same with the optimisers' moments anew, materials within the range of logits, and what follows from them."""
-        state = self.with_light(EnvironmentLight.from_radiance(self.radiance))
-        return state.with_inside(np.arange(len(self.values)), self.materials).with_transport()
+        return self.with_light(self.light).with_inside(np.arange(len(self.values)), self.materials).with_transport()
 
     @property
     def mean_intensity(self) -> Doubles:
