@@ -1,14 +1,14 @@
 """Ablation of the material fit's rules over many objects: the bake of finished runs once more without each of them, scored.
 
-python -m benchmarks.ablation RUNS CAPTURES OUT [--only brass_vase,toy] [--rules metal-trials,emission] [--seed 0] [--views 0]
+python -m benchmarks.ablation RUNS CAPTURES OUT [--only brass_vase,toy] [--rules 'metal trials,emission'] [--seed 0] [--views 0]
     [--scorer DIR] [--csv FILE]
 
 RUNS has a folder of a finished run (`--profile relight`) per object, CAPTURES the capture of the same name with its reference in `gt/`;
 `benchmarks.objects` makes both. Mesh, poses and photos are those of the run. The first row of an object has all rules, then one is taken
-out at a time (`RULES`), by replacing its function in this process. Seconds are those of the bake; set OMP_WAIT_POLICY=PASSIVE where other
-work runs beside it. `--views` scores on that many of the reference's views, evenly chosen, instead of all. Rows have commit, host and
-seed, and replace those of the same object, rule, seed and commit in the CSV file. The table at the end has, for each rule, what it brings
-on the objects whose figures it changes: the mean, and the worst object.
+out at a time (`RULES`): a pass of the recipe (`gsbake.materials.recipe`) or a setting. Seconds are those of the bake; set
+OMP_WAIT_POLICY=PASSIVE where other work runs beside it. `--views` scores on that many of the reference's views, evenly chosen, instead of
+all. Rows have commit, host and seed, and replace those of the same object, rule, seed and commit in the CSV file. The table at the end has,
+for each rule, what it brings on the objects whose figures it changes: the mean, and the worst object.
 """
 
 from __future__ import annotations
@@ -20,14 +20,9 @@ import statistics
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
-from unittest.mock import patch
-
-import numpy as np
 
 from benchmarks.ceiling import finished_folders
 from benchmarks.csv_rows import current_commit, read_rows, today, write_rows
@@ -38,32 +33,15 @@ from gsbake.config.load import load_profile
 from gsbake.errors import GsbakeError
 from gsbake.gltf.export import ExportOptions, export_asset
 from gsbake.materials.bake import BakeOptions, bake_textures
-from gsbake.materials.fit import MaterialFit
-from gsbake.materials.initialisation import DEFAULT_START
-from gsbake.materials.light_intensity import LightAdjustment
-from gsbake.materials.metal_trials import TrialResult
+from gsbake.materials.recipe import OPTIONAL
 from gsbake.system.limits import cpu_name
 
 RESULTS = ROOT / "benchmarks" / "results" / "ablation.csv"
 
-_UNCHANGED = LightAdjustment(np.ones(3), 1.0, 0.0, 0.0)
-#: {rule: what takes it out of the fit}.
-RULES: dict[str, Callable[[], AbstractContextManager[Any]]] = {
-    "none": nullcontext,
-    "starts": lambda: patch("gsbake.materials.initialisation.STARTS", (DEFAULT_START,)),
-    "light-search": lambda: patch.object(MaterialFit, "_search_light", lambda *_, **__: _UNCHANGED),
-    "metal-search": lambda: patch.object(MaterialFit, "_search_metals", lambda *_: None),
-    "metal-trials": lambda: patch("gsbake.materials.two_level_fit.try_kinds", lambda fit, fitted, *_: TrialResult(fitted)),
-    "metal-noise": lambda: patch.object(MaterialFit, "remove_noise", lambda *_: None),
-    "metal-superresolution": lambda: patch("gsbake.materials.fitting.superresolve_metals", lambda *given: given[5]),
-    "remaining-shading": lambda: patch.object(MaterialFit, "find_remaining_shading", lambda *_: np.zeros((8, 3))),
-    "emission": lambda: patch.object(MaterialFit, "_search_emission", lambda *_: 0),
-    "sparsity": nullcontext,
-    "neutral-light": nullcontext,
-    "smoothness": nullcontext,
-}
 #: Rules that are settings, with the values that take them out.
 SETTINGS = {"sparsity": "bake.sparsity=0", "neutral-light": "bake.neutral_light=0", "smoothness": "bake.smoothness=0"}
+#: All that can be taken out: passes of the recipe, and settings.
+RULES = ("none", *OPTIONAL, *SETTINGS)
 
 
 @dataclass(frozen=True)
@@ -103,8 +81,8 @@ def bake_without(rule: str, run: Path, out: Path, seed: int) -> float:
     shutil.rmtree(baked, ignore_errors=True)  # of a run that was stopped
     baked.mkdir(parents=True)
     begun = time.perf_counter()
-    with RULES[rule]():
-        bake_textures(folder["poses"], folder["refine"], folder["mesh"], baked, BakeOptions.of(profile), seed=seed)
+    options = replace(BakeOptions.of(profile), without=frozenset({rule} & set(OPTIONAL)))
+    bake_textures(folder["poses"], folder["refine"], folder["mesh"], baked, options, seed=seed)
     seconds = time.perf_counter() - begun
     export_asset(folder["ingest"], folder["poses"], folder["refine"], baked, out, ExportOptions(materials="fit"))
     return seconds

@@ -18,7 +18,7 @@ from gsbake.geometry.ply import read_textured_mesh
 from gsbake.geometry.raycast import RayCaster
 from gsbake.imaging.exr import write_exr
 from gsbake.kernels.threads import configure
-from gsbake.materials.delighting import find_irradiance, remove_shading
+from gsbake.materials.remaining_shading import find_irradiance, remove_shading
 from gsbake.materials.fitting import RAY_OFFSET, SMOOTHING_RADIUS, FitSettings, fit_materials
 from gsbake.meshing.repair import repair_foreign
 from gsbake.monitor import SILENT, Monitor, Rule, decide_skip
@@ -51,7 +51,8 @@ MAX_MISSED = 0.02
 @dataclass(frozen=True)
 class BakeOptions:
     """Settings of the bake; `train_size` and `holdout` are those of training, `light_size` the edge of the environment map's faces in
-    texels, `max_triangles` the limit of the exported asset, the rest are rules of [skip]."""
+    texels, `max_triangles` the limit of the exported asset, `without` names of passes of the material fit that are left out, the rest are
+    rules of [skip]."""
 
     bake: Bake = Bake()
     train_size: int = 512
@@ -63,6 +64,7 @@ class BakeOptions:
     normal_map: Rule = "auto"
     metallic_map: Rule = "auto"
     roughness_map: Rule = "auto"
+    without: frozenset[str] = frozenset()
 
     @classmethod
     def of(cls, settings: Any) -> BakeOptions:
@@ -232,12 +234,16 @@ class _Baking:
                 return Textures(self._delight(surface, projected, detail, occlusion), detail, {})
         if options.bake.materials == "fit":
             rules = options.specular, options.metallic_map, options.roughness_map
-            fit = FitSettings(options.bake, options.light_size, options.holdout, *rules)
+            fit = FitSettings(options.bake, options.light_size, options.holdout, *rules, options.without)
             fitted = fit_materials(surface, self.posed, projected, detail, occlusion, fit, self.seed, monitor)
-            fitted.light.save(light)
-            if fitted.light_motion.rotations is not None:
-                fitted.light_motion.save(self.out / "light_motion.json")
-            return Textures(fitted.textures, fitted.normal, fitted.figures)
+            fitted.state.light.save(light)
+            if fitted.state.light_motion.rotations is not None:
+                fitted.state.light_motion.save(self.out / "light_motion.json")
+            maps = fitted.maps
+            values = np.column_stack([maps.base_color, maps.roughness, maps.metallic])
+            values = values if maps.emission is None else np.column_stack([values, maps.emission])
+            textures = replace(projected, values=values, views=np.where(fitted.observed, projected.views, 0))
+            return Textures(textures, replace(detail, normal=fitted.normal), fitted.figures)
         return Textures(projected, detail, {})
 
     def _delight(self, surface: UnwrappedMesh, projected: ProjectedTexture, detail: DenseSamples, occlusion: Floats) -> ProjectedTexture:

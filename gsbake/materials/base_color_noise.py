@@ -15,17 +15,45 @@ itself.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gsbake.imaging.srgb import decode, encode
 from gsbake.materials.bilateral import EdgeAwareFilter
+from gsbake.materials.descent import Steps, descend
 from gsbake.materials.linear_shading import BaseColourSolver, PhotoSamples, observed_weight
+from gsbake.materials.materials import Materials
+from gsbake.materials.passes import Scene
+from gsbake.materials.state import State
 from gsbake.texturing.texels import Texels
 
 Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class MetalNoise:
+    """Takes out of metals' base colours the noise that two halves of the photos tell, `rounds` times; after each texels and light adapt in
+    the gradient `steps`."""
+
+    rounds: int = 1
+    steps: Steps | None = None
+
+    def applies(self, scene: Scene, state: State) -> bool:
+        """Not on a diffuse object, nor where the light moves: metals adapt to the errors of that, which is an approximation."""
+        return not scene.diffuse and not state.level.moving
+
+    def run(self, scene: Scene, state: State) -> State:
+        """Base colours of metals without noise."""
+        for turn in range(self.rounds):
+            metal, surface, m = state.metal & state.emits_nothing, state.level.surface, state.materials
+            base, texel = without_noise(state.metal_samples(), m, metal, surface.texels, surface.pairs), np.flatnonzero(metal)
+            state = state.with_inside(texel, replace(m.of(texel), base_color=base[texel].astype(np.float32))).with_transport().judged()
+            if self.steps is not None:
+                state = descend(scene.seeded(turn), state, self.steps, scene.each("trials of metal and dielectric"))
+        return state
+
 
 #: Change of base colour (sRGB, sum of channels) between adjacent texels over which a neighbourhood extends.
 SCALE = 0.5
@@ -36,17 +64,17 @@ TINY = 1e-6
 
 
 def without_noise(
-    photos: Sequence[PhotoSamples], values: NDArray[Any], metal: NDArray[np.bool_], texels: Texels, pairs: NDArray[np.int64]
+    photos: Sequence[PhotoSamples], materials: Materials, metal: NDArray[np.bool_], texels: Texels, pairs: NDArray[np.int64]
 ) -> Floats:
     """Linear base colours (n, 3): those of `metal` (n,) without the noise that two halves of the `photos` tell.
 
-    `values` (n, ≥ 4) are linear base colour and roughness of the `texels` with neighbouring `pairs` (m, 2).
+    `materials` are those of the `texels` with neighbouring `pairs` (m, 2).
     """
-    base = np.asarray(values[:, :3], np.float64)
+    base = np.asarray(materials.base_color, np.float64)
     if metal.mean() < MIN_SHARE or len(photos) < 2:
         return base
-    colour, weight = encode(np.clip(base, 0, 1)).astype(np.float64), observed_weight(photos, len(values)) * metal
-    noise, measured = _noise(photos, values[:, 3].astype(np.float32))
+    colour, weight = encode(np.clip(base, 0, 1)).astype(np.float64), observed_weight(photos, len(base)) * metal
+    noise, measured = _noise(photos, np.ascontiguousarray(materials.roughness))
     near = EdgeAwareFilter(texels, pairs, np.where(metal[:, None], colour, 0).astype(np.float32), SCALE)
     mean = _mean(near, colour, weight)
     variance = _mean(near, np.square(colour - mean), weight)
@@ -59,7 +87,7 @@ def _noise(photos: Sequence[PhotoSamples], roughness: NDArray[np.float32]) -> tu
     second one, and where it is measured (n,)."""
     solved, measured = [], np.ones(len(roughness), bool)
     for half in (photos[::2], photos[1::2]):
-        shadings = [samples.shade(roughness, 1.0) for samples in half]
+        shadings = [samples.shade(roughness).metal for samples in half]
         solved.append(encode(BaseColourSolver(half, len(roughness)).solve(shadings, robust=True)))
         measured &= observed_weight(half, len(roughness)) > MIN_WEIGHT
     return np.asarray(np.square(solved[0] - solved[1]) / 4, np.float64), measured

@@ -75,9 +75,9 @@ class Neighbourhoods:
         colour = encode(np.clip(np.asarray(self._photographed, np.float32), 0, 1))
         return EdgeAwareFilter(self._texels, self._pairs, colour, WIDE_SCALE)
 
-    def near(self, values: NDArray[np.float32]) -> EdgeAwareFilter:
-        """The filter over texels of nearly the same material `values` (n, ≥ 4): linear base colour and roughness."""
-        material = np.column_stack([encode(values[:, :3]), ROUGHNESS_FACTOR * values[:, 3]])
+    def near(self, base_color: NDArray[np.float32], roughness: NDArray[np.float32]) -> EdgeAwareFilter:
+        """The filter over texels of nearly the same material: linear `base_color` (n, 3) and `roughness` (n,)."""
+        material = np.column_stack([encode(base_color), ROUGHNESS_FACTOR * roughness])
         return EdgeAwareFilter(self._texels, self._pairs, material, NEAR_SCALE)
 
 

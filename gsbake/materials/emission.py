@@ -17,7 +17,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import scipy.sparse
@@ -55,7 +54,7 @@ class Emission:
 
 
 def find_emission(
-    photos: Sequence[PhotoSamples], roughness: NDArray[np.float32], pairs: NDArray[np.int64], position: NDArray[Any]
+    photos: Sequence[PhotoSamples], roughness: NDArray[np.float32], pairs: NDArray[np.int64], position: NDArray[np.floating]
 ) -> Emission:
     """The emissive texels, from the texels' present `roughness` (n,), neighbouring `pairs` (p, 2) and `position` (n, 3)."""
     n = len(roughness)
@@ -87,7 +86,7 @@ def _diffuse_radiance(photos: Sequence[PhotoSamples], roughness: NDArray[np.floa
     n = len(roughness)
     radiance, irradiance, total = np.zeros((n, 3)), np.zeros((n, 3)), np.zeros((n, 3))
     for photo in photos:
-        weight, shading = perceptual_weights(photo), photo.shade(roughness, 0.0)
+        weight, shading = perceptual_weights(photo), photo.shade(roughness).dielectric
         for sums, value in ((radiance, weight * (photo.colour - shading.offset)), (irradiance, weight * shading.slope), (total, weight)):
             for k in range(3):
                 sums[:, k] += np.bincount(photo.texel, value[:, k], n)
@@ -108,7 +107,7 @@ def _inliers(brightness: Floats) -> NDArray[np.bool_]:
     return np.asarray(deviation <= OUTLIER_DEVIATIONS * 1.4826 * np.median(deviation) + 0.01 * median)
 
 
-def _is_emissive(radiance: Floats, irradiance: Floats, position: NDArray[Any]) -> bool:
+def _is_emissive(radiance: Floats, irradiance: Floats, position: NDArray[np.floating]) -> bool:
     """Whether a region of m texels emits: diffuse `radiance` (m, 3), `irradiance` / π (m, 3), `position` (m, 3)."""
     albedo = np.median(radiance / np.maximum(irradiance, 1e-6), 0).max()
     if not albedo > MIN_ALBEDO:

@@ -14,10 +14,11 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import numba
 import numpy as np
 from numba import njit, prange
 
-from gsbake.kernels.declaration import kernel
+from gsbake.kernels.declaration import argument_types, kernel
 from gsbake.shading.reflection_kernel import reflected_radiance, specular_visibility
 from gsbake.shading.split_sum_kernel import (
     _CLAMP_TERM,
@@ -45,9 +46,17 @@ _POWER = np.float32(1 / 2.4)
 PARAMETERS = 8
 #: Columns of a pixel's shading parameters: diffuse albedo (3), base colour times metallic (3), roughness, normal offset (3), metallic.
 SHADING = 11
-#: Columns of a texel's light transport: visibility, ambient occlusion, indirect irradiance / π (3), emission (3), and for reflections of it
-#: diffuse radiosity / π (3), base colour times metallic (3), roughness, unit normal (3), metallic.
-TRANSPORT = 19
+#: Light transport at a place: visibility (0..1) of the present light and, for specular reflection, of uniform light (ambient occlusion);
+#: indirect irradiance / π; emission.
+LOCAL = np.dtype([("visibility", "f4"), ("occlusion", "f4"), ("indirect", "f4", 3), ("emission", "f4", 3)], align=True)
+#: That of a texel, and for reflections of it diffuse radiosity / π, base colour times metallic, roughness, unit normal, metallic.
+TRANSPORT = np.dtype(
+    [*((name, LOCAL[name]) for name in LOCAL.names or ()), ("diffuse", "f4", 3), ("metal_colour", "f4", 3), ("roughness", "f4"),
+     ("normal", "f4", 3), ("metallic", "f4")],
+    align=True,
+)  # fmt: skip
+_LOCAL, _TRANSPORT = (numba.types.Array(numba.from_dtype(record), 1, "C") for record in (LOCAL, TRANSPORT))
+_TABLES = "f4[:, ::1], f4[::1], i8[::1], i8[::1], Array(f4, 3, 'C', readonly=True)"
 
 
 @njit(forceinline=True, **_FLAGS)
@@ -60,10 +69,10 @@ def srgb_and_slope(linear: Any) -> Any:
 
 
 @kernel(
-    "i4[:, ::1], f4[:, ::1], f4[:, ::1], f4[:, ::1], f4[:, ::1], f4[::1], i4[::1], f4[:, ::1], f4[:, ::1], f4[:, ::1], f4[::1], i8[::1], "
-    "i8[::1], Array(f4, 3, 'C', readonly=True), f4, f4, f4, f4[:, ::1], f4[:, :, ::1], f8[:, ::1]",
+    (*argument_types("i4[:, ::1], f4[:, ::1], f4[:, ::1], f4[:, ::1], f4[:, ::1], f4[::1], i4[::1], f4[:, ::1]"), _TRANSPORT,
+     *argument_types(f"{_TABLES}, f4, f4, f4, f4[:, ::1], f4[:, :, ::1], f8[:, ::1]")),
     parallel=True, **_FLAGS,
-)
+)  # fmt: skip
 def shade_and_differentiate(
     texel: Any, bilinear: Any, normal: Any, view: Any, colour: Any, weight: Any, reflected: Any,
     values: Any, transport: Any, table: Any, knots: Any, sizes: Any, offsets: Any, lut: Any,
@@ -72,8 +81,8 @@ def shade_and_differentiate(
     """Loss and gradients of n pixels of one photo.
 
     `texel`, `bilinear` (n, 4) taps; `normal` (n, 3) of the mesh; `view`, sRGB `colour` (n, 3); `weight` (n,); `reflected` (n,) texel that
-    the reflected ray hits, −1: none, or empty: not traced; `values` (texels, PARAMETERS); `transport` (texels, TRANSPORT); `table` … `lut`
-    as in `split_sum_kernel`. `factor` scales the gradients. Written: `gradient` (n, SHADING) of the pixels' interpolated parameters;
+    the reflected ray hits, −1: none, or empty: not traced; `values` (texels, PARAMETERS); `transport` (texels,) of `TRANSPORT`; `table` …
+    `lut` as in `split_sum_kernel`. `factor` scales the gradients. Written: `gradient` (n, SHADING) of the pixels' interpolated parameters;
     added: `g_table` (CHUNKS, rows, 3); `sums` (CHUNKS, 3) loss, weighted mean squared error and weight.
     """
     for chunk in prange(CHUNKS):
@@ -98,14 +107,15 @@ def _shade_chunk(
     square_sum = 0.0
     weight_sum = 0.0
     shading = np.empty(SHADING, np.float32)
-    local = np.empty(8, np.float32)
+    indirect, emission = np.empty(3, np.float32), np.empty(3, np.float32)
     bounced = np.zeros(3, np.float32)
     for pixel in range(chunk * n // CHUNKS, (chunk + 1) * n // CHUNKS):
         i = np.uint64(pixel)
         for c in range(SHADING):
             shading[c] = _0
-        for c in range(8):
-            local[c] = _0
+        visible = occlusion = _0
+        indirect[:] = _0
+        emission[:] = _0
         for k in range(4):
             w = bilinear[i, k]
             t = np.uint64(texel[i, k])
@@ -117,11 +127,13 @@ def _shade_chunk(
                     shading[7 + c] += w * values[t, 5 + c]
                 shading[6] += w * values[t, 3]
                 shading[10] += w_metal
-                for c in range(8):
-                    local[c] += w * transport[t, c]
+                at = transport[t]
+                visible += w * at.visibility
+                occlusion += w * at.occlusion
+                for c in range(3):
+                    indirect[c] += w * at.indirect[c]
+                    emission[c] += w * at.emission[c]
         rough = shading[6]
-        visible = local[0]
-        occlusion = local[1]
 
         # Geometry.
         nx = normal[i, 0] + shading[7]
@@ -176,11 +188,11 @@ def _shade_chunk(
             upper = _bilinear(table, base1, stride1, fx1, fy1, ch)
             irradiance = _bilinear(table, base2, stride2, fx2, fy2, ch)
             narrow = lower + t_level * (upper - lower)
-            diffuse = visible * irradiance + local[2 + ch]
-            near = visible_s * narrow + incident * bounced[ch] + blocked * local[2 + ch]
+            diffuse = visible * irradiance + indirect[ch]
+            near = visible_s * narrow + incident * bounced[ch] + blocked * indirect[ch]
             light = near + share * (diffuse - near)
             reflectance = metal_colour * scale + metal * bias + (_1 - metal) * dielectric
-            linear = albedo * transmitted * diffuse + light * reflectance + local[5 + ch]
+            linear = albedo * transmitted * diffuse + light * reflectance + emission[ch]
             encoded, slope = srgb_and_slope(min(max(linear, _0), _1))
             error = encoded - colour[i, ch]
             squares += error * error
@@ -284,7 +296,8 @@ def _sign(x: Any) -> Any:
 @kernel(
     "f4[:, ::1], f4[:, ::1], f4[:, ::1], f4[:, ::1], f4[:, ::1], f4[:, ::1], i8[::1], i4[::1], f4[::1], f4[::1], f4, f4[:, ::1], f4[::1], "
     "f4[::1], f4, f4, f4, f4, f4",
-    parallel=True, **_FLAGS,
+    parallel=True,
+    **_FLAGS,
 )
 def adam_step(
     raw: Any, values: Any, new_values: Any, data: Any, first: Any, second: Any, start: Any, neighbour: Any, smoothness: Any,
@@ -335,10 +348,9 @@ def adam_step(
 
 
 @kernel(
-    "f4[:, ::1], f4[:, ::1], i4[::1], f4[:, ::1], f4[:, ::1], f4[:, ::1], f4[::1], i8[::1], i8[::1], Array(f4, 3, 'C', readonly=True), "
-    "f4[:, ::1], f4[:, ::1]",
+    (*argument_types("f4[:, ::1], f4[:, ::1], i4[::1]"), _LOCAL, _TRANSPORT, *argument_types(f"{_TABLES}, f4[:, ::1], f4[:, ::1]")),
     parallel=True, **_FLAGS,
-)
+)  # fmt: skip
 def incident_light(
     normal: Any, view: Any, reflected: Any, local: Any, transport: Any, table: Any, knots: Any, sizes: Any, offsets: Any, lut: Any,
     diffuse: Any, bounced: Any,
@@ -346,7 +358,7 @@ def incident_light(
     """Of the light of n pixels what does not depend on their roughness, (n, 3) each: the `diffuse` light, and the radiance `bounced` of the
     texel that the reflected ray meets.
 
-    `local` (n, 8) is the light transport of pixels, `transport` (texels, TRANSPORT) that of the texels that they reflect.
+    `local` (n,) of `LOCAL` is the light transport of pixels, `transport` (texels,) of `TRANSPORT` that of the texels that they reflect.
     """
     last = sizes.shape[0] - 1
     for pixel in prange(normal.shape[0]):
@@ -355,7 +367,7 @@ def incident_light(
         u, v = _encode(nx, ny, nz)
         base, stride, fx, fy = _taps(u, v, sizes[last], offsets[last])
         for ch in range(3):
-            diffuse[i, ch] = local[i, 0] * _bilinear(table, base, stride, fx, fy, ch) + local[i, 2 + ch]
+            diffuse[i, ch] = local[i].visibility * _bilinear(table, base, stride, fx, fy, ch) + local[i].indirect[ch]
             bounced[i, ch] = _0
         if reflected.shape[0] > 0 and reflected[i] >= 0:
             two = _2 * c
@@ -364,10 +376,10 @@ def incident_light(
 
 
 @kernel(
-    "i8[::1], f4[:, ::1], f4[:, ::1], i4[::1], f4[:, ::1], f4[:, ::1], f4[:, ::1], f4[::1], f4[:, ::1], f4[::1], i8[::1], i8[::1], "
-    "Array(f4, 3, 'C', readonly=True), f4[:, ::1], f4[:, ::1], f4[:, ::1], f4[:, ::1]",
+    (*argument_types("i8[::1], f4[:, ::1], f4[:, ::1], i4[::1]"), _LOCAL,
+     *argument_types(f"f4[:, ::1], f4[:, ::1], f4[::1], {_TABLES}, f4[:, ::1], f4[:, ::1], f4[:, ::1], f4[:, ::1]")),
     parallel=True, **_FLAGS,
-)
+)  # fmt: skip
 def linear_shading(
     texel: Any, normal: Any, view: Any, reflected: Any, local: Any, wide: Any, bounced: Any, rough: Any, table: Any, knots: Any,
     sizes: Any, offsets: Any, lut: Any, diffuse: Any, specular: Any, scaled: Any, edge: Any,
@@ -375,7 +387,7 @@ def linear_shading(
     """Shading of n pixels as a linear function of base colour b, without what they emit.
 
     A dielectric shows b · `diffuse` + `specular`, a metal b · `scaled` + `edge`; (n, 3) each. `texel` (n,) is the texel whose roughness
-    `rough` (texels,) counts; `local` (n, 8) the light transport of pixels; `wide`, `bounced` (n, 3) their diffuse light and the radiance
+    `rough` (texels,) counts; `local` (n,) the light transport of pixels; `wide`, `bounced` (n, 3) their diffuse light and the radiance
     that they reflect, of `incident_light`.
     """
     for pixel in prange(normal.shape[0]):
@@ -396,12 +408,12 @@ def linear_shading(
         level, t = _roughness_level(_table_value(lut, row, col, fx, fy, 3), knots)
         base0, stride0, fx0, fy0 = _taps(u, v, sizes[level], offsets[level])
         base1, stride1, fx1, fy1 = _taps(u, v, sizes[level + 1], offsets[level + 1])
-        visible_s, blocked, incident, _ = specular_visibility(soft, roughness, local[i, 1], reflected, i)
+        visible_s, blocked, incident, _ = specular_visibility(soft, roughness, local[i].occlusion, reflected, i)
         for ch in range(3):
             lower = _bilinear(table, base0, stride0, fx0, fy0, ch)
             upper = _bilinear(table, base1, stride1, fx1, fy1, ch)
             narrow = lower + t * (upper - lower)
-            near = visible_s * narrow + incident * bounced[i, ch] + blocked * local[i, 2 + ch]
+            near = visible_s * narrow + incident * bounced[i, ch] + blocked * local[i].indirect[ch]
             light = near + share * (wide[i, ch] - near)
             diffuse[i, ch] = transmitted * wide[i, ch]
             specular[i, ch] = light * dielectric

@@ -17,11 +17,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from gsbake.materials.materials import Materials
 from gsbake.materials.visibility import LUMINANCE
 from gsbake.shading.cubemap import solid_angles
 
@@ -42,10 +42,10 @@ class IntensityPrior:
     radiance: float | None = None
 
     @classmethod
-    def of(cls, values: NDArray[Any], dielectric: NDArray[np.bool_], radiance: NDArray[Any] | None) -> IntensityPrior:
-        """The prior for texels with `values` (n, ≥ 5), linear base colour, roughness and metallic, of which some (n,) are `dielectric`,
-        under the environment map `radiance` (6, s, s, 3), which does not count without."""
-        strongest, metal = values[:, :3].max(1), values[:, 4] > 0.5
+    def of(cls, materials: Materials, dielectric: NDArray[np.bool_], radiance: NDArray[np.float32] | None) -> IntensityPrior:
+        """The prior for texels with `materials`, of which some (n,) are `dielectric`, under the environment map `radiance` (6, s, s, 3),
+        which does not count without."""
+        strongest, metal = materials.base_color.max(1), materials.metallic > 0.5
         dielectrics = float(np.exp(np.log(strongest[dielectric] + LOG_OFFSET).mean())) if dielectric.mean() >= MIN_SHARE else None
         metals = float(np.median(strongest[metal])) if metal.mean() >= MIN_SHARE else None
         if radiance is None:

@@ -1,82 +1,87 @@
-"""Two resolutions of the material fit: the fit texture, and one of half its edge on which starts are compared and searches are made.
-
-Starts are compared on the coarse level, with a quarter of the texels and of the pixels, and the fine level continues from the best of them.
-Visibility and indirect light vary slowly over the surface: they are traced on
-the coarse level and interpolated.
-"""
+"""From the coarse level of a fit to the fine one, and from there to the texture of the asset."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from gsbake.materials.adjacency import neighbours
-from gsbake.materials.fit_surface import FitSurface, Transport
-from gsbake.materials.pixels import Pixels
-from gsbake.texturing.resampling import CoarseTexture
-
-Floats = NDArray[np.float32]
-
-#: The coarse level keeps every so many pixels of a photo: as its texels cover as many.
-PIXEL_STEP = 4
+from gsbake.materials.descent import Steps, descend
+from gsbake.materials.passes import Scene
+from gsbake.materials.state import LIMITS, State
+from gsbake.texturing.resampling import DETAIL_OFFSET, MAX_DETAIL_RATIO
 
 
 @dataclass(frozen=True)
-class FitLevel:
-    """One resolution: the texels, and the pixels of the photos to fit and of the validation photos."""
+class PureMetals:
+    """Scales metallic, where it is metal, so that its median there is 1: metals are pure.
 
-    surface: FitSurface
-    fitted: list[Pixels]
-    held_out: list[Pixels]
+    Gradient steps leave it lower, as a share of diffuse reflection makes up for reflections that are misplaced.
+    """
+
+    def applies(self, scene: Scene, state: State) -> bool:
+        """Where most is metal."""
+        return not state.mostly_dielectric
+
+    def run(self, scene: Scene, state: State) -> State:
+        """Metallic scaled."""
+        texel = np.flatnonzero(state.metal)
+        if not len(texel):
+            return state
+        m = state.materials.of(texel)
+        return state.with_materials(texel, replace(m, metallic=np.minimum(m.metallic / np.median(m.metallic), LIMITS.pure_metal)))
 
 
 @dataclass(frozen=True)
-class InterpolatedTransport:
-    """Visibility and indirect light of the fine texels of `texture`, computed by `coarse` on its coarse texels."""
+class FineLevel:
+    """Goes on to the finer level, with base colours that take their detail from the photos' colours there."""
 
-    coarse: Transport
-    texture: CoarseTexture
+    def applies(self, scene: Scene, state: State) -> bool:
+        """Where there is one."""
+        return scene.finer is not None
 
-    def visible_share(self, radiance: NDArray[Any]) -> Floats:
-        """See `Visibility.visible_share`."""
-        return self.texture.up(self.coarse.visible_share(radiance)[:, None])[:, 0]
-
-    def indirect_irradiance(self, irradiance: NDArray[Any], reflectance: NDArray[Any]) -> Floats:
-        """See `Visibility.indirect_irradiance`."""
-        return self.texture.up(self.coarse.indirect_irradiance(self.texture.down(irradiance), self.texture.down(reflectance)))
-
-
-def coarse_surface(surface: FitSurface, texture: CoarseTexture) -> FitSurface:
-    """The texels of `surface` averaged onto the coarse ones of `texture`, without light transport."""
-    normal, occlusion, base, position = (
-        texture.down(x) for x in (surface.normal, surface.occlusion[:, None], surface.base_color, surface.position)
-    )
-    pairs = neighbours(texture.texels, position, normal)
-    return replace(
-        surface, texels=texture.texels, position=position, pairs=pairs, normal=normal, occlusion=occlusion[:, 0], base_color=base,
-        transport=None,
-    )  # fmt: skip
+    def run(self, scene: Scene, state: State) -> State:
+        """The state interpolated at the finer texels."""
+        assert scene.finer is not None
+        up, level = scene.finer.texture.up, scene.finer.level.under(state.light_motion.rotations)
+        values = up(state.values)
+        detail = (level.surface.base_color + DETAIL_OFFSET) / (up(state.level.surface.base_color) + DETAIL_OFFSET)
+        values[:, :3] = np.clip(values[:, :3] * np.clip(detail, 1 / MAX_DETAIL_RATIO, MAX_DETAIL_RATIO), *LIMITS.base_color)
+        values[:, 3:5] = np.clip(values[:, 3:5], LIMITS.least, 1 - LIMITS.least)
+        emission = up(state.transport["emission"])
+        return state.on(level, np.ascontiguousarray(values, np.float32), emission)
 
 
-def coarse_pixels(pixels: Pixels, texture: CoarseTexture) -> Pixels:
-    """Every `PIXEL_STEP`-th of the `pixels`, reading the coarse texels of `texture` that contain their fine ones."""
-    chosen = pixels.every(PIXEL_STEP)
-    parent = coarse_texels(texture)
-    texel = parent[chosen.texel]
-    bilinear = np.where(texel >= 0, chosen.bilinear, 0).astype(np.float32)
-    total = bilinear.sum(1)
-    reflected = chosen.reflected_texel
-    if reflected is not None:
-        reflected = np.where(reflected >= 0, parent[reflected], -1)
-    share = bilinear / np.maximum(total, 1e-6)[:, None]
-    return replace(chosen, texel=np.maximum(texel, 0), bilinear=share, reflected_texel=reflected, weight=chosen.weight * (total > 0))
+@dataclass(frozen=True)
+class GradientSteps:
+    """Gradient `steps` on the present level, reported by the `name`."""
+
+    steps: Steps
+    name: str
+
+    def applies(self, scene: Scene, state: State) -> bool:
+        """Always."""
+        return True
+
+    def run(self, scene: Scene, state: State) -> State:
+        """The state after the steps."""
+        return descend(scene, state, self.steps, scene.each(self.name))
 
 
-def coarse_texels(texture: CoarseTexture) -> NDArray[np.int64]:
-    """The coarse texel (n,) that contains each fine one, -1: none."""
-    factor = texture.fine.size // texture.texels.size
-    row, column = np.divmod(texture.fine.index, texture.fine.size)
-    return texture.texels.lookup[row // factor * texture.texels.size + column // factor]
+@dataclass(frozen=True)
+class FullTexture:
+    """Brings the maps to the texels of the asset, with the fine detail of the photos' colours."""
+
+    def applies(self, scene: Scene, state: State) -> bool:
+        """Where there are such texels."""
+        return scene.target is not None
+
+    def run(self, scene: Scene, state: State) -> State:
+        """The maps at all texels of the asset."""
+        assert scene.target is not None
+        up, maps = scene.target.texture.up, state.selected or state.materials
+        values = up(np.column_stack([maps.base_color, maps.roughness, maps.metallic]))
+        detail = scene.target.texture.detail(scene.target.projected)
+        emission = up(state.transport["emission"]) * detail if state.emissive_regions else None
+        full = replace(maps, base_color=values[:, :3] * detail, roughness=values[:, 3], metallic=values[:, 4], emission=emission)
+        return replace(state, maps=replace(full, normal_offset=up(state.values[:, 5:])))

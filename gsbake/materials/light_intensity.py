@@ -30,7 +30,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -74,23 +73,25 @@ class LightAdjustment:
         light = f"RGB factors {red:.2f} {green:.2f} {blue:.2f}, contrast {self.contrast:.2f}"
         return f"{light}{roughness} (residual -{self.improvement:.1%})"
 
-    def shifted_roughness(self, roughness: NDArray[Any]) -> NDArray[np.float32]:
+    def shifted_roughness(self, roughness: NDArray[np.floating]) -> NDArray[np.float32]:
         """`roughness` (n,) of dielectrics after the shift."""
         return shift_roughness(roughness, self.roughness_shift)
 
 
-def shift_roughness(roughness: NDArray[Any], shift: float) -> NDArray[np.float32]:
+def shift_roughness(roughness: NDArray[np.floating], shift: float) -> NDArray[np.float32]:
     """`roughness` (n,) with `shift` added to its logit."""
     odds = np.clip(roughness, 1e-4, 1 - 1e-4)
     odds = odds / (1 - odds) * np.exp(shift)
     return np.asarray(odds / (1 + odds), np.float32)
 
 
-def adjust_radiance(radiance: NDArray[Any], intensity: NDArray[Any], contrast: float, area: NDArray[Any]) -> NDArray[np.float32]:
+def adjust_radiance(
+    radiance: NDArray[np.floating], intensity: NDArray[np.floating], contrast: float, area: NDArray[np.floating]
+) -> NDArray[np.float32]:
     """The environment `radiance` (6, s, s, 3) with its mean over the sphere (texels weighted by solid angles `area` (6, s, s)) times
     `intensity` (3,), and each direction's ratio to that mean raised to `contrast`."""
 
-    def mean(light: NDArray[Any]) -> NDArray[Any]:
+    def mean(light: NDArray[np.floating]) -> NDArray[np.floating]:
         return np.asarray((light * area[..., None]).sum((0, 1, 2)) / area.sum())
 
     average = np.maximum(mean(radiance), 1e-12)
@@ -197,7 +198,7 @@ def _tinted(best: _Candidate, residual: Callable[[_Candidate], Floats]) -> _Cand
 
 def _residual(photos: Sequence[PhotoSamples], roughness: NDArray[np.float32]) -> Floats:
     """Block-averaged absolute residuals (3,) of sRGB values at the best base colours."""
-    shadings = [photo.shade(roughness, 0.0) for photo in photos]
+    shadings = [photo.shade(roughness).dielectric for photo in photos]
     base = BaseColourSolver(photos, len(roughness)).solve(shadings, robust=True)
     total, pixels = np.zeros(3), 0.0
     for photo, shading in zip(photos, shadings, strict=True):

@@ -43,13 +43,25 @@ class LinearShading:
     slope: NDArray[np.float32]
     offset: NDArray[np.float32]
 
-    def srgb(self, base: NDArray[Any]) -> NDArray[np.float32]:
+    def srgb(self, base: NDArray[np.floating]) -> NDArray[np.float32]:
         """sRGB colours (n, 3), clipped at white, of base colours `base` (n, 3)."""
         return np.asarray(encode(np.clip(base * self.slope + self.offset, 0, 1)), np.float32)
 
 
-#: Shades pixels of one photo at a roughness (texels,) and metallic 0 or 1.
-Shader = Callable[[NDArray[np.float32], float], LinearShading]
+@dataclass(frozen=True)
+class LinearParts:
+    """The shading of the same pixels as `dielectric` and as `metal`."""
+
+    dielectric: LinearShading
+    metal: LinearShading
+
+    def of(self, metal: bool) -> LinearShading:
+        """That of one kind."""
+        return self.metal if metal else self.dielectric
+
+
+#: Shades pixels of one photo at a roughness (texels,).
+Shader = Callable[[NDArray[np.float32]], LinearParts]
 
 
 @dataclass(frozen=True)
@@ -112,7 +124,9 @@ class BaseColourSolver:
 
 @kernel(
     "i8[::1], f4[:, ::1], f4[:, ::1], f4[:, ::1], f4[:, ::1], f4[:, ::1], f8, i8, b1, f8[:, ::1]",
-    parallel=True, nogil=True, error_model="numpy",
+    parallel=True,
+    nogil=True,
+    error_model="numpy",
 )
 def solve_base_colours(
     texel: Any, slope: Any, offset: Any, colour: Any, weight: Any, curve: Any, lowest: Any, rounds: Any, robust: Any, base: Any

@@ -26,7 +26,7 @@ mean of what it covers); Gilbert, *Iterative methods for the three-dimensional r
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
@@ -34,15 +34,14 @@ import numpy as np
 import scipy.sparse
 from numpy.typing import NDArray
 
-from gsbake.geometry.cameras import Camera
 from gsbake.imaging.srgb import encode
-from gsbake.materials.fit import MaterialFit
 from gsbake.materials.linear_shading import LinearShading, PhotoSamples, unclipped_weights
+from gsbake.materials.materials import Materials
 from gsbake.materials.metallic import MIN_METAL_ALBEDO
-from gsbake.materials.pixels import PixelReader, Pixels
-from gsbake.texturing.resampling import CoarseTexture
+from gsbake.materials.passes import Scene
+from gsbake.materials.photo import PhotoReader
+from gsbake.materials.state import State
 from gsbake.texturing.texels import Texels
-from gsbake.texturing.unwrapped_mesh import UnwrappedMesh
 
 Floats = NDArray[np.float32]
 
@@ -88,43 +87,43 @@ class MetalPixels:
     shading: LinearShading
 
 
-def superresolve_metals(
-    surface: UnwrappedMesh,
-    coarse: CoarseTexture,
-    fit: MaterialFit,
-    metal: NDArray[np.bool_],
-    roughness: Floats,
-    values: Floats,
-    photos: Sequence[tuple[Pixels, Camera]],
-) -> Floats:
-    """`values` (n, 5) of the surface's texels, with the base colour of perforated metal solved at full resolution.
+@dataclass(frozen=True)
+class MetalSuperresolution:
+    """Solves the base colour of perforated metal at the texels of the asset."""
 
-    `metal` (m,) and `roughness` (m,) belong to the `coarse` texels of the `fit`; `photos` are the fitted pixels with their cameras.
-    """
-    region = metal_regions(coarse.texels, metal)
-    reader = PixelReader(surface.atlas_caster, surface.atlas.uv, surface.texels, surface.diagonal)
-    metal_pixels = []
-    for pixels, camera in photos:
-        rows, samples = fit.samples_of(pixels, region)
-        pixel = pixels.pixel[rows]
-        row, column = np.divmod(pixel, camera.width)
-        shading = samples.shade(roughness, 1.0)
-        metal_pixels.append(MetalPixels(column, row, *reader.subpixel_texels(camera, pixel), samples, shading))
-    return superresolved(values, surface.texels, coarse.up(region[:, None].astype(np.float32))[:, 0] > 0.5, metal_pixels)
+    def applies(self, scene: Scene, state: State) -> bool:
+        """Where there is metal, and a map of it."""
+        return state.maps is not None and bool(state.metal.any() and state.maps.metallic.any())
+
+    def run(self, scene: Scene, state: State) -> State:
+        """The maps with perforated metal solved."""
+        assert scene.target is not None and state.maps is not None
+        target, mesh, roughness = scene.target, scene.target.mesh, (state.selected or state.materials).roughness
+        region = metal_regions(target.texture.texels, state.metal)
+        reader = PhotoReader(mesh.atlas_caster, mesh.atlas.uv, mesh.texels, mesh.texel_normal, mesh.diagonal)
+        metal_pixels = []
+        for photo in state.level.photos:
+            camera, shown = target.cameras[photo.index], photo.showing(region)
+            for samples in state.samples([shown]):  # none where nothing is shown
+                row, column = np.divmod(shown.pixel, camera.width)
+                shading = samples.shade(roughness).metal
+                metal_pixels.append(MetalPixels(column, row, *reader.subpixel_texels(camera, shown.pixel), samples, shading))
+        covered = target.texture.up(region[:, None].astype(np.float32))[:, 0] > 0.5
+        return replace(state, maps=superresolved(state.maps, mesh.texels, covered, metal_pixels))
 
 
 def metal_regions(texels: Texels, metal: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Mask (n,) of the texels in a neighbourhood of mostly `metal` (n,)."""
-    return np.asarray(_blur(texels, metal[:, None], REGION_RADIUS)[:, 0] > MIN_METAL_SHARE)
+    return np.asarray(_blur(texels, metal[:, None].astype(np.float32), REGION_RADIUS)[:, 0] > MIN_METAL_SHARE)
 
 
-def superresolved(values: Floats, texels: Texels, region: NDArray[np.bool_], photos: Sequence[MetalPixels]) -> Floats:
-    """`values` (n, 5) of `texels` (linear base colour, roughness, metallic) with perforated metal in `region` (n,) solved.
+def superresolved(maps: Materials, texels: Texels, region: NDArray[np.bool_], photos: Sequence[MetalPixels]) -> Materials:
+    """`maps` of `texels` with perforated metal in `region` (n,) solved.
 
     Results darker than any metal, or much darker than the metal around, are holes: dielectric and rough, without a specular reflection of
     the room. The rest of the perforated metal has metallic 1.
     """
-    systems, initial = _photo_systems(photos, region), values[region, :3]
+    systems, initial = _photo_systems(photos, region), maps.base_color[region]
     everything, half, other_half = (
         _with_local_hue(_solve(some, initial), texels, region) for some in (systems, systems[::2], systems[1::2])
     )
@@ -132,23 +131,24 @@ def superresolved(values: Floats, texels: Texels, region: NDArray[np.bool_], pho
     dark = everything.mean(1) < np.maximum(DARK * around, MIN_METAL_ALBEDO)
     perforated[region] = _has_holes(texels, region, dark) & _correlated(texels, region, half.mean(1), other_half.mean(1))
     if not perforated.any():
-        return values
+        return maps
 
     def prior(base: Floats) -> Floats:
         return _metal_or_black(base, texels, perforated)
 
-    base = _with_local_hue(_solve(_photo_systems(photos, perforated), values[perforated, :3], prior), texels, perforated)
+    solved = _solve(_photo_systems(photos, perforated), maps.base_color[perforated], prior)
+    base = _with_local_hue(solved, texels, perforated)
     metal = _metal_colour(base, texels, perforated).mean(1)
     hole = base.mean(1) < np.maximum(HOLE_THRESHOLD * metal, MIN_METAL_ALBEDO)
-    out = values.copy()
-    out[perforated, :3] = np.where(hole[:, None], np.maximum(base - DIELECTRIC_F0, 0), np.minimum(base, 1))
-    if np.ptp(values[:, 3]) > 0:  # a constant roughness stays constant
-        out[perforated, 3] = np.where(hole, 1, out[perforated, 3])
-    out[perforated, 4] = ~hole
+    out = maps.copied()
+    out.base_color[perforated] = np.where(hole[:, None], np.maximum(base - DIELECTRIC_F0, 0), np.minimum(base, 1))
+    if np.ptp(maps.roughness) > 0:  # a constant roughness stays constant
+        out.roughness[perforated] = np.where(hole, 1, out.roughness[perforated])
+    out.metallic[perforated] = ~hole
     return out
 
 
-def _blur(texels: Texels, values: NDArray[Any], radius: float) -> Floats:
+def _blur(texels: Texels, values: NDArray[np.floating], radius: float) -> Floats:
     """`values` (n, c) blurred in the texture with a Gaussian of `radius` texels; 0 outside the charts."""
     image = cv2.GaussianBlur(texels.image(values), (0, 0), radius)
     return np.asarray(image.reshape(texels.size**2, -1)[texels.index])
@@ -156,7 +156,7 @@ def _blur(texels: Texels, values: NDArray[Any], radius: float) -> Floats:
 
 def _has_holes(texels: Texels, region: NDArray[np.bool_], hole: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Which of the t texels in `region` (n,) have both metal and holes (t,) around them."""
-    share = _local_mean(hole[:, None], texels, region, LOCAL_RADIUS)[:, 0]
+    share = _local_mean(hole[:, None].astype(np.float32), texels, region, LOCAL_RADIUS)[:, 0]
     return np.asarray((share > HOLE_SHARE[0]) & (share < HOLE_SHARE[1]))
 
 
@@ -169,7 +169,7 @@ def _correlated(texels: Texels, region: NDArray[np.bool_], first: Floats, second
 
 
 def _local_mean(
-    values: NDArray[Any], texels: Texels, region: NDArray[np.bool_], radius: float, weight: NDArray[Any] | None = None
+    values: NDArray[np.floating], texels: Texels, region: NDArray[np.bool_], radius: float, weight: NDArray[np.floating] | None = None
 ) -> Floats:
     """Gaussian mean over about `radius` texels of `values` (t, c) in `region` (n,), weighted by `weight` (t,)."""
     w = np.ones(len(values), np.float32) if weight is None else weight

@@ -14,20 +14,21 @@ Then groups are tried one at a time, also those that are a little less likely as
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.cluster.vq import kmeans2
 
-from gsbake.materials.concurrent_fits import Each
-from gsbake.materials.fit import MaterialFit
-from gsbake.materials.fit_surface import Fitted, validation_error
-from gsbake.materials.levels import FitLevel
+from gsbake.materials.descent import Steps, descend
 from gsbake.materials.linear_shading import BaseColourSolver, observed_weight
-from gsbake.materials.metallic import TRIED_ROUGHNESS, candidate_model
-from gsbake.materials.options import FitSchedule
+from gsbake.materials.materials import Materials
+from gsbake.materials.metallic import TRIED_ROUGHNESS, candidate_model, shaded
+from gsbake.materials.passes import Scene
+from gsbake.materials.photo import texel_weight
+from gsbake.materials.state import LIMITS, State
+from gsbake.shading.environment import EnvironmentLight
 
 Floats = NDArray[np.float64]
 
@@ -45,6 +46,7 @@ MIN_DECREASE, MIN_OWN_DECREASE = 0.005, 0.5
 
 #: A trial: the mean log-likelihood ratio per pixel of a group for its present kind, whether it is to be metal, and its texels (m,).
 Trial = tuple[float, bool, NDArray[np.int64]]
+Groups = list[NDArray[np.int64]]
 
 
 @dataclass(frozen=True)
@@ -60,97 +62,119 @@ class Turn:
 
 
 @dataclass(frozen=True)
-class TrialResult:
-    """The fit's result `fitted` after trials, the number of `trials`, and those that were kept, `turned`."""
+class KindTrials:
+    """Tries groups of texels as the other kind and keeps what validation photos prefer after the gradient `steps` of each trial."""
 
-    fitted: Fitted
-    trials: int = 0
-    turned: tuple[Turn, ...] = ()
+    steps: Steps
 
-    def __str__(self) -> str:
-        return f"{self.trials} trials of the other kind: {', '.join(map(str, self.turned)) or 'none kept'}"
+    def applies(self, scene: Scene, state: State) -> bool:
+        """With validation photos, on an object that is not diffuse, under a light that stands: metals adapt to the errors of one that
+        moves."""
+        return state.level.validated and not scene.diffuse and not state.level.moving
 
-
-def try_kinds(fit: MaterialFit, fitted: Fitted, level: FitLevel, schedule: FitSchedule, each: Each) -> TrialResult:
-    """Try groups of texels as the other kind and keep what validation photos prefer.
-
-    `fit` on the `level`, with the result `fitted`, changes in place; `schedule` has the steps of each trial. Without validation
-    photos nothing is tried.
-    """
-    if not any(map(len, level.held_out)):
-        return TrialResult(fitted)
-    trial = _Trials(fit, level, schedule, each)
-    trial.run((fitted.weight > MIN_WEIGHT) & (fitted.emission.sum(1) == 0))
-    return TrialResult(trial.fitted, trial.count, tuple(trial.turned))
-
-
-class _Trials:
-    """Trials one after another: `state` is the best so far, `fitted` its result, after as many steps as any trial from it."""
-
-    def __init__(self, fit: MaterialFit, level: FitLevel, schedule: FitSchedule, each: Each) -> None:
-        self.fit, self.level, self.schedule, self.each = fit, level, schedule, each
-        self.observed, self.count, self.turned = 0, 0, list[Turn]()
-        self._adapt()
-        self.state = fit.state()
-        self.fitted = self._adapt()
-
-    def _adapt(self) -> Fitted:
-        return self.fit.run(self.level.fitted, self.level.held_out, self.schedule, self.each)
-
-    def run(self, observed: NDArray[np.bool_]) -> None:
-        """Try the groups of `observed` (n,) texels together and alone, those first whose evidence for the other kind is strongest."""
-        self.observed = int(observed.sum())
-        models, tries = self._candidates(observed)
+    def run(self, scene: Scene, state: State) -> State:
+        """The best state, with the evidence."""
+        observed = (texel_weight(filter(len, state.level.photos), len(state.values)) > MIN_WEIGHT) & state.emits_nothing
+        tried = _Tried.first(scene, state, self.steps)
+        models, tries = _candidates(tried.base, observed)
         for metal in (True, False):
             likelier = [group for for_present, other, group in tries if other == metal and for_present < 0]
-            if len(likelier) > 1 and self._try(models, metal, likelier):
-                models, tries = self._candidates(observed)
+            if len(likelier) > 1:
+                before, tried = tried, tried.with_trial(models, metal, likelier, observed)
+                if tried.turns != before.turns:
+                    models, tries = _candidates(tried.base, observed)
         for _, metal, group in tries:
-            self._try(models, metal, [group])
-        self.fit.restore(self.state, self.level.fitted)
+            tried = tried.with_trial(models, metal, [group], observed)
+        found = f"{tried.count} trials of the other kind: {', '.join(map(str, tried.turns)) or 'none kept'}"
+        return replace(tried.base, kinds_changed=bool(tried.turns), evidence=f"{state.evidence}; {found}")
 
-    def _candidates(self, observed: NDArray[np.bool_]) -> tuple[_Models, list[Trial]]:
-        """The models of all texels under the present light, and the trials that they are worth."""
-        self.fit.restore(self.state, self.level.fitted)
-        models, tries = _Models(self.fit, self.level), list[Trial]()
-        for group in _groups(self.state.values, np.asarray(self.level.surface.base_color), observed):
-            share, for_dielectric = (self.state.values[group, 4] > 0.5).mean(), models.evidence(group)
-            for metal, for_present in ((True, for_dielectric), (False, -for_dielectric)):
-                if share != metal and for_present < MAX_EVIDENCE:
-                    tries.append((for_present, metal, group))
-        return models, sorted(tries, key=lambda entry: entry[0])
 
-    def _try(self, models: _Models, metal: bool, groups: list[NDArray[np.int64]]) -> bool:
-        """Turn `groups` (m,) of texels into `metal` or dielectric and keep that where validation photos prefer it: whether they do."""
-        kind, texels, values = self.fit.kind(metal), [], []
+@dataclass(frozen=True)
+class LightLevel:
+    """Sets the light to the intensity that searches had left, from which gradient steps drift along a valley; where texels changed their
+    kind the gradient `steps` search for it again."""
+
+    steps: Steps
+
+    def applies(self, scene: Scene, state: State) -> bool:
+        """After trials of kinds, or where they might have been."""
+        return not scene.diffuse and not state.level.moving
+
+    def run(self, scene: Scene, state: State) -> State:
+        """The light scaled, and base colours so that what they show stays."""
+        if state.intensity is not None:
+            factor = (state.intensity / np.maximum(state.mean_intensity, 1e-12)).astype(np.float32)
+            state = state.under_light(EnvironmentLight.from_radiance(state.radiance * factor), np.flatnonzero(state.emits_nothing))
+        if state.kinds_changed:
+            state = descend(scene, state, self.steps, scene.each("trials of metal and dielectric"))
+        return state
+
+
+@dataclass(frozen=True)
+class _Tried:
+    """The best state so far as the `base` of trials, its validation `error` after as many steps as any trial from it, the number of trials
+    so far and those that were kept."""
+
+    adapt: Callable[[State], State]
+    base: State
+    error: float
+    count: int = 0
+    turns: tuple[Turn, ...] = ()
+
+    @classmethod
+    def first(cls, scene: Scene, state: State, steps: Steps) -> _Tried:
+        """Before all trials: texels and light adapt once, so that trials are compared with a state that had as many steps."""
+
+        def adapt(state: State) -> State:
+            return descend(scene, state, steps, scene.each("trials of metal and dielectric"))
+
+        base = adapt(state)
+        return cls(adapt, base.restarted(), adapt(base).error)
+
+    def with_trial(self, models: _Models, metal: bool, groups: Groups, observed: NDArray[np.bool_]) -> _Tried:
+        """After a trial of `groups` (m,) of texels as `metal` or dielectric, which is kept where validation photos prefer it."""
+        texels, values = [], []
         for group in groups:
-            texel = group[(self.state.values[group, 4] > 0.5) != metal]
-            base, roughness = models.best(metal, group, texel)
+            texel = group[self.base.metal[group] != metal]
+            colour, roughness = models.best(metal, group, texel)
             texels.append(texel)
-            values.append(np.column_stack([base, np.full(len(texel), roughness), np.full(len(texel), kind)]))
-        share = sum(map(len, texels)) / max(1, self.observed)
+            values.append(np.column_stack([colour, np.full(len(texel), roughness)]))
+        share = sum(map(len, texels)) / max(1, int(observed.sum()))
         if share < MIN_SHARE:
-            return False
-        self.fit.restore(self.state, self.level.fitted)
-        self.fit.set_materials(np.concatenate(texels), np.concatenate(values))
-        self.count += 1
-        decrease = 1 - validation_error(self._adapt()) / max(validation_error(self.fitted), 1e-12)
+            return self
+        texel, both = np.concatenate(texels), np.concatenate(values).astype(np.float32)
+        kind = np.full(len(texel), LIMITS.as_metal if metal else LIMITS.as_dielectric, np.float32)
+        changed = self.base.with_inside(texel, Materials(both[:, :3], both[:, 3], kind)).with_transport()
+        trial = self.adapt(changed)
+        decrease = 1 - trial.error / max(self.error, 1e-12)
         if not decrease > (max(MIN_DECREASE, MIN_OWN_DECREASE * share) if metal or len(groups) > 1 else 0):
-            return False
-        self.state = self.fit.state()
-        self.fitted = self._adapt()
-        self.turned.append(Turn(metal, share, decrease))
-        return True
+            return replace(self, count=self.count + 1)
+        turns = (*self.turns, Turn(metal, share, decrease))
+        return replace(self, base=trial.restarted(), error=self.adapt(trial).error, count=self.count + 1, turns=turns)
+
+
+def _candidates(state: State, observed: NDArray[np.bool_]) -> tuple[_Models, list[Trial]]:
+    """The models of all texels under the present light, and the trials that they are worth, those first whose evidence for the other kind
+    is strongest."""
+    models, tries = _Models(state), list[Trial]()
+    for group in _groups(state.materials, state.level.surface.base_color, observed):
+        share, for_dielectric = state.metal[group].mean(), models.evidence(group)
+        for metal, for_present in ((True, for_dielectric), (False, -for_dielectric)):
+            if share != metal and for_present < MAX_EVIDENCE:
+                tries.append((for_present, metal, group))
+    return models, sorted(tries, key=lambda entry: entry[0])
 
 
 class _Models:
     """Dielectric and metallic models of all texels under the present light, at each of a few roughnesses."""
 
-    def __init__(self, fit: MaterialFit, level: FitLevel) -> None:
-        photos, texels = fit.metal_samples(level.fitted), len(level.surface.texels)
+    def __init__(self, state: State) -> None:
+        photos, texels = state.metal_samples(), len(state.values)
         self._weight = observed_weight(photos, texels)
-        solver, tried = BaseColourSolver(photos, texels), [np.full(texels, r, np.float32) for r in TRIED_ROUGHNESS]
-        at_each = [[candidate_model(photos, solver, roughness, metallic) for metallic in (0.0, 1.0)] for roughness in tried]
+        solver, at_each = BaseColourSolver(photos, texels), []
+        for tried in TRIED_ROUGHNESS:
+            parts = shaded(photos, np.full(texels, tried, np.float32))
+            at_each.append([candidate_model(photos, solver, parts, metal) for metal in (False, True)])
         self._found = [*zip(*at_each, strict=True)]
 
     def _costs(self, metal: bool, group: NDArray[np.int64]) -> list[float]:
@@ -168,12 +192,12 @@ class _Models:
         return self._found[metal][index][1][texel], TRIED_ROUGHNESS[index]
 
 
-def _groups(values: NDArray[Any], photographed: NDArray[Any], observed: NDArray[np.bool_]) -> list[NDArray[np.int64]]:
-    """Indices (m,) of the `observed` (n,) texels of each group that is large enough: similar in material `values` (n, 5) and linear
-    `photographed` colour (n, 3)."""
+def _groups(materials: Materials, photographed: NDArray[np.floating], observed: NDArray[np.bool_]) -> Groups:
+    """Indices (m,) of the `observed` (n,) texels of each group that is large enough: similar in `materials` and linear `photographed`
+    colour (n, 3)."""
     texel = np.flatnonzero(observed)
-    columns = [values[texel, 3:5].astype(np.float64)]
-    for colour in (photographed, values[:, :3]):
+    columns = [np.column_stack([materials.roughness[texel], materials.metallic[texel]]).astype(np.float64)]
+    for colour in (photographed, materials.base_color):
         log = np.log(np.maximum(colour[texel], 0) + LOG_OFFSET)
         columns.append(np.column_stack([log[:, 0] - log[:, 1], log[:, 2] - log[:, 1], LUMINANCE_FACTOR * log.mean(1)]))
     points = np.column_stack(columns)

@@ -28,7 +28,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from gsbake.materials.linear_shading import CLIPPED, BaseColourSolver, LinearShading, PhotoSamples, observed_weight
+from gsbake.materials.linear_shading import CLIPPED, BaseColourSolver, LinearParts, LinearShading, PhotoSamples, observed_weight
 
 Floats = NDArray[np.float64]
 #: A filter of values (texels,).
@@ -69,12 +69,6 @@ class ShadingModel:
 
     shading: LinearShading
     tilted: tuple[LinearShading, ...]
-
-    @classmethod
-    def of(cls, samples: PhotoSamples, roughness: NDArray[np.float32], metallic: float) -> ShadingModel:
-        """The model of the `samples` at `roughness` (texels,) and `metallic` 0 or 1."""
-        shading, *tilted = (shade(roughness, metallic) for shade in (samples.shade, *samples.tilted))
-        return cls(shading, tuple(tilted))
 
     def negative_log_likelihood(self, samples: PhotoSamples, base: Floats) -> Floats:
         """Weighted sums (texels,) over pixels and channels, up to a constant, for base colours `base` (texels, 3)."""
@@ -129,13 +123,18 @@ class _BestModel:
         self.cost[better], self.base[better], self.roughness[better] = cost[better], base[better], roughness[better]
 
 
+def shaded(photos: Sequence[PhotoSamples], roughness: NDArray[np.float32]) -> list[list[LinearParts]]:
+    """The shading of each photo's pixels at a `roughness` (texels,), followed by those with tilted normals."""
+    return [[shade(roughness) for shade in (samples.shade, *samples.tilted)] for samples in photos]
+
+
 def candidate_model(
-    photos: Sequence[PhotoSamples], solver: BaseColourSolver, roughness: NDArray[np.float32], metallic: float
+    photos: Sequence[PhotoSamples], solver: BaseColourSolver, parts: Sequence[Sequence[LinearParts]], metal: bool
 ) -> tuple[Floats, Floats]:
-    """The best model at a `roughness` (texels,) and `metallic` 0 or 1: costs (texels,), which are negative log-likelihoods up to a
+    """The best model of one kind with the shading `parts` of `shaded`: costs (texels,), which are negative log-likelihoods up to a
     constant, and base colours (texels, 3)."""
-    models = [ShadingModel.of(samples, roughness, metallic) for samples in photos]
-    base = solver.solve([model.shading for model in models], MIN_METAL_ALBEDO if metallic else 0.0)
+    models = [ShadingModel(first.of(metal), tuple(one.of(metal) for one in tilted)) for first, *tilted in parts]
+    base = solver.solve([model.shading for model in models], MIN_METAL_ALBEDO if metal else 0.0)
     costs = [model.negative_log_likelihood(samples, base) for samples, model in zip(photos, models, strict=True)]
     return sum(costs, np.zeros(len(base))), base
 
@@ -143,10 +142,12 @@ def candidate_model(
 def _compare_models(photos: Sequence[PhotoSamples], own: NDArray[np.float32]) -> tuple[_BestModel, _BestModel]:
     """The best dielectric and the best metal of each texel over all roughnesses tried."""
     texels = len(own)
-    solver, tried = BaseColourSolver(photos, texels), [np.full(texels, r, np.float32) for r in TRIED_ROUGHNESS]
-    found = _BestModel(texels), _BestModel(texels)
-    smooth = own if own.max(initial=0) <= MAX_METAL_ROUGHNESS else np.minimum(own, np.float32(MAX_METAL_ROUGHNESS))
-    for pair in ((own, smooth), *zip(tried, tried, strict=True)):  # both kinds at one roughness: they share the reflections
-        for metallic, roughness in enumerate(pair):
-            found[metallic].offer(*candidate_model(photos, solver, roughness, metallic), roughness)
+    solver, found = BaseColourSolver(photos, texels), (_BestModel(texels), _BestModel(texels))
+    smooth = np.minimum(own, np.float32(MAX_METAL_ROUGHNESS))
+    for pair in ((own, smooth), *((r, r) for r in (np.full(texels, tried, np.float32) for tried in TRIED_ROUGHNESS))):
+        parts = shaded(photos, pair[0])
+        found[False].offer(*candidate_model(photos, solver, parts, False), pair[0])
+        if (pair[0] != pair[1]).any():
+            parts = shaded(photos, pair[1])
+        found[True].offer(*candidate_model(photos, solver, parts, True), pair[1])
     return found

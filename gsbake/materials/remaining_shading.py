@@ -1,36 +1,51 @@
-"""Shading that a fit has left in base colours, found by comparing points of the surface, and moved to the light.
+"""Shading in colours of a surface, found by comparing its points: in photos' colours (delighting), and what a fit has left in base colours.
 
-Photos of a rough object under one light fit as well with shading in the base colours as in the light: for any irradiance E'(n), base
-colours times E / E' give the same diffuse colours. Most objects have few base colours, though, whatever their orientation. So the error of
-the light's irradiance, log E'(n)/E(n) = Σ_k e_k Y_k(n) in each channel with the eight spherical harmonics of orders 1 and 2 (Ramamoorthi
-& Hanrahan, JOSA A 2001), is where
+A colour is c = ρ · a · E(n): base colour, ambient occlusion, and the irradiance of a distant environment, whose logarithm is
 
-    Σ_ij w_ij |log b_i/b_j − Σ_k e_k (Y_k(n_i) − Y_k(n_j))| + ridge |e|²
+    log E(n) = Σ_k e_k Y_k(n),   Y: the eight spherical harmonics of orders 1 and 2
+
+in each channel (Ramamoorthi & Hanrahan, *On the relationship between radiance and irradiance*, JOSA A 2001: a diffuse surface hardly
+reflects higher orders). Photos of a rough object under one light fit as well with shading in the base colours as in the light, but most
+objects have few base colours, whatever their orientation. So the shading is where
+
+    Σ_ij w_ij |log c_i/c_j − Σ_k e_k (Y_k(n_i) − Y_k(n_j))| + ridge |e|²
 
 is least over pairs of points, half of them near each other and half anywhere on the object. Weights w_ij fall with the difference of
 chromaticity and of brightness that is left (Geman–McClure), so that pairs of different base colours do not take part (Retinex with
-chromaticity: Grosse et al., ICCV 2009; global sparsity of reflectance: Gehler et al., *Recovering intrinsic images with a global sparsity
-prior on reflectance*, NIPS 2011). Gauss-Newton with iteratively reweighted least squares.
+chromaticity: Grosse et al., *Ground truth dataset and baseline evaluations for intrinsic image algorithms*, ICCV 2009; global sparsity of
+reflectance: Gehler et al., *Recovering intrinsic images with a global sparsity prior on reflectance*, NIPS 2011). Gauss-Newton with
+iteratively reweighted least squares.
 
 That is not convex: where shading is strong, pairs across it look like different base colours and drop out before it is found. So it is
 solved twice, once with scales that start wide (graduated non-convexity: Blake & Zisserman, *Visual Reconstruction*, 1987), and the
 solution with which more pairs agree is taken; the wide one must win clearly, as it may take a base colour that varies with the normal
 for shading.
+
+Delighting takes the light as white. Its intensity is not observable: the median shading is set to 1, and no base colour may exceed that of
+white paper.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
+import torch
 from numba import njit, prange
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from gsbake.kernels.declaration import kernel
-from gsbake.materials.delighting import harmonics, nearby_pairs
+from gsbake.materials.descent import Steps, descend
+from gsbake.materials.passes import Scene
+from gsbake.materials.state import State
 from gsbake.shading.cubemap import directions
+from gsbake.shading.environment import EnvironmentLight
+from gsbake.shading.light_tables import irradiance
 
 Doubles = NDArray[np.float64]
 
@@ -47,12 +62,101 @@ RIDGE, ROUNDS, DAMPING = 1e-3, 25, 0.7
 WIDENING, WIDENED_SHARE, MIN_AGREEMENT_GAIN = 20.0, 0.6, 0.01
 #: Partial sums of the pairs: a fixed number, so that results do not depend on threads; and pairs that are summed at a time.
 CHUNKS, BLOCK = 16, 64
+#: Delighting: the irradiance is clamped to within this factor of its mean; lower bound of ambient occlusion, as indirect light fills cavities
+#: and photos show them least reliably; this quantile of base colour is at most that of white paper.
+MAX_IRRADIANCE_RATIO, MIN_OCCLUSION, ALBEDO_QUANTILE, MAX_ALBEDO = 3.0, 0.5, 0.995, 0.9
 #: Points at which the irradiance of a changed light is matched, Gauss-Newton steps, their ridge weight and largest exponent.
 MATCHED_POINTS, MATCHING_STEPS, MATCHING_RIDGE, MAX_EXPONENT = 4000, 4, 1e-3, 1.0
 
 _1, _THIRD = np.float32(1), np.float32(1 / 3)
 #: Where pairs differ so much that they count e⁻³⁰; smaller float32 numbers are denormal and slow.
 _MAX_CHROMATICITY = np.float32(30)
+
+
+@dataclass(frozen=True)
+class RemainingShading:
+    """Moves shading left in base colours to the light, `rounds` times and once more; between these texels adapt to it in the gradient
+    `steps`.
+
+    From there the light is given: gradient steps would move it back, as that base colours have no shading is not part of their loss.
+    """
+
+    steps: Steps
+    rounds: int = 4
+
+    def applies(self, scene: Scene, state: State) -> bool:
+        """Where most is dielectric and the light stands: over all photos under a moving one there is hardly any."""
+        return state.mostly_dielectric and not state.level.moving
+
+    def run(self, scene: Scene, state: State) -> State:
+        """The state under the light that is given from here on."""
+        state = replace(state, light_given=True)
+        for turn in range(self.rounds + 1):
+            if turn:
+                state = descend(scene, state, self.steps, scene.each("remaining shading"))
+            seed = scene.seed + turn
+            state = moved_to_light(state, shading_of(state, seed), seed)
+        return state
+
+
+def shading_of(state: State, seed: int) -> Doubles:
+    """Coefficients (8, 3) of the log shading that is left in the base colours of dielectrics."""
+    texel, surface = np.flatnonzero(state.dielectric), state.level.surface
+    position = np.asarray(surface.position)[texel]
+    return remaining_shading(state.materials.base_color[texel], surface.unit_normals[texel], position, np.random.default_rng(seed))
+
+
+@torch.no_grad()
+def moved_to_light(state: State, shading: Doubles, seed: int) -> State:
+    """The state with the shading of these coefficients (8, 3) moved from the base colours of dielectrics to the light."""
+    texel = np.flatnonzero(state.dielectric)
+    chosen = np.random.default_rng(seed).choice(texel, min(MATCHED_POINTS, len(texel)), replace=False)
+    matched = state.level.surface.unit_normals[chosen]
+    light = with_irradiance_factor(state.radiance, shading, matched, partial(irradiance, normals=matched))
+    return state.under_light(EnvironmentLight.from_radiance(light), texel)
+
+
+@dataclass(frozen=True)
+class Irradiance:
+    """`coefficients` (8,) of the logarithm of the irradiance, in the order of `harmonics`."""
+
+    coefficients: Doubles
+
+    def at(self, normal: NDArray[np.floating]) -> Doubles:
+        """Irradiance (n,) at unit normals (n, 3), over that of a light without direction, clamped to `MAX_IRRADIANCE_RATIO`."""
+        return np.clip(np.exp(harmonics(normal) @ self.coefficients), 1 / MAX_IRRADIANCE_RATIO, MAX_IRRADIANCE_RATIO)
+
+    def light(self, size: int, intensity: float) -> EnvironmentLight:
+        """A white environment, cube map of edge `size`, with this irradiance (over π) times `intensity`."""
+        around = directions(4).reshape(-1, 3)
+        even, coefficients = np.ones((6, size, size, 3), np.float32), np.repeat(self.coefficients[:, None], 3, 1)
+        radiance = with_irradiance_factor(even, coefficients, around, partial(irradiance, normals=around))
+        wanted = intensity * self.at(around).mean()
+        return EnvironmentLight.from_radiance(radiance * np.float32(wanted / irradiance(radiance, around).mean()))
+
+
+def find_irradiance(
+    colour: NDArray[np.floating], normal: NDArray[np.floating], position: NDArray[np.floating], occlusion: NDArray[np.floating]
+) -> Irradiance:
+    """The white irradiance that best explains the differences between n points of the surface; uniform without usable pairs.
+
+    `colour` (n, 3) linear, `normal` (n, 3) unit, `position` (n, 3), `occlusion` (n,) ambient occlusion, 1 = open.
+    """
+    unoccluded = colour / np.maximum(occlusion, MIN_OCCLUSION)[:, None]
+    return Irradiance(remaining_shading(unoccluded, normal, position, np.random.default_rng(0)).mean(1))
+
+
+def remove_shading(
+    colour: NDArray[np.floating], normal: NDArray[np.floating], occlusion: NDArray[np.floating], irradiance: Irradiance
+) -> tuple[NDArray[np.float32], float]:
+    """Base colours (n, 3) of texels with the projected `colour` (n, 3), and the light intensity that belongs to them."""
+    shading = irradiance.at(normal) * np.maximum(occlusion, MIN_OCCLUSION)
+    intensity = float(1 / np.median(shading)) if len(shading) else 1.0
+    base = np.asarray(colour, np.float64) / (intensity * shading)[:, None]
+    brightest = float(np.quantile(base.max(1), ALBEDO_QUANTILE)) if len(base) else 0.0
+    if brightest > MAX_ALBEDO:
+        base, intensity = base * (MAX_ALBEDO / brightest), intensity * brightest / MAX_ALBEDO
+    return np.clip(base, 0, 1).astype(np.float32), intensity
 
 
 class _Pairs(NamedTuple):
@@ -78,7 +182,9 @@ class _Pairs(NamedTuple):
         return cls(first, second, points, share.astype(np.float32), scale.astype(np.float32))
 
 
-def remaining_shading(base_color: NDArray[Any], normal: NDArray[Any], position: NDArray[Any], generator: np.random.Generator) -> Doubles:
+def remaining_shading(
+    base_color: NDArray[np.floating], normal: NDArray[np.floating], position: NDArray[np.floating], generator: np.random.Generator
+) -> Doubles:
     """Coefficients e (8, 3) of the log shading that is left in the linear base colours (n, 3) of points with unit normals (n, 3) and
     positions (n, 3); zeros where there are fewer than two points."""
     if len(base_color) < 2:
@@ -111,7 +217,8 @@ def _solve(pairs: _Pairs, widening: float) -> tuple[Doubles, float]:
 
 @kernel(
     "i4[::1], i4[::1], f4[:, ::1], f4[::1], f4[::1], f4[:, ::1], f8, f8[:, :, :, ::1], f8[:, :, ::1], f8[:, ::1], f8[::1]",
-    parallel=True, nogil=True,
+    parallel=True,
+    nogil=True,
 )
 def normal_equations(
     first: Any, second: Any, points: Any, share: Any, scale: Any, found: Any, wider: Any, matrices: Any, rights: Any, weights: Any,
@@ -192,7 +299,10 @@ def _sum_pairs(
 
 
 def with_irradiance_factor(
-    radiance: NDArray[Any], coefficients: Doubles, normal: NDArray[Any], irradiance: Callable[[NDArray[np.float32]], NDArray[Any]]
+    radiance: NDArray[np.floating],
+    coefficients: Doubles,
+    normal: NDArray[np.floating],
+    irradiance: Callable[[NDArray[np.float32]], NDArray[np.floating]],
 ) -> NDArray[np.float32]:
     """The environment `radiance` (6, s, s, 3) changed smoothly so that its irradiance is multiplied by exp(Σ_k e_k Y_k(n)), with the mean
     over the unit normals (n, 3) kept.
@@ -219,3 +329,26 @@ def with_irradiance_factor(
             q = np.linalg.solve(slope.T @ slope + ridge, slope.T @ error[:, channel])
             light[:, channel] *= np.exp(np.clip(basis @ q, -MAX_EXPONENT, MAX_EXPONENT))
     return light.reshape(shape).astype(np.float32)
+
+
+def harmonics(direction: NDArray[np.floating]) -> Doubles:
+    """Spherical harmonics (n, 8) of orders 1 and 2 at unit directions (n, 3), not normalised: x, y, z, xy, yz, zx, x²−y², 3z²−1."""
+    x, y, z = np.asarray(direction, np.float64).T
+    return np.stack([x, y, z, x * y, y * z, z * x, x * x - y * y, 3 * z * z - 1], 1)
+
+
+def nearby_pairs(position: Doubles, neighbours: int, radius_share: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Indices (m,), (m,) of points at `position` (n, 3) that are among the nearest `neighbours` of one another within `radius_share` of the
+    diagonal, every pair once."""
+    if len(position) < 2:
+        return np.zeros(0, np.int64), np.zeros(0, np.int64)
+    radius = radius_share * float(np.linalg.norm(np.ptp(position, axis=0)))
+    count = min(neighbours + 1, len(position))
+    near = cKDTree(position).query(position, k=count, distance_upper_bound=radius)[1].astype(np.int64)
+    own = np.repeat(np.arange(len(position)), count)
+    other = near.ravel()
+    # The relation is not symmetric: a pair that either point found is taken once.
+    low, high = np.minimum(own, other), np.maximum(own, other)
+    valid = (other < len(position)) & (low != high)
+    once = np.unique(low[valid] * len(position) + high[valid])
+    return once // len(position), once % len(position)

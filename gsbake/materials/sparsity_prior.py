@@ -13,13 +13,13 @@ Comaniciu & Meer, *Mean shift: a robust approach toward feature space analysis*,
 from __future__ import annotations
 
 from itertools import product
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
 from gsbake.imaging.srgb import encode
+from gsbake.materials.materials import Materials
 
 Floats = NDArray[np.float32]
 
@@ -29,20 +29,19 @@ KERNEL_WIDTHS = (0.03, 0.03, 0.03, 0.1)
 METAL_THRESHOLD = 0.5
 
 
-def common_materials(values: NDArray[Any], included: NDArray[np.bool_]) -> Floats:
-    """The local mean material of each texel, (n, 4): base colour in sRGB and roughness.
+def common_materials(materials: Materials, included: NDArray[np.bool_]) -> Floats:
+    """The local mean of the `materials` around each texel, (n, 4): base colour in sRGB and roughness.
 
-    `values` (n, 5) are linear base colour, roughness and metallic. Texels that are not `included` (n,) do not enter the density and keep
-    their own material.
+    Texels that are not `included` (n,) do not enter the density and keep their own material.
     """
-    materials = np.column_stack([encode(np.clip(values[:, :3], 0, 1)), values[:, 3]])
-    metal = values[:, 4] >= METAL_THRESHOLD
+    common = np.column_stack([encode(np.clip(materials.base_color, 0, 1)), materials.roughness])
+    metal = materials.metallic >= METAL_THRESHOLD
     for kind in (included & metal, included & ~metal):
-        materials[kind] = mean_shift(materials[kind], KERNEL_WIDTHS)
-    return np.asarray(materials, np.float32)
+        common[kind] = mean_shift(common[kind], KERNEL_WIDTHS)
+    return np.asarray(common, np.float32)
 
 
-def mean_shift(values: NDArray[Any], widths: tuple[float, ...]) -> Floats:
+def mean_shift(values: NDArray[np.floating], widths: tuple[float, ...]) -> Floats:
     """For each of `values` (n, k) the mean (n, k) of all, weighted by a Gaussian of their distance.
 
     Its standard deviations are `widths` (k,), and a sixth more: sums are taken on a grid with cells of one deviation, by linear splatting

@@ -2,7 +2,7 @@
 
 Where it is blocked follows from ambient occlusion and from one traced ray. What it sees there follows from the light transport of the texel
 that the ray meets: its diffuse radiosity, its emission, and the environment that it reflects in turn. The PyTorch twin is
-`gsbake.materials.fit_reference`.
+`tests/materials/reference.py`.
 """
 
 from __future__ import annotations
@@ -71,8 +71,9 @@ def reflected_radiance(
 
     Of what blocks its specular lobe the mean radiance counts, which its indirect light tells.
     """
-    nx, ny, nz = transport[hit, 15], transport[hit, 16], transport[hit, 17]
-    roughness, occlusion = transport[hit, 14], transport[hit, 1]
+    met = transport[hit]
+    nx, ny, nz = met.normal[0], met.normal[1], met.normal[2]
+    roughness, occlusion, metal = met.roughness, met.occlusion, met.metallic
     c = -(nx * x + ny * y + nz * z)
     soft = _HALF * (c + math.sqrt(c * c + _CLAMP_TERM))
     row, col, fx, fy = _table_cell(math.sqrt(soft), roughness, lut)
@@ -81,7 +82,6 @@ def reflected_radiance(
     share = _table_value(lut, row, col, fx, fy, 2)
     mirror = _table_value(lut, row, col, fx, fy, 4)
     dielectric = _table_value(lut, row, col, fx, fy, 5)
-    metal = transport[hit, 18]
     coeff = _1 + mirror * (_2 * c - _1)
     u, v = _encode(coeff * nx + mirror * x, coeff * ny + mirror * y, coeff * nz + mirror * z)
     level, t = _roughness_level(_table_value(lut, row, col, fx, fy, 3), knots)
@@ -97,6 +97,6 @@ def reflected_radiance(
         upper = _bilinear(table, base1, stride1, fx1, fy1, ch)
         narrow = lower + t * (upper - lower)
         light = narrow + share * (_bilinear(table, base2, stride2, fx2, fy2, ch) - narrow)
-        reflectance = transport[hit, 11 + ch] * scale + metal * bias + (_1 - metal) * dielectric
-        specular = (visible * light + blocked * transport[hit, 2 + ch]) * reflectance
-        out[ch] = (_1 - dielectric) * transport[hit, 8 + ch] + transport[hit, 5 + ch] + specular
+        reflectance = met.metal_colour[ch] * scale + metal * bias + (_1 - metal) * dielectric
+        specular = (visible * light + blocked * met.indirect[ch]) * reflectance
+        out[ch] = (_1 - dielectric) * met.diffuse[ch] + met.emission[ch] + specular

@@ -12,19 +12,26 @@ from benchmarks.ablation import RULES, SETTINGS, Row, markdown
 from benchmarks.csv_rows import read_rows, write_rows
 from gsbake.config.load import load_profile
 from gsbake.errors import UsageError
-from gsbake.materials.fit import MaterialFit
+from gsbake.materials.bake import BakeOptions
+from gsbake.materials.recipe import OPTIONAL
 
 ROW = Row("toy", "none", 0, "abc1234", "cpu", 60.0, 25.0, 26.0, 23.0, 24.0, 0.1, 0.2)
 
 
 @pytest.mark.parametrize("rule", [rule for rule in RULES if rule != "none"])
-def test_rules_are_taken_out_and_put_back(rule: str) -> None:
-    """A rule whose function is renamed is found here; settings are valid."""
-    before = MaterialFit.__dict__.get("_search_metals")
-    with RULES[rule]() as replaced:
-        assert (replaced is not None) != (rule in SETTINGS)
-    assert MaterialFit.__dict__.get("_search_metals") is before
+def test_rules_are_passes_or_settings(rule: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A pass that is renamed is found here; settings are valid."""
     load_profile("relight", [SETTINGS[rule]] if rule in SETTINGS else [])
+    assert (rule in SETTINGS) != (rule in OPTIONAL)
+    given: list[BakeOptions] = []
+    monkeypatch.setattr(
+        ablation, "finished_folders", lambda run: {stage: tmp_path for stage in ("ingest", "poses", "refine", "mesh", "bake")}
+    )
+    (tmp_path / "manifest.json").write_text('{"settings": {}}')
+    monkeypatch.setattr(ablation, "bake_textures", lambda *paths, seed: given.append(paths[-1]))
+    monkeypatch.setattr(ablation, "export_asset", lambda *_: None)
+    ablation.bake_without(rule, tmp_path, tmp_path / "out", 0)
+    assert given[0].without == ({rule} if rule in OPTIONAL else set())
 
 
 def test_a_rule_is_judged_on_the_objects_that_it_changes(tmp_path: Path) -> None:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from gsbake.materials.adjacency import neighbours
+from gsbake.materials.surface import neighbours
 from gsbake.texturing.texels import Texels, rasterise
 
 SIZE = 64

@@ -9,9 +9,10 @@ import pytest
 from numpy.typing import NDArray
 
 from gsbake.imaging.srgb import encode
-from gsbake.materials.adjacency import neighbours
 from gsbake.materials.base_color_noise import without_noise
 from gsbake.materials.linear_shading import PhotoSamples
+from gsbake.materials.materials import Materials
+from gsbake.materials.surface import neighbours
 from gsbake.texturing.texels import Texels, rasterise
 from tests.support.linear import linear
 
@@ -53,7 +54,8 @@ class Plate:
         return float(np.sqrt(np.square(encode(np.clip(base, 0, 1)) - encode(self.truth)).mean()))
 
     def filtered(self, metal: bool = True) -> NDArray[np.float64]:
-        return without_noise(self.photos, self.values, np.full(len(self.values), metal), self.texels, self.pairs)
+        materials = Materials(self.values[:, :3], self.values[:, 3], self.values[:, 4])
+        return without_noise(self.photos, materials, np.full(len(self.values), metal), self.texels, self.pairs)
 
 
 def test_noise_on_a_uniform_metal_is_taken_out() -> None:

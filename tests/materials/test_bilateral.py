@@ -9,8 +9,8 @@ import pytest
 from numpy.typing import NDArray
 
 from gsbake.imaging.srgb import encode
-from gsbake.materials.adjacency import neighbours
 from gsbake.materials.bilateral import FILTER_RADIUS, EdgeAwareFilter, Neighbourhoods
+from gsbake.materials.surface import neighbours
 from gsbake.texturing.texels import Texels, rasterise
 
 SIZE, SCALE = 64, 0.3
@@ -95,5 +95,7 @@ def test_near_neighbours_share_the_material_and_wide_ones_the_colour_of_photos()
     pairs = neighbours(texels, at, np.tile([0.0, 0.0, 1.0], (len(left), 1)))
     neighbourhoods = Neighbourhoods(texels, pairs, np.full((len(left), 3), 0.3))
     values = np.column_stack([np.full((len(left), 3), 0.3), np.where(left, 0.1, 0.9)]).astype(np.float32)
-    near, wide = (average(left.astype(float))[~left].mean() for average in (neighbourhoods.near(values), neighbourhoods.wide))
+    near, wide = (
+        average(left.astype(float))[~left].mean() for average in (neighbourhoods.near(values[:, :3], values[:, 3]), neighbourhoods.wide)
+    )
     assert near < 0.5 * wide

@@ -7,7 +7,7 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from gsbake.materials.delighting import MAX_ALBEDO, NOISE_FLOOR, Irradiance, find_irradiance, remove_shading
+from gsbake.materials.remaining_shading import MAX_ALBEDO, NOISE_FLOOR, Irradiance, find_irradiance, remove_shading
 
 Floats = NDArray[np.float64]
 

@@ -10,11 +10,11 @@ import torch
 from numba import set_num_threads
 
 from gsbake.materials import fit_kernel
-from gsbake.materials.fit_reference import Batch, photo_loss, prior_loss
-from gsbake.materials.photo_batch import FitStep, KernelTables, PhotoBatch, TexelInputs
-from gsbake.materials.pixels import Pixels
+from gsbake.materials.photo import Photo
+from gsbake.materials.shading import KernelTables, PhotoLights, ShadingStep, linear_samples
 from gsbake.shading.environment import EnvironmentLight
 from gsbake.shading.light_tables import LightTables
+from tests.materials.reference import Batch, Transport, photo_loss, prior_loss
 
 TEXELS, PIXELS = 300, 2000
 RESIDUAL_WEIGHT, ROBUST = 1.5, 0.1
@@ -28,21 +28,24 @@ class Case:
         unit = rng.normal(size=(TEXELS, 3))
         self.normal = (unit / np.linalg.norm(unit, axis=1, keepdims=True)).astype(np.float32)
         self.values = np.concatenate([rng.uniform(0.02, 0.98, (TEXELS, 5)), rng.normal(0, 0.1, (TEXELS, 3))], 1).astype(np.float32)
-        self.transport = rng.uniform(0, 1, (TEXELS, fit_kernel.TRANSPORT)).astype(np.float32)
-        self.transport[:, 2:14] *= 0.2
-        self.transport[:, 15:18] = self.normal[rng.permutation(TEXELS)]
-        texel = rng.integers(0, TEXELS, (PIXELS, 4))
+        self.transport = np.zeros(TEXELS, fit_kernel.TRANSPORT)
+        for name in fit_kernel.TRANSPORT.names or ():
+            high = 0.2 if name in ("indirect", "emission", "diffuse", "metal_colour") else 1
+            self.transport[name] = rng.uniform(0, high, self.transport[name].shape)
+        self.transport["normal"] = self.normal[rng.permutation(TEXELS)]
+        texel = rng.integers(0, TEXELS, (PIXELS, 4)).astype(np.int32)
         bilinear = rng.dirichlet(np.ones(4), PIXELS).astype(np.float32)
         bilinear[:50] = [1, 0, 0, 0]
         view = self.normal[texel[:, 0]] + rng.normal(0, 0.8, (PIXELS, 3))
         view /= np.linalg.norm(view, axis=1, keepdims=True)
-        reflected = np.where(rng.uniform(size=PIXELS) < 0.3, rng.integers(0, TEXELS, PIXELS), -1) if traced else None
-        self.pixels = Pixels(
-            texel, bilinear, view.astype(np.float32), rng.uniform(0, 1, (PIXELS, 3)).astype(np.float32),
-            rng.uniform(0, 1, PIXELS).astype(np.float32), np.zeros(PIXELS, np.int32), np.arange(PIXELS), reflected,
-        )  # fmt: skip
+        reflected = np.where(rng.uniform(size=PIXELS) < 0.3, rng.integers(0, TEXELS, PIXELS), -1) if traced else np.zeros(0)
+        self.photo = Photo(
+            texel, bilinear, np.zeros((PIXELS, 3), np.float32), view.astype(np.float32), rng.uniform(0, 1, (PIXELS, 3)).astype(np.float32),
+            rng.uniform(0, 1, PIXELS).astype(np.float32), np.zeros(PIXELS, np.int32), np.arange(PIXELS), reflected.astype(np.int32),
+        ).with_normals(self.normal)  # fmt: skip
         radiance = rng.uniform(0, 1, (6, 8, 8, 3)) ** 3
-        self.tables = EnvironmentLight.from_radiance(radiance.astype(np.float32)).prefilter().detach()
+        self.light = EnvironmentLight.from_radiance(radiance.astype(np.float32))
+        self.tables = self.light.prefilter().detach()
 
 
 def reference(case: Case) -> tuple[float, np.ndarray, np.ndarray]:
@@ -50,9 +53,9 @@ def reference(case: Case) -> tuple[float, np.ndarray, np.ndarray]:
     values = torch.tensor(case.values[:, :5], requires_grad=True)
     offset = torch.tensor(case.values[:, 5:], requires_grad=True)
     table = case.tables.table.clone().requires_grad_()
-    batch = Batch.of(case.pixels, torch.as_tensor(case.normal))
+    batch = Batch.of(case.photo)
     tables = LightTables(table, case.tables.layout)
-    loss = photo_loss(batch, values, offset, tables, torch.as_tensor(case.transport), RESIDUAL_WEIGHT, ROBUST)
+    loss = photo_loss(batch, values, offset, tables, Transport.of(case.transport), RESIDUAL_WEIGHT, ROBUST)
     loss.backward()
     assert values.grad is not None and offset.grad is not None and table.grad is not None
     return float(loss.detach()), torch.cat([values.grad, offset.grad], 1).numpy(), table.grad.numpy()
@@ -62,7 +65,7 @@ def reference(case: Case) -> tuple[float, np.ndarray, np.ndarray]:
 def test_loss_and_gradients(traced: bool) -> None:
     case = Case(1, traced)
     loss, texel_gradient, table_gradient = reference(case)
-    step, batch = FitStep(TEXELS), PhotoBatch.of(case.pixels, case.normal)
+    step, batch = ShadingStep(TEXELS), case.photo
     tables = KernelTables.of(case.tables)
     sums = step(batch, case.values, tables, case.transport, RESIDUAL_WEIGHT, ROBUST, 1 / PIXELS)
     assert sums[0] / PIXELS == pytest.approx(loss, rel=1e-4)
@@ -78,16 +81,17 @@ def test_object_as_bright_as_the_room_changes_nothing(traced: bool) -> None:
     case, level = Case(5, traced), 0.7
     tables = EnvironmentLight.from_radiance(np.full((6, 8, 8, 3), level, np.float32)).prefilter().detach()
     transport = np.zeros_like(case.transport)
-    occlusion = case.transport[:, :1] * 0.85  # at least so much is blocked that indirect light tells what blocks it
-    transport[:, :2], transport[:, 2:5], transport[:, 15:18] = occlusion, level * (1 - occlusion), case.normal
-    transport[:, 8:11] = level  # diffuse radiosity / π of a white object, whose specular layer reflects the same
+    occlusion = case.transport["visibility"] * 0.85  # at least so much is blocked that indirect light tells what blocks it
+    transport["visibility"] = transport["occlusion"] = occlusion
+    transport["indirect"], transport["normal"] = level * (1 - occlusion[:, None]), case.normal
+    transport["diffuse"] = level  # radiosity / π of a white object, whose specular layer reflects the same
     values = torch.tensor(case.values[:, :5])
-    batch = Batch.of(case.pixels, torch.as_tensor(case.normal))
-    shaded = batch.shade(values, torch.zeros(TEXELS, 3), tables, torch.as_tensor(transport))
+    batch = Batch.of(case.photo)
+    shaded = batch.shade(values, torch.zeros(TEXELS, 3), tables, Transport.of(transport))
     clear = np.zeros_like(transport)
-    clear[:, :2] = 1
-    alone = Batch.of(replace(case.pixels, reflected_texel=None), torch.as_tensor(case.normal))
-    torch.testing.assert_close(shaded, alone.shade(values, torch.zeros(TEXELS, 3), tables, torch.as_tensor(clear)), rtol=2e-3, atol=1e-3)
+    clear["visibility"] = clear["occlusion"] = 1
+    alone = Batch.of(replace(case.photo, reflected=np.zeros(0, np.int32)))
+    torch.testing.assert_close(shaded, alone.shade(values, torch.zeros(TEXELS, 3), tables, Transport.of(clear)), rtol=2e-3, atol=1e-3)
 
 
 def test_results_do_not_depend_on_threads() -> None:
@@ -95,9 +99,8 @@ def test_results_do_not_depend_on_threads() -> None:
     found = []
     for threads in (1, 2):
         set_num_threads(threads)
-        step = FitStep(TEXELS)
-        batch, tables = PhotoBatch.of(case.pixels, case.normal), KernelTables.of(case.tables)
-        sums = step(batch, case.values, tables, case.transport, RESIDUAL_WEIGHT, ROBUST, 1 / PIXELS)
+        step, tables = ShadingStep(TEXELS), KernelTables.of(case.tables)
+        sums = step(case.photo, case.values, tables, case.transport, RESIDUAL_WEIGHT, ROBUST, 1 / PIXELS)
         found.append((sums, step.gradient.copy(), step.table.copy()))
     for a, b in zip(*found, strict=True):
         np.testing.assert_array_equal(a, b)
@@ -105,18 +108,17 @@ def test_results_do_not_depend_on_threads() -> None:
 
 def test_linear_shading_is_the_shading_at_both_ends() -> None:
     case = Case(3, True)
-    batch = PhotoBatch.of(replace(case.pixels, bilinear=np.tile(np.array([1, 0, 0, 0], np.float32), (PIXELS, 1))), case.normal)
-    tables = KernelTables.of(case.tables)
-    samples = batch.samples(TexelInputs.of(case.values, case.transport), tables)
-    torch_batch = Batch.of(replace(case.pixels, bilinear=batch.bilinear), torch.as_tensor(case.normal))
+    photo = replace(case.photo, bilinear=np.tile(np.array([1, 0, 0, 0], np.float32), (PIXELS, 1))).with_normals(case.normal)
+    (samples,) = linear_samples([photo], case.values[:, 5:], case.transport, PhotoLights(case.light.radiance().detach()))
+    torch_batch = Batch.of(photo)
     rough = np.ascontiguousarray(case.values[:, 3])
     for metallic in (0.0, 1.0):
-        shading = samples.shade(rough, metallic)
+        shading = samples.shade(rough).of(metallic > 0)
         values = case.values[:, :5].copy()
         values[:, 4] = metallic
         inputs = torch.as_tensor(values), torch.as_tensor(case.values[:, 5:])
-        expected = torch_batch.shade(*inputs, case.tables, torch.as_tensor(case.transport))
-        base = case.values[batch.dominant_texel, :3]
+        expected = torch_batch.shade(*inputs, case.tables, Transport.of(case.transport))
+        base = case.values[photo.dominant_texel, :3]
         np.testing.assert_allclose(base * shading.slope + shading.offset, expected.numpy(), rtol=2e-3, atol=2e-4)
 
 

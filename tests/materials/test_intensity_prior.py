@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from scipy import integrate, stats
 
 from benchmarks.light_levels import mean_radiance, median_and_scale
 from gsbake.materials.intensity_prior import DIELECTRICS, METALS, RADIANCE, IntensityPrior
+from gsbake.materials.materials import Materials
 
 #: Normal reflectances, strongest channel (Lagarde & de Rousiers 2014, table 4; iron from the same course).
 PURE_METALS = {
@@ -53,15 +55,14 @@ def test_quantities_that_contradict_each_other_meet_between() -> None:
 
 
 def test_what_counts_of_an_object() -> None:
-    values = np.tile(np.float32([0.1, 0.3, 0.2, 0.5, 0.0]), (100, 1))
-    values[:40, :3], values[:40, 4] = [0.5, 0.7, 0.6], 1
-    dielectric = values[:, 4] < 0.3
+    metal = np.arange(100) < 40
+    base = np.where(metal[:, None], [0.5, 0.7, 0.6], [0.1, 0.3, 0.2])
+    materials = Materials(base, np.full(100, 0.5), metal.astype(float))
     light = np.full((6, 4, 4, 3), 0.9, np.float32)
-    assert IntensityPrior.of(values, dielectric, None) == IntensityPrior(pytest.approx(0.31), pytest.approx(0.7))
-    assert IntensityPrior.of(values, dielectric, light) == IntensityPrior(pytest.approx(0.31), pytest.approx(0.7), pytest.approx(0.9))
+    assert IntensityPrior.of(materials, ~metal, None) == IntensityPrior(pytest.approx(0.31), pytest.approx(0.7))
+    assert IntensityPrior.of(materials, ~metal, light) == IntensityPrior(pytest.approx(0.31), pytest.approx(0.7), pytest.approx(0.9))
     few = np.arange(100) < 4
-    values[:, 4] = np.where(few, 0, 1)
-    assert IntensityPrior.of(values, few, light).dielectrics is None  # too small a share
+    assert IntensityPrior.of(replace(materials, metallic=(~few).astype(float)), few, light).dielectrics is None  # too small a share
 
 
 def test_mean_radiance_weighs_by_solid_angle() -> None:

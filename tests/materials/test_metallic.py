@@ -9,7 +9,7 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from gsbake.materials.linear_shading import LinearShading, PhotoSamples, Shader
+from gsbake.materials.linear_shading import LinearParts, LinearShading, PhotoSamples, Shader
 from gsbake.materials.metallic import MIN_METAL_ALBEDO, MIN_PHOTOS, find_metals, majority_vote
 from gsbake.shading.environment import EnvironmentLight
 from gsbake.shading.split_sum import shade
@@ -169,9 +169,9 @@ def test_majority_vote_removes_isolated_texels() -> None:
 def brightened(shade: Shader, exposure: float) -> Shader:
     """The shading under a brighter light."""
 
-    def shaded(roughness: NDArray[np.float32], metallic: float) -> LinearShading:
-        shading = shade(roughness, metallic)
-        return LinearShading(exposure * shading.slope, exposure * shading.offset)
+    def shaded(roughness: NDArray[np.float32]) -> LinearParts:
+        parts = shade(roughness)
+        return LinearParts(*(LinearShading(exposure * kind.slope, exposure * kind.offset) for kind in (parts.dielectric, parts.metal)))
 
     return shaded
 

@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from gsbake.config.schema import Bake
 from gsbake.imaging.srgb import encode
-from gsbake.materials.fitting import FitSettings, _Fitting
-from gsbake.materials.levels import FitLevel
-from gsbake.materials.options import FitSchedule
-from gsbake.materials.pixels import Pixels
-from gsbake.materials.two_level_fit import FitPlan, compare_light_motions
+from gsbake.materials.fitting import _light_motions
+from gsbake.materials.passes import Scene
+from gsbake.materials.photo import Photo
+from gsbake.materials.recipe import MOTION_TRIAL
+from gsbake.materials.starts import MotionComparison
 from gsbake.shading.light_motion import Motion, light_rotations
-from tests.materials.test_fit import WEAK_PRIORS, Scene, cameras, room
+from tests.materials.test_fit import WEAK_PRIORS, Sphere, after, cameras, observed, room
 from tests.support.cameras import look_at
 from tests.support.recorder import Recorder
 from tests.support.slow import slow
@@ -25,28 +23,28 @@ COUNT = 12
 
 
 @pytest.fixture(scope="module", params=["turntable", slow("camera")])
-def moving(request: pytest.FixtureRequest) -> tuple[Motion, Scene]:
-    return request.param, Scene(0.25, COUNT, motion=request.param)
+def moving(request: pytest.FixtureRequest) -> tuple[Motion, Sphere]:
+    return request.param, Sphere(0.25, COUNT, motion=request.param)
 
 
-def under(scene: Scene, motion: Motion) -> list[Pixels]:
+def under(scene: Sphere, motion: Motion) -> list[Photo]:
     """The photos, explained by a light that moves so."""
     rotations = light_rotations(cameras(COUNT), motion)
     return scene.photos if rotations is None else [replace(p, to_light=r) for p, r in zip(scene.photos, rotations, strict=True)]
 
 
-def test_materials_are_recovered_under_a_moving_light(moving: tuple[Motion, Scene]) -> None:
+def test_materials_are_recovered_under_a_moving_light(moving: tuple[Motion, Sphere]) -> None:
     motion, scene = moving
     photos = under(scene, motion)
-    fitted = scene.fit(0.2).run(photos[2:], photos[:2], FitSchedule(300))
-    known = fitted.weight > 0.3
-    base_color, truth = fitted.values[known, :3], scene.base_color[known]
+    fitted = after(scene.start(0.2, photos, 2), 300)
+    known = observed(fitted)
+    base_color, truth = fitted.materials.base_color[known], scene.base_color[known]
     gain = (base_color * truth).sum(0) / (base_color**2).sum(0)
     assert np.abs(encode(base_color * gain) - encode(truth)).mean() < 0.06
-    assert np.abs(fitted.values[known, 3] - 0.25).mean() < 0.1
-    still = scene.fit(0.2).run(scene.photos[2:], scene.photos[:2], FitSchedule(300))
-    assert fitted.held_out_psnr is not None and still.held_out_psnr is not None
-    assert fitted.held_out_psnr > still.held_out_psnr + 3
+    assert np.abs(fitted.materials.roughness[known] - 0.25).mean() < 0.1
+    still = after(scene.start(0.2, held_out=2), 300)
+    assert fitted.psnr is not None and still.psnr is not None
+    assert fitted.psnr > still.psnr + 3
     # The light as the first photo sees it.
     direction = np.array([[0.8, 0.0, 0.6], [-0.8, 0.0, -0.6]])
     from gsbake.shading.cubemap import sample
@@ -55,28 +53,30 @@ def test_materials_are_recovered_under_a_moving_light(moving: tuple[Motion, Scen
     assert bright > 4 * dark and room(direction)[0, 0] > 4 * room(direction)[1, 0]
 
 
-def test_how_the_light_moves_is_found(moving: tuple[Motion, Scene]) -> None:
+def test_how_the_light_moves_is_found(moving: tuple[Motion, Sphere]) -> None:
     motion, scene = moving
     assert best_motion(scene) == motion
 
 
 def test_a_light_that_stands_is_found() -> None:
-    assert best_motion(Scene(0.25, COUNT)) == "static"
+    assert best_motion(Sphere(0.25, COUNT)) == "static"
 
 
 def test_a_turn_that_is_asked_for_and_not_there_is_said() -> None:
     """Cameras rolled at random have no common axis: the light stands, and the report does not say otherwise."""
     recorder = Recorder()
     rolled = [look_at(np.random.default_rng(k).normal(size=3) * 3, roll=2.3 * k) for k in range(9)]
-    fitting = SimpleNamespace(settings=FitSettings(Bake(light_motion="turntable")), cameras=rolled, monitor=recorder)
-    pixels = SimpleNamespace(under=lambda rotations: rotations)
-    assert _Fitting._under_moving_light(fitting, None, pixels, False) is None  # type: ignore[arg-type]
-    assert fitting.light_motion.motion == "static"
+    motion, choices = _light_motions(rolled, "turntable", recorder)
+    assert motion.motion == "static" and not choices
     assert any("do not turn about one axis" in text for text in recorder.warnings)
 
 
-def best_motion(scene: Scene) -> Motion:
+def best_motion(scene: Sphere) -> Motion:
     motions: tuple[Motion, ...] = ("static", "turntable", "camera")
-    levels = {m: FitLevel(scene.surface(), photos[2:], photos[:2]) for m in motions for photos in [under(scene, m)]}
-    found = compare_light_motions(levels, FitPlan(400, 16, WEAK_PRIORS), lambda *_: None)
-    return min(found, key=lambda motion: found[motion])
+    comparison = MotionComparison(MOTION_TRIAL)
+    context = Scene(WEAK_PRIORS, 400, 16, motions={motion: light_rotations(cameras(COUNT), motion) for motion in motions})
+    start = scene.start(0.5, held_out=2)
+    assert comparison.applies(context, start)
+    found = comparison.run(context, start)
+    assert found.level.moving == (found.light_motion.motion != "static")
+    return found.light_motion.motion

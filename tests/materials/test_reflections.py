@@ -12,20 +12,19 @@ from numpy.typing import NDArray
 from gsbake.config.schema import Bake
 from gsbake.geometry.raycast import RayCaster
 from gsbake.imaging.srgb import encode
-from gsbake.materials.adjacency import neighbours
-from gsbake.materials.fit import MaterialFit
 from gsbake.materials.fit_kernel import TRANSPORT
-from gsbake.materials.fit_reference import reflected_radiance
-from gsbake.materials.fit_surface import FitSurface
-from gsbake.materials.options import FitSchedule, Priors
-from gsbake.materials.photo_batch import EMISSION, METAL_COLOUR, METALLIC, NORMAL, OCCLUSION, ROUGHNESS
-from gsbake.materials.pixels import PixelReader, Pixels
-from gsbake.materials.reflections import ReflectionTracer
+from gsbake.materials.passes import Priors
+from gsbake.materials.photo import Photo, PhotoReader
+from gsbake.materials.recipe import COARSE
+from gsbake.materials.state import Level, State
+from gsbake.materials.surface import Surface, neighbours
 from gsbake.materials.visibility import Visibility
 from gsbake.shading.environment import EnvironmentLight
 from gsbake.shading.reflection_kernel import specular_visibility
 from gsbake.shading.split_sum import shade
 from gsbake.texturing.texels import rasterise
+from tests.materials.reference import Transport, reflected_radiance
+from tests.materials.test_fit import after, observed
 from tests.support.cameras import look_at
 from tests.support.split_sum import transmitted_share
 
@@ -46,16 +45,17 @@ class Corner:
         self.normal = np.where(self.floor[:, None], [0.0, 0, 1], [0.0, 1, 0])
         self.caster = RayCaster(self.vertices, self.faces, 1)
 
-    def read(self, k: int, traced: bool) -> Pixels:
+    def read(self, k: int, traced: bool) -> Photo:
         """The pixels of photo `k` of 16, black."""
         turn, high = np.pi / 2 + 1.1 * np.sin(2.4 * k), 0.3 + 0.7 * k / 16
         away = np.array([np.cos(turn) * np.cos(high), np.sin(turn) * np.cos(high), np.sin(high)])
         target = np.array([0, 0.7, 0.3])
         camera = look_at(target + 4 * away, target, size=64, focal=110)
-        pixels = PixelReader(self.caster, self.uv, self.texels, 3.0).read(camera, np.zeros((64, 64, 3), np.uint8), None)
-        return ReflectionTracer(self.caster, self.uv, self.texels, self.at, self.normal, 1e-3).trace(pixels) if traced else pixels
+        reader = PhotoReader(self.caster, self.uv, self.texels, self.normal, 3.0)
+        photo = reader.read(camera, np.zeros((64, 64, 3), np.uint8), None)
+        return reader.with_reflections(photo, self.at, 1e-3) if traced else photo
 
-    def mirrored(self, pixels: Pixels) -> tuple[NDArray[np.bool_], Doubles, Doubles]:
+    def mirrored(self, pixels: Photo) -> tuple[NDArray[np.bool_], Doubles, Doubles]:
         """Which pixels show mostly floor, where they are, and where the mirrored view meets the plane of the wall: by hand."""
         at = np.einsum("nk,nkd->nd", pixels.bilinear, self.at[pixels.texel])
         floor = np.einsum("nk,nk->n", pixels.bilinear, self.floor[pixels.texel]) > 0.99
@@ -73,13 +73,13 @@ def corner() -> Corner:
 @pytest.mark.parametrize("k", [0, 5, 11])
 def test_reflected_ray_hits_the_expected_texel(corner: Corner, k: int) -> None:
     pixels = corner.read(k, traced=True)
-    assert pixels.reflected_texel is not None
+    assert len(pixels.reflected) == len(pixels)
     floor, _, there = corner.mirrored(pixels)
     inside = floor & (np.abs(there[:, 0]) < 0.95) & (there[:, 2] < 0.95)
     outside = floor & ((np.abs(there[:, 0]) > 1.05) | (there[:, 2] > 1.05))
     assert inside.sum() > 30 and outside.sum() > 30
-    assert (pixels.reflected_texel[outside] == -1).all()
-    met = pixels.reflected_texel[inside]
+    assert (pixels.reflected[outside] == -1).all()
+    met = pixels.reflected[inside]
     assert (met >= 0).mean() > 0.97  # next to the wall a ray may start behind it
     met, there = met[met >= 0], there[inside][met >= 0]
     assert (~corner.floor[met]).all()
@@ -87,11 +87,9 @@ def test_reflected_ray_hits_the_expected_texel(corner: Corner, k: int) -> None:
 
 
 def test_untraced_pixels_have_no_reflected_texel(corner: Corner) -> None:
-    assert corner.read(0, traced=False).reflected_texel is None
-    traced = corner.read(0, traced=True)
-    assert traced.reflected_texel is not None
-    few = traced.subsampled(100)
-    assert few.reflected_texel is not None and len(few.reflected_texel) == len(few)
+    assert len(corner.read(0, traced=False).reflected) == 0
+    few = corner.read(0, traced=True).every(10)
+    assert 0 < len(few.reflected) == len(few)
 
 
 def test_reflection_does_not_change_base_colour(corner: Corner) -> None:
@@ -105,7 +103,7 @@ def test_reflection_does_not_change_base_colour(corner: Corner) -> None:
     irradiance = visible_share[:, None] * np.ones((1, 3), np.float32)
     irradiance = irradiance + visibility.indirect_irradiance(irradiance, base_color.astype(np.float32))
 
-    def photo(k: int, traced: bool) -> Pixels:
+    def photo(k: int, traced: bool) -> Photo:
         pixels = corner.read(k, traced)
         floor, _, there = corner.mirrored(pixels)
         blocked = floor & (np.abs(there[:, 0]) < 1) & (there[:, 2] < 1)
@@ -124,12 +122,12 @@ def test_reflection_does_not_change_base_colour(corner: Corner) -> None:
     def error(traced: bool) -> float:
         pairs = neighbours(corner.texels, corner.at, corner.normal)
         start = np.full((n, 3), 0.3)
-        surface = FitSurface(corner.texels, corner.at, pairs, corner.normal, visible_share, start, visibility)
-        fit = MaterialFit(surface, 8, Priors.of(Bake()), 0.2)
-        photos = [photo(k, traced) for k in range(16)]
-        fitted = fit.run(photos, [], FitSchedule(120, metal_searches_at=(), emission=False))
-        known = corner.floor & (fitted.weight > 0.3) & (corner.at[:, 1] < 0.8)
-        return float(np.abs(encode(fitted.values[known, :3]) - encode(base_color[known])).mean())
+        surface = Surface(corner.texels, corner.at, pairs, corner.normal, visible_share, start, visibility)
+        level = Level(surface, [photo(k, traced) for k in range(16)], [])
+        plan = replace(COARSE, normals=True, passes=COARSE.passes[1:2])  # the light
+        fitted = after(State.start(level, 8, 0.2), 120, plan, Priors.of(Bake()))
+        known = corner.floor & observed(fitted) & (corner.at[:, 1] < 0.8)
+        return float(np.abs(encode(fitted.materials.base_color[known]) - encode(base_color[known])).mean())
 
     assert error(True) < 0.7 * error(False)
 
@@ -137,11 +135,10 @@ def test_reflection_does_not_change_base_colour(corner: Corner) -> None:
 def test_a_reflected_mirror_shows_the_light_behind_the_viewer() -> None:
     """A ray that comes down onto a mirror at 45° leaves along +x: it carries F0 times the light from there, and what the texel emits."""
     light = EnvironmentLight.from_function(lambda at: np.repeat(np.where(at[:, :1] > 0.5, 2.0, 0.1), 3, 1), 32).prefilter().detach()
-    met = torch.zeros(1, TRANSPORT)
-    met[0, OCCLUSION], met[0, EMISSION], met[0, ROUGHNESS], met[0, METALLIC] = 1, torch.tensor([0, 0, 0.5]), 0.1, 1
-    met[0, METAL_COLOUR] = torch.tensor([0.9, 0.6, 0.3])
-    met[0, NORMAL] = torch.tensor([np.sqrt(0.5), 0, np.sqrt(0.5)])
-    found = reflected_radiance(met, torch.tensor([[0.0, 0, -1]]), light)[0]
+    met = np.zeros(1, TRANSPORT)
+    met["occlusion"], met["emission"], met["roughness"], met["metallic"] = 1, [0, 0, 0.5], 0.1, 1
+    met["metal_colour"], met["normal"] = [0.9, 0.6, 0.3], [np.sqrt(0.5), 0, np.sqrt(0.5)]
+    found = reflected_radiance(Transport.of(met), torch.tensor([[0.0, 0, -1]]), light)[0]
     fresnel = (1 - np.sqrt(0.5)) ** 5
     expected = [2 * (f0 + (1 - f0) * fresnel) + emitted for f0, emitted in ((0.9, 0), (0.6, 0), (0.3, 0.5))]
     assert found.tolist() == pytest.approx(expected, rel=0.03)

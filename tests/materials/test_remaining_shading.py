@@ -7,11 +7,11 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from gsbake.materials.delighting import harmonics
 from gsbake.materials.remaining_shading import (
     CHROMATICITY_SCALE,
     CHUNKS,
     NOISE_FLOOR,
+    harmonics,
     normal_equations,
     remaining_shading,
     with_irradiance_factor,

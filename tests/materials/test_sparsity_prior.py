@@ -9,9 +9,10 @@ import pytest
 from numpy.typing import NDArray
 
 from gsbake.imaging.srgb import decode, encode
-from gsbake.materials.options import FitSchedule, Priors
+from gsbake.materials.materials import Materials
+from gsbake.materials.passes import Priors
 from gsbake.materials.sparsity_prior import KERNEL_WIDTHS, METAL_THRESHOLD, common_materials, mean_shift
-from tests.materials.test_fit import WEAK_PRIORS, Scene
+from tests.materials.test_fit import WEAK_PRIORS, Sphere, after, observed
 
 WIDTHS = (0.03, 0.05)
 
@@ -50,24 +51,21 @@ def test_mean_shift_of_no_point_and_one() -> None:
 
 
 def test_metals_and_dielectrics_are_separate_and_excluded_texels_stay() -> None:
-    values = np.zeros((300, 5), np.float32)
-    values[:, :3] = decode(np.full((300, 3), 0.5))
-    values[:100, 4], values[100:, 3] = METAL_THRESHOLD, 0.1
-    values[100:200, :3] = decode(np.full((100, 3), 0.52))
-    values[200:, :3] = decode(np.full((100, 3), 0.54))
-    included = np.arange(300) < 200
-    found = common_materials(values, included)
+    base = decode(np.repeat([0.5, 0.52, 0.54], 100)[:, None] * np.ones(3)).astype(np.float32)
+    index = np.arange(300)
+    roughness, metallic = np.where(index < 100, 0, 0.1).astype(np.float32), np.where(index < 100, METAL_THRESHOLD, 0).astype(np.float32)
+    found = common_materials(Materials(base, roughness, metallic), index < 200)
     np.testing.assert_allclose(found[:100], [[0.5, 0.5, 0.5, 0.0]] * 100, atol=1e-3)
-    np.testing.assert_allclose(found[100:], np.column_stack([encode(values[100:, :3]), values[100:, 3]]), atol=1e-3)
+    np.testing.assert_allclose(found[100:], np.column_stack([encode(base[100:]), roughness[100:]]), atol=1e-3)
     assert len(KERNEL_WIDTHS) == found.shape[1]
 
 
 @pytest.fixture(scope="module")
-def glossy() -> Scene:
-    return Scene(0.25)
+def glossy() -> Sphere:
+    return Sphere(0.25)
 
 
-def with_stains(scene: Scene, size: float) -> Scene:
+def with_stains(scene: Sphere, size: float) -> Sphere:
     """The scene with a smooth error of brightness in every photo, as from misplaced reflections."""
     random = np.random.default_rng(0)
     photos = []
@@ -75,35 +73,36 @@ def with_stains(scene: Scene, size: float) -> Scene:
         wave = sum(random.normal() * np.sin(random.normal(0, 6, 3) @ scene.normal.T + random.uniform(0, 6)) for _ in range(4))
         off = np.einsum("nk,nk->n", p.bilinear, np.asarray(wave)[p.texel])
         photos.append(replace(p, colour=np.clip(p.colour + size * off[:, None], 0, 1).astype(np.float32)))
-    other = Scene.__new__(Scene)
+    other = Sphere.__new__(Sphere)
     other.texels, other.normal, other.base_color, other.photos = scene.texels, scene.normal, scene.base_color, photos
     return other
 
 
-def colour_deviation(scene: Scene, priors: Priors) -> float:
+def colour_deviation(scene: Sphere, priors: Priors) -> float:
     """Median deviation (sRGB) of observed texels from the median of their base colour, mean of both base colours."""
-    fitted = scene.fit(0.2, priors).run(scene.photos, [], FitSchedule(200))
-    known = fitted.weight > 0.3
+    fitted = after(scene.start(0.2), 200, priors=priors)
+    known = observed(fitted)
     red = scene.base_color[:, 0] > 0.3
-    shown = encode(fitted.values[:, :3])
+    shown = encode(fitted.materials.base_color)
     off = [shown[known & kind] - np.median(shown[known & kind], 0) for kind in (red, ~red)]
     return float(np.mean([np.median(np.abs(o)) for o in off]))
 
 
-def test_prior_removes_stains(glossy: Scene) -> None:
+def test_prior_removes_stains(glossy: Sphere) -> None:
     stained = with_stains(glossy, 0.04)
     assert colour_deviation(stained, WEAK_PRIORS) < 0.5 * colour_deviation(stained, replace(WEAK_PRIORS, sparsity=0.0))
 
 
 @pytest.mark.slow
 def test_continuous_base_colours_stay() -> None:
-    scene = Scene(0.8, even=True)
+    scene = Sphere(0.8, even=True)
     truth = encode(scene.base_color)
 
     def error(priors: Priors) -> float:
-        fitted = scene.fit(0.8, priors).run(scene.photos, [], FitSchedule(200, diffuse=True))
-        known = fitted.weight > 0.3
-        gain = (fitted.values[known, :3] * scene.base_color[known]).sum(0) / (fitted.values[known, :3] ** 2).sum(0)
-        return float(np.abs(encode(fitted.values[known, :3] * gain) - truth[known]).mean())
+        fitted = after(scene.start(0.8), 200, priors=priors, diffuse=True)
+        known = observed(fitted)
+        base = fitted.materials.base_color[known]
+        gain = (base * scene.base_color[known]).sum(0) / (base**2).sum(0)
+        return float(np.abs(encode(base * gain) - truth[known]).mean())
 
     assert error(WEAK_PRIORS) < error(replace(WEAK_PRIORS, sparsity=0.0)) < 0.05

@@ -13,16 +13,16 @@ from numpy.typing import NDArray
 from gsbake.config.schema import Bake
 from gsbake.geometry.raycast import RayCaster
 from gsbake.imaging.srgb import encode
-from gsbake.materials.adjacency import neighbours
-from gsbake.materials.fit import MaterialFit
-from gsbake.materials.fit_model import FitState
-from gsbake.materials.fit_surface import FitSurface
-from gsbake.materials.options import FitSchedule, Priors
-from gsbake.materials.pixels import PixelReader, Pixels
+from gsbake.materials.passes import Priors
+from gsbake.materials.photo import Photo, PhotoReader
+from gsbake.materials.recipe import COARSE
+from gsbake.materials.state import Level, State
+from gsbake.materials.surface import Surface, neighbours
 from gsbake.materials.visibility import ROTATIONS, Visibility, directions, unoccluded_irradiance
 from gsbake.shading import cubemap
 from gsbake.shading.environment import EnvironmentLight
 from gsbake.texturing.texels import Texels, rasterise
+from tests.materials.test_fit import after, observed
 from tests.support.cameras import look_at
 from tests.support.monte_carlo import render
 from tests.support.split_sum import transmitted_share
@@ -197,7 +197,7 @@ class Tray:
                 gained[start] += self.base_color[met] * irradiance[met] / rounds
             irradiance = direct + gained
         self.inside, self.cube, self.slot, self.diffuse = self.box.quad < 5, cube, slot, self.base_color * irradiance
-        reader = PixelReader(self.box.caster, self.box.uv, texels, 4.0)
+        reader = PhotoReader(self.box.caster, self.box.uv, texels, normal, 4.0)
         self.photos = [self.photo(reader, k) for k in range(12)]
 
     def incident(self, point: Doubles, ray: Doubles) -> Doubles:
@@ -209,7 +209,7 @@ class Tray:
         radiance[hits.hit] = self.diffuse[self.slot[row * self.box.texels.size + column]]
         return radiance
 
-    def photo(self, reader: PixelReader, k: int) -> Pixels:
+    def photo(self, reader: PhotoReader, k: int) -> Photo:
         turn, high = 2.4 * k, 0.3 + 1.1 * k / 12
         centre = 5 * np.array([np.cos(turn) * np.cos(high), np.sin(turn) * np.cos(high), np.sin(high)])
         blank = reader.read(look_at(centre, size=64, focal=100), np.zeros((64, 64, 3), np.uint8), None)
@@ -231,15 +231,16 @@ class Tray:
         ambient = np.ones(len(texels)) if visibility is None else visibility.visible_share(WHITE)
         start = np.full((len(texels), 3), 0.4)
         pairs = neighbours(texels, self.box.at, self.box.normal)
-        surface = FitSurface(texels, self.box.at, pairs, self.box.normal, ambient, start, visibility, indirect)
-        fit = MaterialFit(surface, 32, priors, 0.5)
-        values = np.column_stack([start, np.tile([0.5, 0.05], (len(start), 1))]).astype(np.float32)
-        fit.restore(FitState(values, self.cube.reshape(6, 32, 32, 3)), self.photos)
-        fitted = fit.run(self.photos, [], FitSchedule(300, light_searches_at=(), fixed_light=True))
-        known = fitted.weight > 0.3
-        gain = (fitted.values[known, :3] * self.base_color[known]).sum(0) / (fitted.values[known, :3] ** 2).sum(0)
+        surface = Surface(texels, self.box.at, pairs, self.box.normal, ambient, start, visibility, indirect)
+        light = EnvironmentLight.from_radiance(self.cube.reshape(6, 32, 32, 3))
+        state = State.start(Level(surface, self.photos, []), 32, 0.5).with_light(light).with_transport()
+        passes = (COARSE.passes[0], COARSE.passes[2])  # emission and metals
+        fitted = after(replace(state, light_given=True), 300, replace(COARSE, normals=True, passes=passes), priors)
+        known = observed(fitted)
+        base = fitted.materials.base_color
+        gain = (base[known] * self.base_color[known]).sum(0) / (base[known] ** 2).sum(0)
         known &= self.inside
-        return float(np.abs(encode(fitted.values[known, :3] * gain) - encode(self.base_color[known])).mean())
+        return float(np.abs(encode(base[known] * gain) - encode(self.base_color[known])).mean())
 
 
 def test_shadows_and_indirect_light_stay_out_of_base_colour() -> None:

@@ -10,24 +10,15 @@ texel that it hits replaces the environment: its diffuse radiosity, its emission
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from gsbake.imaging.srgb_torch import linear_to_srgb
-from gsbake.materials.photo_batch import (
-    DIFFUSE,
-    EMISSION,
-    INDIRECT,
-    LOCAL,
-    METAL_COLOUR,
-    METALLIC,
-    NORMAL,
-    OCCLUSION,
-    ROUGHNESS,
-    VISIBILITY,
-)
-from gsbake.materials.pixels import Pixels
+from gsbake.materials.photo import Photo
+from gsbake.materials.shading import Records
 from gsbake.shading import brdf
 from gsbake.shading.light_tables import LightTables
 from gsbake.shading.reflection_kernel import MIN_BLOCKED
@@ -42,20 +33,38 @@ from gsbake.shading.split_sum import (
 )
 
 
-@dataclass(frozen=True)
-class PixelTransport:
-    """Light transport at n pixels: `local` (n, 8), the columns up to `EMISSION`; where reflections were traced, which are `blocked` (n,)
-    by the object, the `rows` (k,) of these and the transport `met` (k, TRANSPORT) of the texels that their reflected rays meet."""
+class Transport(NamedTuple):
+    """Light transport of n texels or pixels, fields as in `fit_kernel.TRANSPORT`."""
 
-    local: Tensor
-    blocked: Tensor | None
-    rows: Tensor | None
-    met: Tensor | None
+    visibility: Tensor
+    occlusion: Tensor
+    indirect: Tensor
+    emission: Tensor
+    diffuse: Tensor
+    metal_colour: Tensor
+    roughness: Tensor
+    normal: Tensor
+    metallic: Tensor
+
+    @classmethod
+    def of(cls, records: Records) -> Transport:
+        """The fields of `records` (n,)."""
+        return cls(*(torch.as_tensor(np.ascontiguousarray(records[name])) for name in cls._fields))
+
+    def rows(self, index: Tensor) -> Transport:
+        """Those of some texels."""
+        return Transport(*(field[index] for field in self))
+
+    def interpolated(self, texel: Tensor, bilinear: Tensor) -> Transport:
+        """Those at pixels with the taps `texel` (n, 4) and weights `bilinear` (n, 4)."""
+        columns = (field if field.ndim == 2 else field[:, None] for field in self)
+        found = (_interpolate(column, texel, bilinear) for column in columns)
+        return Transport(*(column if field.ndim == 2 else column[:, 0] for column, field in zip(found, self, strict=True)))
 
 
 @dataclass(frozen=True)
 class Batch:
-    """The n pixels of one photo as tensors, fields as in `Pixels`, with the mesh's `normal` (n, 3) there, of any length."""
+    """The n pixels of one photo as tensors, fields as in `Photo`."""
 
     texel: Tensor
     bilinear: Tensor
@@ -63,75 +72,63 @@ class Batch:
     colour: Tensor
     weight: Tensor
     normal: Tensor
-    reflected_texel: Tensor | None
+    reflected: Tensor
 
     @classmethod
-    def of(cls, pixels: Pixels, normal: Tensor) -> Batch:
-        """The `pixels` of a photo on a mesh whose texels have the `normal` (texels, 3)."""
-        texel, bilinear = torch.as_tensor(pixels.texel), torch.as_tensor(pixels.bilinear)
-        view, colour, weight = (torch.as_tensor(x) for x in (pixels.view, pixels.colour, pixels.weight))
-        reflected = None if pixels.reflected_texel is None else torch.as_tensor(pixels.reflected_texel)
-        return cls(texel, bilinear, view, colour, weight, _interpolate(normal, texel, bilinear), reflected)
+    def of(cls, photo: Photo) -> Batch:
+        """The pixels of a `photo`."""
+        parts = photo.bilinear, photo.view, photo.colour, photo.weight, photo.normal
+        return cls(torch.as_tensor(photo.texel).long(), *map(torch.as_tensor, parts), torch.as_tensor(photo.reflected).long())
 
-    def shade(self, values: Tensor, normal_offset: Tensor, tables: LightTables, transport: Tensor) -> Tensor:
-        """Linear colours (n, 3) of the pixels for texels with material `values` (texels, 5) and light `transport` (texels, TRANSPORT)."""
+    def shade(self, values: Tensor, normal_offset: Tensor, tables: LightTables, transport: Transport) -> Tensor:
+        """Linear colours (n, 3) of the pixels for texels with material `values` (texels, 5) and light `transport`."""
         metal = values[:, 4:]
         parameters = torch.cat([(1 - metal) * values[:, :3], metal * values[:, :3], values[:, 3:]], 1)
         g = _interpolate(parameters, self.texel, self.bilinear)
         albedo, metal_colour, roughness, metallic = g[:, :3], g[:, 3:6], g[:, 6], g[:, 7]
-        surface, at = unit(self._normals(normal_offset)), self._transport(transport)
+        surface, at = unit(self._normals(normal_offset)), transport.interpolated(self.texel, self.bilinear)
         split = brdf.split_sum(soft_cosine((surface * self.view).sum(1)), roughness)
-        diffuse = at.local[:, VISIBILITY, None] * tables.diffuse(surface) + at.local[:, INDIRECT]
-        near = self._near_light(surface, roughness.detach(), split, tables, at)
+        diffuse = at.visibility[:, None] * tables.diffuse(surface) + at.indirect
+        near = self._near_light(surface, roughness.detach(), split, tables, at, transport)
         light = near + split.share[:, None] * (diffuse - near)
         below = albedo * (1 - split.dielectric[:, None]) * diffuse
-        return below + light * reflectance(split, metal_colour, metallic) + at.local[:, EMISSION]
+        return below + light * reflectance(split, metal_colour, metallic) + at.emission
 
     def _near_light(
-        self, surface: Tensor, roughness: Tensor, split: brdf.SplitSum, tables: LightTables, transport: PixelTransport
+        self, surface: Tensor, roughness: Tensor, split: brdf.SplitSum, tables: LightTables, at: Transport, texels: Transport
     ) -> Tensor:
-        """Light (n, 3) in the prefiltered lobe of unit normals: environment, object around, and what traced rays meet. Gradients go through
-        the environment alone."""
-        occlusion = transport.local[:, OCCLUSION]
-        ambient = specular_occlusion(surface, self.view, roughness, occlusion)
-        around = ((1 - ambient) / (1 - occlusion).clamp_min(MIN_BLOCKED))[:, None] * transport.local[:, INDIRECT]
+        """Light (n, 3) in the prefiltered lobe of unit normals: environment, object around, and what traced rays meet of the `texels`.
+        Gradients go through the environment alone."""
+        ambient = specular_occlusion(surface, self.view, roughness, at.occlusion)
+        around = ((1 - ambient) / (1 - at.occlusion).clamp_min(MIN_BLOCKED))[:, None] * at.indirect
         environment = prefiltered_light(surface, self.view, split, tables)
-        if transport.blocked is None or transport.rows is None or transport.met is None:
+        if not len(self.reflected):
             return ambient[:, None] * environment + around
-        mirror = mirror_weight(roughness)[:, None]
-        at, facing = transport.rows, surface.detach()[transport.rows]
-        ray = 2 * (facing * self.view[at]).sum(1, keepdim=True) * facing - self.view[at]
-        met = torch.zeros_like(around).index_copy(0, at, reflected_radiance(transport.met, ray, tables))
-        open_share = torch.where(transport.blocked[:, None], 0.0, mirror) + (1 - mirror) * ambient[:, None]
+        mirror, blocked = mirror_weight(roughness)[:, None], self.reflected >= 0
+        rows = torch.nonzero(blocked)[:, 0]
+        facing = surface.detach()[rows]
+        ray = 2 * (facing * self.view[rows]).sum(1, keepdim=True) * facing - self.view[rows]
+        met = torch.zeros_like(around).index_copy(0, rows, reflected_radiance(texels.rows(self.reflected[rows]), ray, tables))
+        open_share = torch.where(blocked[:, None], 0.0, mirror) + (1 - mirror) * ambient[:, None]
         return open_share * environment + (1 - mirror) * around + mirror * met
 
     def _normals(self, normal_offset: Tensor) -> Tensor:
         """Shading normals (n, 3) of the pixels, of any length, with the texels' `normal_offset` (texels, 3)."""
         return self.normal + _interpolate(normal_offset, self.texel, self.bilinear)
 
-    def _transport(self, transport: Tensor) -> PixelTransport:
-        """Light transport at each pixel from that of the texels (texels, TRANSPORT)."""
-        local = _interpolate(transport[:, LOCAL], self.texel, self.bilinear)
-        if self.reflected_texel is None:
-            return PixelTransport(local, None, None, None)
-        blocked = self.reflected_texel >= 0
-        rows = torch.nonzero(blocked)[:, 0]
-        return PixelTransport(local, blocked, rows, transport[self.reflected_texel[rows]])
-
 
 @torch.no_grad()
-def reflected_radiance(met: Tensor, ray: Tensor, tables: LightTables) -> Tensor:
-    """Radiance (k, 3) that surfaces with light transport `met` (k, TRANSPORT) send against the unit `ray` (k, 3) that meets each.
+def reflected_radiance(met: Transport, ray: Tensor, tables: LightTables) -> Tensor:
+    """Radiance (k, 3) that surfaces with light transport `met` (k,) send against the unit `ray` (k, 3) that meets each.
 
     Of what blocks their specular lobe the mean radiance counts, which their indirect light tells.
     """
-    normal, roughness, occlusion = met[:, NORMAL], met[:, ROUGHNESS], met[:, OCCLUSION]
-    split = brdf.split_sum(soft_cosine(-(normal * ray).sum(1)), roughness)
-    visible = specular_occlusion(normal, -ray, roughness, occlusion)
-    blocked = ((1 - visible) / (1 - occlusion).clamp_min(MIN_BLOCKED))[:, None] * met[:, INDIRECT]
-    light = visible[:, None] * specular_light(normal, -ray, split, tables, tables.diffuse(normal)) + blocked
-    specular = light * reflectance(split, met[:, METAL_COLOUR], met[:, METALLIC])
-    return (1 - split.dielectric[:, None]) * met[:, DIFFUSE] + met[:, EMISSION] + specular
+    split = brdf.split_sum(soft_cosine(-(met.normal * ray).sum(1)), met.roughness)
+    visible = specular_occlusion(met.normal, -ray, met.roughness, met.occlusion)
+    blocked = ((1 - visible) / (1 - met.occlusion).clamp_min(MIN_BLOCKED))[:, None] * met.indirect
+    light = visible[:, None] * specular_light(met.normal, -ray, split, tables, tables.diffuse(met.normal)) + blocked
+    specular = light * reflectance(split, met.metal_colour, met.metallic)
+    return (1 - split.dielectric[:, None]) * met.diffuse + met.emission + specular
 
 
 def _interpolate(values: Tensor, texel: Tensor, bilinear: Tensor) -> Tensor:
@@ -141,7 +138,7 @@ def _interpolate(values: Tensor, texel: Tensor, bilinear: Tensor) -> Tensor:
 
 
 def photo_loss(
-    batch: Batch, values: Tensor, normal_offset: Tensor, tables: LightTables, transport: Tensor, residual_weight: float, robust: float
+    batch: Batch, values: Tensor, normal_offset: Tensor, tables: LightTables, transport: Transport, residual_weight: float, robust: float
 ) -> Tensor:
     """Mean weighted pseudo-Huber error of the pixels in sRGB, for texels with material `values` (texels, 5)."""
     # Clamped: a reflection brighter than white that the photo does not show has no gradient; it is misplaced rather than too bright.
