@@ -16,14 +16,17 @@ from gsbake.cli.options import (
     Device,
     DeviceOption,
     DryRunOption,
+    FrontOption,
     InvertOption,
     JsonOption,
     KnownDistanceOption,
+    LeaveOutOption,
     LevelsOption,
     MarkerSizeOption,
     MasksOption,
     MovedOption,
     Options,
+    OriginOption,
     OutOption,
     OverwriteOption,
     PhotosArgument,
@@ -37,11 +40,14 @@ from gsbake.cli.options import (
     StoreOption,
     TargetOption,
     ThreadsOption,
+    UnsetOption,
+    UpOption,
     VerboseOption,
     ViewOption,
     complete_profile,
     complete_stage,
     given_path,
+    placement_settings,
     scale_settings,
     target_settings,
 )
@@ -105,8 +111,12 @@ def _pipeline_command(until: str | None) -> Callable[..., None]:
         dry_run: DryRunOption = False,
         view: ViewOption = False,
         require: RequireOption = None,
+        up: UpOption = None,
+        front: FrontOption = None,
+        origin: OriginOption = None,
         masks: MasksOption = None,
         invert_masks: InvertOption = False,
+        leave_out: LeaveOutOption = None,
         poses: PosesOption = None,
         moved: MovedOption = False,
         region: RegionOption = None,
@@ -124,7 +134,8 @@ def _pipeline_command(until: str | None) -> Callable[..., None]:
 
         mask_settings = (*(masks.settings if masks else ()), *(INVERTED if invert_masks else ()))
         photo_settings = (*mask_settings, *(region or ()), *scale_settings(known_distances, marker_size))
-        settings = [*(overrides or []), *photo_settings, *target_settings(targets, levels)]
+        placement = (*(up or ()), *placement_settings(leave_out, front, origin))
+        settings = [*(overrides or []), *photo_settings, *placement, *target_settings(targets, levels)]
         options = Options(
             photos=photos, out=out, profile=profile, overrides=settings,
             masks=masks.folder if masks else None, poses=poses, device=device.value, threads=threads, seed=seed,
@@ -161,6 +172,44 @@ def status_command(
             photos=photos, out=out, profile=profile, overrides=overrides or [], device=device.value, seed=seed, quiet=quiet,
             as_json=as_json, moved=moved,
         )
+    )  # fmt: skip
+
+
+@command(app, "settings", Panel.EDIT)
+def settings_command(
+    photos: PhotosArgument = None,
+    out: OutOption = None,
+    profile: ProfileOption = None,
+    targets: TargetOption = None,
+    levels: LevelsOption = None,
+    overrides: SetOption = None,
+    unset: UnsetOption = None,
+    up: UpOption = None,
+    front: FrontOption = None,
+    origin: OriginOption = None,
+    masks: MasksOption = None,
+    leave_out: LeaveOutOption = None,
+    poses: PosesOption = None,
+    moved: MovedOption = False,
+    region: RegionOption = None,
+    known_distances: KnownDistanceOption = None,
+    marker_size: MarkerSizeOption = None,
+    seed: SeedOption = None,
+    quiet: QuietOption = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Store settings in the output folder for its next run; nothing is run."""
+    from gsbake.cli.settings import settings
+
+    photo_settings = (*(masks.settings if masks else ()), *(region or ()), *scale_settings(known_distances, marker_size))
+    placement = (*(up or ()), *placement_settings(leave_out, front, origin))
+    given = [*(overrides or []), *photo_settings, *placement, *target_settings(targets, levels)]
+    settings(
+        Options(
+            photos=photos, out=out, profile=profile, overrides=given, masks=masks.folder if masks else None, poses=poses, seed=seed,
+            moved=moved, quiet=quiet, as_json=as_json,
+        ),
+        frozenset(unset or ()),
     )  # fmt: skip
 
 
