@@ -264,6 +264,20 @@ def check_command(
     check(photos, masks.folder if masks else None, poses, threads, as_json)
 
 
+@command(app, "studio", Panel.MAKE)
+def studio_command(
+    folder: Annotated[
+        Path, typer.Argument(parser=given_path, metavar="FOLDER", help="Folder of captures.  [default: .]", show_default=False)
+    ] = Path("."),
+    port: Annotated[int, typer.Option("--port", min=0, max=65_535, help="Port on 127.0.0.1; 0: a free one.", show_default=False)] = 0,
+    browser: Annotated[bool, typer.Option("--browser/--no-browser", help="Open the page in the browser.")] = True,
+) -> None:
+    """Serve a page on this machine that does all of this with eyes and a mouse: captures, photos, masks, set-up, runs, assets."""
+    from gsbake.cli.studio import studio
+
+    studio(folder, port, browser=browser)
+
+
 @command(app, "masks", Panel.EDIT)
 def masks_command(
     folder: Annotated[Path, typer.Argument(parser=given_path, metavar="DIR", help="New folder for the masks.", show_default=False)],

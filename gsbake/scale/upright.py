@@ -38,6 +38,7 @@ def measure_rotation(ingest: Path, posed: PosedPhotos, surfels: Path, export: Ex
     BadInputError for points that determine no axis.
     """
     up: str = export.up
+    axis: Array | None
     if export.up_points:
         up = "points"
         centres = posed.cameras.to_world.apply(np.stack([camera.centre for camera in posed.cameras.cameras]))

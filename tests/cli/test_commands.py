@@ -296,8 +296,8 @@ def test_help_groups_commands_and_options_in_panels(run: Run) -> None:
     assert titles == ["Make", "Inspect", "Edit", "Many captures", "Files", "Single stages", "Options"]
     panels = dict(zip(titles, re.split(r"(?m)^\S.*:$", text)[1:], strict=True))
     listed = {title: re.findall(r"(?m)^  ([a-z]+) ", panels[title]) for title in titles[:-1]}
-    assert listed["Make"] == ["run", "check", "synth"] and listed["Many captures"] == ["plan", "batch", "cache"]
-    assert listed["Single stages"] == list(ORDER) and sum(map(len, listed.values())) == 25
+    assert listed["Make"] == ["run", "check", "studio", "synth"] and listed["Many captures"] == ["plan", "batch", "cache"]
+    assert listed["Single stages"] == list(ORDER) and sum(map(len, listed.values())) == 27
     assert "..." not in re.sub(r"\[ARGS\]\.\.\.", "", text)  # no sentence is cut
     for command in ("run", "mesh"):
         options = run(command, "--help").out
