@@ -32,8 +32,9 @@ Bytes = NDArray[np.uint8]
 MASKS = "masks"
 #: File in the cache with the digests of the masks that the studio wrote.
 WRITTEN = "masks.json"
-#: Longer side in pixels at which GrabCut works, its iterations, and how far beyond a stroke it looks, as a share of the stroke's box.
-CUT_SIZE, CUT_STEPS, CUT_MARGIN = 640, 4, 0.75
+#: Longer side in pixels at which GrabCut works, its iterations, and how far beyond a stroke it looks: a share of the stroke's longer side, and
+#: one of the picture's.
+CUT_SIZE, CUT_STEPS, CUT_MARGIN, CUT_ROOM = 640, 4, 1.0, 0.12
 #: Deflate level of masks on their way to the page.
 LEVEL = 1
 
@@ -112,11 +113,8 @@ def grab_cut(photo: Bytes, mask: Bytes, inside: NDArray[np.bool_], outside: NDAr
     rows, columns = np.nonzero(inside | outside)
     if not len(rows):
         raise UsageError("There is no stroke; draw one over the part that the mask lacks, or has too much.")
-    box = []
-    for at, most in ((rows, mask.shape[0]), (columns, mask.shape[1])):
-        low, high = int(at.min()), int(at.max()) + 1
-        margin = int(CUT_MARGIN * (high - low)) + max(mask.shape) // 16
-        box.append(slice(max(low - margin, 0), min(high + margin, most)))
+    margin = int(CUT_MARGIN * max(np.ptp(rows), np.ptp(columns)) + CUT_ROOM * max(mask.shape)) + 1
+    box = [slice(max(int(at.min()) - margin, 0), int(at.max()) + margin) for at in (rows, columns)]
     window = tuple(box)
     height, width = mask[window].shape
     scale = min(1.0, CUT_SIZE / max(height, width))

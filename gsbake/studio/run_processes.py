@@ -18,6 +18,8 @@ from gsbake.studio.sessions import session_of
 from gsbake.studio.workspace import Capture, NotFoundError
 from gsbake.system.processes import start_apart
 
+#: Seconds in which a run that has told its end exits.
+LAST_SECONDS = 0.5
 #: Bytes of the error output that is looked at for the reason of a run that did not start.
 _TAIL = 4000
 
@@ -85,6 +87,15 @@ class Runs:
         if source is None or last is None:
             raise NotFoundError(f"There is no picture of {capture.name} yet.")
         return last[1]
+
+    def close(self) -> None:
+        """Let go of the processes; those that run go on."""
+        with self._lock:
+            for child, errors in self._started.values():
+                with suppress(subprocess.TimeoutExpired):  # it may be about to end
+                    child.wait(LAST_SECONDS)
+                errors.close()
+            self._started.clear()
 
     def _starting(self, capture: Capture) -> bool:
         known = self._started.get(capture.name)

@@ -92,5 +92,6 @@ class Services:
     def close(self) -> None:
         """End processes of this server; runs go on."""
         self.images.close()
+        self.runs.close()
         self.checks.close()
         self.views.close()

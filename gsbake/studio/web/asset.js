@@ -6,6 +6,7 @@ import { t } from "./strings.js";
 
 let loading = null;
 const viewerScript = () => (loading ||= new Promise((done, fail) => {
+  delete window.__THREE__; // the viewer has a three.js of its own, and would warn of two
   document.head.append(Object.assign(document.createElement("script"), { src: "/web/vendor/model-viewer.min.js", onload: done, onerror: () => fail(new Error(t.offline)) }));
 }));
 

@@ -4,7 +4,6 @@ import * as commands from "./commands.js";
 import { action, choice, h, notice, replace, select } from "./dom.js";
 import { go } from "./place.js";
 import { scalePanel } from "./scale.js";
-import { Scene3D } from "./scene3d.js";
 import { t } from "./strings.js";
 
 const POINTS = { ground: 3, edge: 2 };
@@ -130,12 +129,12 @@ export const open = async (capture, current) => {
   const scale = scalePanel(capture, photos, store);
   const node = h("div", { class: "page wide" },
     h("div", { class: "setup" },
-      h("div", { class: "stage" }, h("div", { class: "bar over" }, modes, h("span", { class: "grow" }), info), canvas, hint),
-      h("aside", { class: "panels" }, regionPanel, upPanel, frontPanel, originPanel)),
-    scale.node);
+      h("div", { class: "left" }, h("div", { class: "stage" }, h("div", { class: "bar over" }, modes, h("span", { class: "grow" }), info), canvas, hint), scale.node),
+      h("aside", { class: "panels" }, regionPanel, upPanel, frontPanel, originPanel)));
 
   const shown = async () => {
     try {
+      const { Scene3D } = await import("./scene3d.js"); // three.js, which no other tab needs
       scene = new Scene3D(canvas, data, {
         onpoint: (point) => {
           if (scene.marks.length >= POINTS[scene.mode]) scene.marks = [];
@@ -158,5 +157,5 @@ export const open = async (capture, current) => {
     canvas.dataset.ready = "true";
     if (current()) scale.shown();
   };
-  return { node, shown, leave: () => { scene?.close(); scale.close(); }, keys: {}, get scene() { return scene; } };
+  return { node, shown, leave: () => { scene?.close(); scale.close(); }, keys: {} };
 };
