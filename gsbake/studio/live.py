@@ -149,7 +149,6 @@ class LiveState(Observer):
         """Mark a stage as running."""
         with self._lock:
             self._left = state.name, TimeLeft(time.monotonic(), self.expected(state))
-            self._curves = {}
         self._set(state.name, status="running", done=0, total=0, text="")
         self.display.stage_started(state)
 
@@ -171,7 +170,7 @@ class LiveState(Observer):
             if self._left is not None:
                 self._left[1].update(time.monotonic(), done, total)
             for key, value in live.items():
-                points = self._curves.setdefault(printable(key), [])
+                points = self._curves.setdefault(printable(f"{name}: {key}"), [])
                 points.append((float(done), float(value)))
                 if len(points) > MAX_POINTS:
                     del points[1::2]

@@ -32,8 +32,8 @@ Bytes = NDArray[np.uint8]
 MASKS = "masks"
 #: File in the cache with the digests of the masks that the studio wrote.
 WRITTEN = "masks.json"
-#: Longer side in pixels at which GrabCut works, its iterations, and how far beyond a stroke it looks: a share of the stroke's longer side, and
-#: one of the picture's.
+#: Longer side in pixels at which GrabCut works, its iterations, and how far beyond a stroke it looks: a share of the stroke's longer side,
+#: and one of the picture's.
 CUT_SIZE, CUT_STEPS, CUT_MARGIN, CUT_ROOM = 640, 4, 1.0, 0.12
 #: Deflate level of masks on their way to the page.
 LEVEL = 1
@@ -50,7 +50,8 @@ def listing(call: Call) -> dict[str, Any]:
     for name, path in capture.photos().items():
         entry = by_source.get(name)
         made = entry is not None and _made(found, entry) is not None
-        source = "file" if name in files else "made" if made else "none"
+        alpha = entry is not None and entry["mask"] is not None
+        source = "file" if name in files else "alpha" if alpha else "made" if made else "none"
         uncertain = entry is not None and entry["name"] in doubtful
         rows.append({"name": name, "version": f"{path.stat().st_mtime_ns:x}", "source": source, "doubtful": uncertain})
     return {"photos": sorted(rows, key=lambda row: not row["doubtful"]), "folder": capture.shown(_folder(capture))}

@@ -18,7 +18,7 @@ from gsbake.studio.sessions import session_of
 from gsbake.studio.workspace import Capture, NotFoundError
 from gsbake.system.processes import start_apart
 
-#: Seconds in which a run that has told its end exits.
+#: Seconds in which a run that has written its end exits.
 LAST_SECONDS = 0.5
 #: Bytes of the error output that is looked at for the reason of a run that did not start.
 _TAIL = 4000
@@ -52,7 +52,7 @@ class Runs:
             known = self._started.get(capture.name)
             if known is not None and live is not None and live.holder is not None and live.holder.pid == known[0].pid:
                 starting = False
-                if known[0].poll() is not None:  # it has told its end itself
+                if known[0].poll() is not None:  # its end is in live.json
                     self._forget(capture)
                     known = None
             message = "" if known is None or starting else self._reason(known)

@@ -52,7 +52,7 @@ def test_state_progress_curves_and_decisions(tmp_path: Path) -> None:
     assert found["stages"][0] | {"left": ""} == {
         "name": "train", "title": "Training <b>", "status": "running", "done": 699, "total": 1000, "text": "", "left": "",
     }  # fmt: skip
-    curve = found["curves"]["psnr"]
+    curve = found["curves"]["train: psnr"]
     assert len(curve) <= 600 and curve[0] == [1, 20.01] and curve[-1] == pytest.approx([699, 26.99])
     assert [line["kind"] for line in found["lines"]] == ["decision", "warning"] and "\\u202e" in found["lines"][0]["text"]
     state.end(75, "stopped \u202e")

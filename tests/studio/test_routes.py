@@ -144,7 +144,8 @@ def test_the_form_is_made_from_the_settings_own_descriptions(browser: Browser) -
     assert fields["bake.size"]["kind"] == "choice" and 1024 in fields["bake.size"]["choices"]
     faces = fields["mesh.faces"]
     assert (faces["kind"], faces["whole"], faces["least"], faces["most"]) == ("number", True, 100, 10_000_000)
-    assert fields["ingest.invert_masks"]["kind"] == "switch" and fields["export.up_points"]["numbers"] and fields["targets.files"]["elsewhere"]
+    assert fields["ingest.invert_masks"]["kind"] == "switch" and fields["targets.files"]["elsewhere"]
+    assert (fields["export.up_points"]["kind"], fields["export.up_points"]["numbers"]) == ("list", True)
     assert all(field["help"] for field in found["settings"]) and browser.get("/api/settings?profile=nothing", 400)["error"]
 
 
@@ -237,11 +238,13 @@ def test_the_scene_is_in_the_frame_of_the_region_and_of_up(posed: Browser) -> No
     corners = np.array(found["cameras"][0]["corners"])
     assert np.allclose(corners.mean(0) / np.linalg.norm(corners.mean(0)), np.array((-6, 0, -1)) / np.sqrt(37), atol=1e-6)
     content = posed.get("/api/captures/a/scene/points")
-    assert np.allclose(np.frombuffer(content[:24], "<f4").reshape(2, 3), [(0.5, 0, 1), (1.5, 0, 1.5)]) and content[24:] == b"\xff\0\0\0\x09\0"
+    assert np.allclose(np.frombuffer(content[:24], "<f4").reshape(2, 3), [(0.5, 0, 1), (1.5, 0, 1.5)])
+    assert content[24:] == b"\xff\0\0\0\x09\0"
 
 
 def test_the_epipolar_line_passes_where_the_point_is(posed: Browser) -> None:
-    cameras = [camera.moved(TO_WORLD) for camera in CameraSet.load(next((posed.folder / "out/a/stages/poses").glob("*/cameras.json"))).cameras]
+    (path,) = (posed.folder / "out/a/stages/poses").glob("*/photo_cameras.json")
+    cameras = CameraSet.load(path).cameras
     point = np.array([(0.7, 0.1, 1.2)])
     (x, y), other = cameras[0].project(point)[0][0], cameras[1].project(point)[0][0]
     scale = np.array((64 / cameras[0].width, 48 / cameras[0].height))

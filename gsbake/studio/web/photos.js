@@ -41,6 +41,7 @@ export const open = async (capture, current) => {
       throw error;
     } finally {
       drawCell(photo);
+      countFilters();
     }
   };
 
@@ -63,6 +64,12 @@ export const open = async (capture, current) => {
       if (event.key.toLowerCase() === "x") toggle(found.photos[index]);
     });
     show();
+  };
+
+  let filters = null;
+  const countFilters = () => {
+    const counts = { all: found.photos.length, flagged: found.photos.filter((photo) => flagsOf(photo, found.median).length).length, out: leftOut().length };
+    for (const button of filters.children) button.textContent = `${t.filters[button.dataset.key]} ${counts[button.dataset.key]}`;
   };
 
   const cells = new Map();
@@ -122,9 +129,8 @@ export const open = async (capture, current) => {
   const draw = () => {
     const stops = found.photos.map((photo) => photo.exposure).filter((value) => value !== undefined && value !== null).sort((a, b) => a - b);
     found.median = stops.length ? stops[stops.length >> 1] : 0;
-    const flagged = found.photos.filter((photo) => flagsOf(photo, found.median).length).length;
-    const filters = choice(t.tabs.photos, [["all", `${t.filters.all} ${found.photos.length}`], ["flagged", `${t.filters.flagged} ${flagged}`], ["out", `${t.filters.out} ${leftOut().length}`]], filter,
-      (key) => { filter = key; drawSheet(); });
+    filters = choice(t.tabs.photos, Object.keys(t.filters).map((key) => [key, ""]), filter, (key) => { filter = key; drawSheet(); });
+    countFilters();
     replace(node, h("div", { class: "bar" }, h("h1", {}, t.tabs.photos), filters, h("span", { class: "grow" }),
       action(t.check, commands.check(capture), async () => { await post(at(capture.name, "check")); await load(); }, { class: "main", id: "check", disabled: found.checking || !(found.photos.length || found.video) })),
       findings, found.video ? h("p", { class: "soft" }, t.video) : null, sheet, area);

@@ -216,8 +216,12 @@ export class Scene3D {
       dragged = this.mode === "box" && event.button === 0 ? this.nearest(this.handles(), x, y, PICK + 4) : null;
     });
     canvas.addEventListener("pointermove", (event) => {
-      if (!last) return;
       const [x, y] = where(event);
+      if (!last) {
+        const near = this.mode === "box" ? this.nearest(this.handles(), x, y, PICK + 4) : null;
+        canvas.dataset.handle = near ? "xyz"[near.k] : "";
+        return;
+      }
       const [dx, dy] = [x - last.x, y - last.y];
       moved += Math.abs(dx) + Math.abs(dy);
       if (dragged) this.drag(dragged, dx, dy);

@@ -75,7 +75,7 @@ export const t = {
   undo: "Undo",
   overlay: "Show mask",
   opacity: "Overlay",
-  maskSources: { file: "mask file", made: "made by gsbake", none: "no mask" },
+  maskSources: { file: "mask file", made: "made by gsbake", alpha: "transparency", none: "no mask file" },
   doubtful: "doubtful",
   doubtfulFirst: "Photos whose masks the others contradict come first.",
   saveMask: "Save mask",
