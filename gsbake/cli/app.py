@@ -47,6 +47,7 @@ from gsbake.cli.options import (
     complete_profile,
     complete_stage,
     given_path,
+    mask_settings,
     placement_settings,
     scale_settings,
     target_settings,
@@ -67,8 +68,6 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 
-#: Setting of `--invert-masks`.
-INVERTED = ("ingest.invert_masks=true",)
 #: {stage command: help}.
 STAGE_HELP = {
     "ingest": "Read photos, masks and known poses.",
@@ -132,10 +131,10 @@ def _pipeline_command(until: str | None) -> Callable[..., None]:
     ) -> None:
         from gsbake.cli.run import run_pipeline
 
-        mask_settings = (*(masks.settings if masks else ()), *(INVERTED if invert_masks else ()))
-        photo_settings = (*mask_settings, *(region or ()), *scale_settings(known_distances, marker_size))
-        placement = (*(up or ()), *placement_settings(leave_out, front, origin))
-        settings = [*(overrides or []), *photo_settings, *placement, *target_settings(targets, levels)]
+        settings = [
+            *(overrides or []), *mask_settings(masks, invert_masks), *(region or ()), *scale_settings(known_distances, marker_size),
+            *(up or ()), *placement_settings(leave_out, front, origin), *target_settings(targets, levels),
+        ]  # fmt: skip
         options = Options(
             photos=photos, out=out, profile=profile, overrides=settings,
             masks=masks.folder if masks else None, poses=poses, device=device.value, threads=threads, seed=seed,
@@ -188,6 +187,7 @@ def settings_command(
     front: FrontOption = None,
     origin: OriginOption = None,
     masks: MasksOption = None,
+    invert_masks: InvertOption = False,
     leave_out: LeaveOutOption = None,
     poses: PosesOption = None,
     moved: MovedOption = False,
@@ -201,9 +201,9 @@ def settings_command(
     """Store settings in the output folder for its next run; nothing is run."""
     from gsbake.cli.settings import settings
 
-    photo_settings = (*(masks.settings if masks else ()), *(region or ()), *scale_settings(known_distances, marker_size))
-    placement = (*(up or ()), *placement_settings(leave_out, front, origin))
-    given = [*(overrides or []), *photo_settings, *placement, *target_settings(targets, levels)]
+    where = [*(region or ()), *(up or ()), *placement_settings(leave_out, front, origin)]
+    given = [*(overrides or []), *mask_settings(masks, invert_masks), *where, *scale_settings(known_distances, marker_size)]
+    given += target_settings(targets, levels)
     settings(
         Options(
             photos=photos, out=out, profile=profile, overrides=given, masks=masks.folder if masks else None, poses=poses, seed=seed,

@@ -81,6 +81,11 @@ def given_masks(text: str) -> Masks:
     return Masks(given_path(text))
 
 
+def mask_settings(masks: Masks | None, inverted: bool) -> tuple[str, ...]:
+    """Settings of `--masks` and `--invert-masks`."""
+    return (*(masks.settings if masks else ()), *(("ingest.invert_masks=true",) if inverted else ()))
+
+
 def given_distance(text: str) -> str:
     """A known distance that can be parsed."""
     from gsbake.config.lengths import parse_known_distance

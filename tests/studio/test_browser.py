@@ -61,15 +61,18 @@ class Session:
     """A page that may ask nobody else, and has no errors."""
 
     def __init__(self, page: Any) -> None:
-        self.page, self.errors, self.foreign = page, [], []  # type: ignore[var-annotated]
+        self.page, self.requests = page, 0
+        self.errors: list[str] = []
+        self.foreign: list[str] = []
         page.on("console", lambda message: self.errors.append(message.text) if message.type == "error" else None)
         page.on("pageerror", lambda error: self.errors.append(str(error)))
-        page.on("request", lambda request: self.foreign.append(request.url) if self._is_foreign(request.url) else None)
+        page.on("request", self._note)
         self.pictures = Path(os.environ["GSBAKE_STUDIO_PICTURES"]) if "GSBAKE_STUDIO_PICTURES" in os.environ else None
 
-    @staticmethod
-    def _is_foreign(url: str) -> bool:
-        return not re.match(r"http://127\.0\.0\.1:\d+/|data:|blob:", url)
+    def _note(self, request: Any) -> None:
+        self.requests += 1
+        if not re.match(r"http://127\.0\.0\.1:\d+/|data:|blob:", request.url):
+            self.foreign.append(request.url)
 
     def open(self, address: str) -> None:
         start = time.monotonic()
@@ -350,6 +353,9 @@ def compare_and_download(session: Session, folder: Path) -> None:
     session.wait("document.querySelector('.state.done') && document.querySelector('.thumb img').naturalWidth > 0")
     page.keyboard.press("t")
     session.picture("captures")
+    asked = session.requests
+    page.wait_for_timeout(5000)
+    assert session.requests == asked  # idle it asks nothing
     page.set_viewport_size({"width": 400, "height": 800})
     for number in range(6):
         if number:
@@ -360,6 +366,14 @@ def compare_and_download(session: Session, folder: Path) -> None:
         if number == 1:
             session.picture("narrow")
     page.set_viewport_size(SIZE)
+
+
+def wait_for_the_end(pid: int) -> None:
+    """Wait until a process is gone, or is a zombie that nobody waits for."""
+    deadline = time.monotonic() + 60
+    while psutil.pid_exists(pid) and psutil.Process(pid).status() != psutil.STATUS_ZOMBIE:
+        assert time.monotonic() < deadline
+        time.sleep(0.1)
 
 
 def kill_the_server_in_a_run(page: Any, folder: Path) -> None:
@@ -387,7 +401,7 @@ def kill_the_server_in_a_run(page: Any, folder: Path) -> None:
         page.goto(re.sub(r"[#?].*", "", page.url) + "#/mug/run")
         page.click("#stop:not([disabled])")
         session.wait("document.getElementById('end').textContent.includes('Stopped')", 300)
-        assert not psutil.pid_exists(live["pid"]) or psutil.Process(live["pid"]).status() == psutil.STATUS_ZOMBIE
+        wait_for_the_end(live["pid"])
         page.fill("[data-key='train.iterations'] input", "310")
         page.press("[data-key='train.iterations'] input", "Enter")
         page.click("#run:not([disabled])")

@@ -60,7 +60,8 @@ export const open = async (capture, current) => {
   const photoImage = h("img", { alt: t.comparePhoto, id: "compare-photo" });
   const renderImage = h("img", { class: "over", alt: t.render, id: "compare-render" });
   const slider = h("input", { type: "range", min: 0, max: 100, value: 50, "aria-label": t.slider, oninput: () => pair.style.setProperty("--at", `${slider.value}%`) });
-  const pair = h("div", { class: "compare" }, photoImage, renderImage, h("span", { class: "tag left" }, t.render), h("span", { class: "tag right" }, t.comparePhoto), slider);
+  const tag = h("span", { class: "tag left" }, t.render);
+  const pair = h("div", { class: "compare" }, photoImage, renderImage, tag, h("span", { class: "tag right" }, t.comparePhoto), slider);
   const score = h("span", { class: "soft", id: "compare-score" });
   let against = found.photos[0]?.name || "";
   let error = false;
@@ -70,6 +71,7 @@ export const open = async (capture, current) => {
     const picture = (kind) => at(capture.name, "asset/pictures", view.key, `${kind}.jpg`);
     photoImage.src = picture("photo");
     renderImage.src = picture(error ? "error" : "render");
+    tag.textContent = error ? t.errorMap : t.render;
   };
   const compare = async (name) => {
     against = name;

@@ -154,7 +154,7 @@ export const open = async (capture, current) => {
   drawLive();
   const node = h("div", { class: "page wide run" },
     h("aside", { class: "settings" }, h("h2", {}, t.profile), profiles, h("h2", {}, t.settings), main, more),
-    h("div", { class: "progress" }, buttons, message, end, stages, picture, curves, h("h2", {}, t.decisions), lines));
+    h("div", { class: "progress" }, buttons, message, end, stages, h("div", { class: "live" }, picture, curves), h("h2", {}, t.decisions), lines));
   return {
     node,
     shown: () => { replan(); if (running()) poll(); },
