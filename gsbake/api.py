@@ -16,7 +16,7 @@ from typing import Any
 
 from gsbake.capture.masks.weights import resolve_network
 from gsbake.capture.sources import PHOTO_FOLDERS, discover, list_masks, source_files
-from gsbake.config.load import DEFAULT, LoadedProfile, load_profile
+from gsbake.config.load import DEFAULT, LoadedProfile, fields, load_profile
 from gsbake.config.renamed import present_override
 from gsbake.config.schema import Profile
 from gsbake.config.targets import parse_target, require_packages
@@ -24,7 +24,7 @@ from gsbake.errors import BadInputError, GsbakeError, UsageError
 from gsbake.meshing.decimator_choice import resolve_decimator
 from gsbake.output_folder import check_output_folder, check_same_photos
 from gsbake.pipeline.engine import Engine, Observer, artifacts_by_stage
-from gsbake.pipeline.files import disk_error
+from gsbake.pipeline.files import disk_error, ensure_output_folder
 from gsbake.pipeline.machine import default_threads, resolve_device
 from gsbake.pipeline.plan import Request, StageState
 from gsbake.pipeline.project import Project
@@ -51,7 +51,8 @@ class RunOptions:
 
     `overrides` are settings as "section.key=value", added to the stored ones; `threads` = 0 uses the physical cores.
     `store` names a shared store, a folder or URL, which is not stored; None takes the variable GSBAKE_STORE. `overwrite` lets results take
-    the place of files that were edited, which are set aside; `moved` says that the photos of an earlier run lie at another path now.
+    the place of files that were edited, which are set aside; `moved` says that the photos of an earlier run lie at another path now; stored
+    settings that `unset` names are forgotten.
     """
 
     photos: Path | None = None
@@ -66,6 +67,7 @@ class RunOptions:
     store: str | None = None
     overwrite: bool = False
     moved: bool = False
+    unset: frozenset[str] = frozenset()
 
 
 @dataclass(frozen=True)
@@ -107,6 +109,16 @@ class Session:
                 f"The output folder '{self.out}' cannot be written ({error.strerror}); choose another with --out."
             ) from error
         return Result(self.out, files, tuple(states), notes)
+
+    def store_settings(self) -> None:
+        """Store the options in the output folder, for its next run. Raises BadInputError where it cannot be written."""
+        try:
+            ensure_output_folder(self.out)
+            self.project.save(self.out)
+        except OSError as error:
+            raise disk_error(error, self.out) or BadInputError(
+                f"The output folder '{self.out}' cannot be written ({error.strerror}); choose another with --out."
+            ) from error
 
     def _publish(self, states: Sequence[StageState]) -> tuple[dict[str, Path], tuple[str, ...]]:
         """Copy the results of these stages to the output folder; returns {file: path} and what needs a word."""
@@ -233,7 +245,12 @@ def open_session(options: RunOptions, observer: Observer | None = None, registry
             found = discover(Path(stored.photos), options.masks or _path(stored.masks), options.poses or _path(stored.poses))
             project = replace(project, masks=_text(found.masks), poses=_text(found.poses))
     check_output_folder(out, stored, project)
-    last = {text.partition("=")[0].strip(): text for text in [*project.overrides, *options.overrides]}
+    unknown = sorted(options.unset - fields().keys())
+    if unknown:
+        raise UsageError(f"There is no setting '{unknown[0]}' to unset; `gsbake profiles {DEFAULT}` lists them.")
+    last = {text.partition("=")[0].strip(): text for text in project.overrides}
+    last = {key: text for key, text in last.items() if key not in options.unset}
+    last |= {text.partition("=")[0].strip(): text for text in options.overrides}
     name = next(name for name in (options.profile, project.profile, DEFAULT) if name is not None)
     profile = load_profile(name, list(last.values()))
     if options.masks is not None and profile.profile.ingest.masks == "ignore":

@@ -20,9 +20,9 @@ from gsbake.pipeline.uses import FOLDER as RUNNING
 from gsbake.publish import is_result
 from gsbake.synth.folder import is_capture
 
-EVENTS, DIGESTS = "events.jsonl", "digests.json"
+EVENTS, DIGESTS, LIVE = "events.jsonl", "digests.json", "live.json"
 #: What gsbake makes in an output folder beside the results; the last name is that of earlier versions for files that were set aside.
-_MADE = frozenset({PROJECT, EVENTS, DIGESTS, "stages", "logs", "errors", RUNNING, SET_ASIDE, "unexpected"})
+_MADE = frozenset({PROJECT, EVENTS, DIGESTS, LIVE, "stages", "logs", "errors", RUNNING, SET_ASIDE, "unexpected"})
 
 
 def check_output_folder(out: Path, stored: Project | None, project: Project) -> None:

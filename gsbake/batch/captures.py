@@ -93,7 +93,7 @@ def plan_capture(photos: Path, options: BatchOptions) -> CapturePlan:
         session = open_session(
             RunOptions(photos, out, options.profile, options.overrides, threads=options.threads, seed=options.seed, moved=options.moved),
         )
-        states = _states(session)
+        states = states_of(session)
     except UsageError:
         raise
     except GsbakeError as error:
@@ -102,7 +102,7 @@ def plan_capture(photos: Path, options: BatchOptions) -> CapturePlan:
     return CapturePlan(plan.name, plan.photos, out, tuple(states), photos_of_request(session.engine.request), files)
 
 
-def _states(session: Session) -> list[StageState]:
+def states_of(session: Session) -> list[StageState]:
     """The states of the stages. Photos are read only where something is stored: else a batch would begin with the digests of all photos."""
     engine = session.engine
     if engine.store.stage_folder("").exists():

@@ -19,6 +19,7 @@ from markupsafe import Markup
 from PIL import Image
 
 from gsbake.atomic import write_atomic
+from gsbake.batch.captures import CapturePlan
 from gsbake.batch.coordinator import Outcome
 from gsbake.own_files import own_place
 from gsbake.text import duration, number, printable, size
@@ -86,31 +87,35 @@ def render(rows: Sequence[Row]) -> str:
 
 def _row(outcome: Outcome, root: Path) -> Row:
     plan = outcome.plan
-    artifacts = {state.name: state.artifact for state in plan.states if state.artifact is not None}
-    manifests = {name: artifact.manifest for name, artifact in artifacts.items()}
-    results: dict[str, Mapping[str, Any]] = {name: manifest.get("results", {}) for name, manifest in manifests.items()}
     asset, report = (plan.files.get(name) or plan.out / name for name in ("asset.glb", "report.html"))
-    seconds = sum(float(manifest.get("seconds", 0)) for manifest in manifests.values())
-    peak = max((int(manifest.get("peak_bytes", 0)) for manifest in manifests.values()), default=0)
-    quality, export = results.get("report", {}), results.get("export", {})
-    megabytes = asset.stat().st_size if asset.is_file() else None
-    export_artifact = artifacts.get("export")
+    artifact = next((state.artifact for state in plan.states if state.name == "export"), None)
     return Row(
         name=plan.name,
         state="done" if outcome.state == "cached" else outcome.state,
         message=outcome.message,
-        thumbnail=_thumbnail(export_artifact.folder / "previews") if export_artifact is not None else "",
+        thumbnail=_thumbnail(artifact.folder / "previews") if artifact is not None else "",
         report=_link(report, root),
         asset=_link(asset, root),
-        cells=(
-            _figure(results.get("ingest", {}).get("photos"), number),
-            _figure(export.get("triangles"), number),
-            _figure(megabytes, size),
-            _figure(quality.get("psnr"), lambda v: f"{v:.1f} dB"),
-            _figure(quality.get("ssim"), lambda v: f"{v:.3f}"),
-            _figure(seconds or None, duration),
-            _figure(peak or None, size),
-        ),
+        cells=figures_of(plan),
+    )
+
+
+def figures_of(plan: CapturePlan) -> tuple[Cell, ...]:
+    """The figures of COLUMNS of a capture, as far as its stages have run."""
+    manifests = {state.name: state.artifact.manifest for state in plan.states if state.artifact is not None}
+    results: dict[str, Mapping[str, Any]] = {name: manifest.get("results", {}) for name, manifest in manifests.items()}
+    seconds = sum(float(manifest.get("seconds", 0)) for manifest in manifests.values())
+    peak = max((int(manifest.get("peak_bytes", 0)) for manifest in manifests.values()), default=0)
+    quality, export = results.get("report", {}), results.get("export", {})
+    asset = plan.files.get("asset.glb") or plan.out / "asset.glb"
+    return (
+        _figure(results.get("ingest", {}).get("photos"), number),
+        _figure(export.get("triangles"), number),
+        _figure(asset.stat().st_size if asset.is_file() else None, size),
+        _figure(quality.get("psnr"), lambda v: f"{v:.1f} dB"),
+        _figure(quality.get("ssim"), lambda v: f"{v:.3f}"),
+        _figure(seconds or None, duration),
+        _figure(peak or None, size),
     )
 
 

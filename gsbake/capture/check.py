@@ -69,8 +69,10 @@ def check_photos(
     ingest(photos, work / "ingest", options, masks=masks, poses=poses, threads=threads, monitor=monitor)
     listing = json.loads((work / "ingest/photos.json").read_text(encoding="utf-8"))
     entries: list[dict[str, Any]] = listing["photos"]
-    findings = [*_files(listing), *_pictures(entries), *_light(work / "ingest", entries), *_masks(work / "ingest", entries)]
+    clipped = [_clipped_share(work / "ingest", entry) for entry in entries]
+    findings = [*_files(listing), *_pictures(entries), *_light(entries, clipped), *_masks(work / "ingest", entries)]
     found, figures = _cameras(work, entries, threads, monitor)
+    figures["photos"] = _by_photo(listing, clipped, figures.get("not_registered"))
     order = ("problem", "advice", "good")
     return sorted([*findings, *found], key=lambda finding: order.index(finding.level)), figures
 
@@ -113,7 +115,22 @@ def _pictures(entries: Sequence[dict[str, Any]]) -> list[Finding]:
     return findings
 
 
-def _light(folder: Path, entries: Sequence[dict[str, Any]]) -> list[Finding]:
+def _by_photo(listing: dict[str, Any], clipped: Sequence[float], missing: Sequence[str] | None) -> list[dict[str, Any]]:
+    """What was found of each photo, and why the skipped ones are; `missing` names those without a camera, None where none were solved."""
+    entries: list[dict[str, Any]] = listing["photos"]
+    blurred = set(find_blurred([entry["blur"] for entry in entries]))
+    found: list[dict[str, Any]] = [
+        {
+            "source": entry["source"], "blur": entry["blur"], "blurred": index in blurred, "exposure": entry["exposure"],
+            "clipped": share, "duplicate_of": entry["duplicate_of"],
+            "registered": None if missing is None else entry["name"] not in missing,
+        }
+        for index, (entry, share) in enumerate(zip(entries, clipped, strict=True))
+    ]  # fmt: skip
+    return found + [{"source": skipped["source"], "skipped": skipped["why"]} for skipped in listing["skipped"]]
+
+
+def _light(entries: Sequence[dict[str, Any]], clipped_shares: Sequence[float]) -> list[Finding]:
     """Exposure of the photos: its range, clipped and dark ones."""
     stops = np.array([e["exposure"] for e in entries])
     spread = float(np.quantile(stops, 0.95) - np.quantile(stops, 0.05))
@@ -124,7 +141,7 @@ def _light(folder: Path, entries: Sequence[dict[str, Any]]) -> list[Finding]:
         findings.append(Finding("advice", "exposure", text, do))
     else:
         findings.append(Finding("good", "exposure", f"photos agree to {spread:.1f} stops"))
-    clipped = float(np.median([_clipped_share(folder, entry) for entry in entries]))
+    clipped = float(np.median(clipped_shares))
     if clipped > CLIPPED_SHARE:
         text = f"{100 * clipped:.0f} % of the object's pixels are clipped"
         findings.append(Finding("advice", "highlights", text, "Expose for the brightest part; what is clipped has no colour."))

@@ -38,6 +38,8 @@ from gsbake.monitor import SILENT, Monitor, Rule, decide_skip
 from gsbake.system.names import portable_name, same_file_key
 from gsbake.text import missing_list, shortlist
 
+#: Why a photo is skipped that the settings leave out.
+LEFT_OUT = "left out by the settings"
 #: Folder of the frames of a video, while they are read.
 FRAMES = "frames"
 #: Share of the pixels of the largest photo of a camera below which another is taken for a crop.
@@ -99,6 +101,7 @@ class _Ingestion:
         names = photo_names(paths)
         use_masks = settings.masks != "ignore"
         masks = self._match_masks(paths) if use_masks else {}
+        self._leave_out(paths)
         with self.monitor.part("duplicates"):
             self._skip_identical_files(paths)
         with self.monitor.part("photos"):
@@ -156,6 +159,19 @@ class _Ingestion:
         self.monitor.decide("frames", f"{written} of {total}", "the sharpest of equal stretches of the video's motion")
         if transfer:
             self.monitor.decide("colours of the video", f"{transfer} undone", "reference white becomes white, what is brighter is clipped")
+
+    def _leave_out(self, paths: dict[str, Path]) -> None:
+        """Remove from `paths` what the settings leave out, by path or by file name. Raises BadInputError for a name of no photo."""
+        named = set()
+        for name in self.options.ingest.leave_out:
+            found = [name] if name in paths else [relative for relative in paths if relative.rsplit("/", 1)[-1] == name]
+            if len(found) != 1:
+                number = len(found) or "none"
+                raise BadInputError(f"ingest.leave_out names '{name}', which is {number} of the photos; write its path in their folder.")
+            named.add(found[0])
+        for relative in sorted(named):
+            self.skipped.append({"source": relative, "why": LEFT_OUT})
+            del paths[relative]
 
     def _skip_identical_files(self, paths: dict[str, Path]) -> None:
         """Remove from `paths` files that cannot be read or are identical to an earlier one."""

@@ -16,14 +16,17 @@ from gsbake.cli.options import (
     Device,
     DeviceOption,
     DryRunOption,
+    FrontOption,
     InvertOption,
     JsonOption,
     KnownDistanceOption,
+    LeaveOutOption,
     LevelsOption,
     MarkerSizeOption,
     MasksOption,
     MovedOption,
     Options,
+    OriginOption,
     OutOption,
     OverwriteOption,
     PhotosArgument,
@@ -37,11 +40,15 @@ from gsbake.cli.options import (
     StoreOption,
     TargetOption,
     ThreadsOption,
+    UnsetOption,
+    UpOption,
     VerboseOption,
     ViewOption,
     complete_profile,
     complete_stage,
     given_path,
+    mask_settings,
+    placement_settings,
     scale_settings,
     target_settings,
 )
@@ -61,8 +68,6 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 
-#: Setting of `--invert-masks`.
-INVERTED = ("ingest.invert_masks=true",)
 #: {stage command: help}.
 STAGE_HELP = {
     "ingest": "Read photos, masks and known poses.",
@@ -105,8 +110,12 @@ def _pipeline_command(until: str | None) -> Callable[..., None]:
         dry_run: DryRunOption = False,
         view: ViewOption = False,
         require: RequireOption = None,
+        up: UpOption = None,
+        front: FrontOption = None,
+        origin: OriginOption = None,
         masks: MasksOption = None,
         invert_masks: InvertOption = False,
+        leave_out: LeaveOutOption = None,
         poses: PosesOption = None,
         moved: MovedOption = False,
         region: RegionOption = None,
@@ -122,9 +131,10 @@ def _pipeline_command(until: str | None) -> Callable[..., None]:
     ) -> None:
         from gsbake.cli.run import run_pipeline
 
-        mask_settings = (*(masks.settings if masks else ()), *(INVERTED if invert_masks else ()))
-        photo_settings = (*mask_settings, *(region or ()), *scale_settings(known_distances, marker_size))
-        settings = [*(overrides or []), *photo_settings, *target_settings(targets, levels)]
+        settings = [
+            *(overrides or []), *mask_settings(masks, invert_masks), *(region or ()), *scale_settings(known_distances, marker_size),
+            *(up or ()), *placement_settings(leave_out, front, origin), *target_settings(targets, levels),
+        ]  # fmt: skip
         options = Options(
             photos=photos, out=out, profile=profile, overrides=settings,
             masks=masks.folder if masks else None, poses=poses, device=device.value, threads=threads, seed=seed,
@@ -161,6 +171,45 @@ def status_command(
             photos=photos, out=out, profile=profile, overrides=overrides or [], device=device.value, seed=seed, quiet=quiet,
             as_json=as_json, moved=moved,
         )
+    )  # fmt: skip
+
+
+@command(app, "settings", Panel.EDIT)
+def settings_command(
+    photos: PhotosArgument = None,
+    out: OutOption = None,
+    profile: ProfileOption = None,
+    targets: TargetOption = None,
+    levels: LevelsOption = None,
+    overrides: SetOption = None,
+    unset: UnsetOption = None,
+    up: UpOption = None,
+    front: FrontOption = None,
+    origin: OriginOption = None,
+    masks: MasksOption = None,
+    invert_masks: InvertOption = False,
+    leave_out: LeaveOutOption = None,
+    poses: PosesOption = None,
+    moved: MovedOption = False,
+    region: RegionOption = None,
+    known_distances: KnownDistanceOption = None,
+    marker_size: MarkerSizeOption = None,
+    seed: SeedOption = None,
+    quiet: QuietOption = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Store settings in the output folder for its next run; nothing is run."""
+    from gsbake.cli.settings import settings
+
+    where = [*(region or ()), *(up or ()), *placement_settings(leave_out, front, origin)]
+    given = [*(overrides or []), *mask_settings(masks, invert_masks), *where, *scale_settings(known_distances, marker_size)]
+    given += target_settings(targets, levels)
+    settings(
+        Options(
+            photos=photos, out=out, profile=profile, overrides=given, masks=masks.folder if masks else None, poses=poses, seed=seed,
+            moved=moved, quiet=quiet, as_json=as_json,
+        ),
+        frozenset(unset or ()),
     )  # fmt: skip
 
 
@@ -213,6 +262,20 @@ def check_command(
     from gsbake.cli.check import check
 
     check(photos, masks.folder if masks else None, poses, threads, as_json)
+
+
+@command(app, "studio", Panel.MAKE)
+def studio_command(
+    folder: Annotated[
+        Path, typer.Argument(parser=given_path, metavar="FOLDER", help="Folder of captures.  [default: .]", show_default=False)
+    ] = Path("."),
+    port: Annotated[int, typer.Option("--port", min=0, max=65_535, help="Port on 127.0.0.1; 0: a free one.", show_default=False)] = 0,
+    browser: Annotated[bool, typer.Option("--browser/--no-browser", help="Open the page in the browser.")] = True,
+) -> None:
+    """Serve a page on this machine that does all of this with eyes and a mouse: captures, photos, masks, set-up, runs, assets."""
+    from gsbake.cli.studio import studio
+
+    studio(folder, port, browser=browser)
 
 
 @command(app, "masks", Panel.EDIT)

@@ -13,6 +13,7 @@ from gsbake.cli.output import cell, print_json, print_table, print_text
 from gsbake.config.load import DEFAULT, LoadedProfile, bounds, fields, load_profile, shipped
 from gsbake.pipeline.plan import StageState
 from gsbake.pipeline.settings import flatten
+from gsbake.studio.live import LiveRun
 from gsbake.text import duration, figures, size
 
 _WORDS = {"cached": "cached", "replaced": "replaced", "run": "will run", "waits": "will run"}
@@ -61,11 +62,15 @@ def status(options: Options) -> None:
     """Print the state of every stage."""
     session = options.session()
     states = session.engine.plan()
+    live = LiveRun.read(session.out)
+    running = live.holder if live is not None and live.runs else None
     if options.as_json:
-        print_json(plan_document(session, states))
+        print_json(plan_document(session, states) | {"running": None if running is None else {"host": running.host, "pid": running.pid}})
         return
     project = session.project
     if not options.quiet:
+        if live is not None and running is not None:
+            print_text(f"{session.out}: a run is in progress, {running}: {live.summary}")
         print_text(f"{session.out}: photos {project.photos}, profile {project.profile} {' '.join(project.overrides)}".rstrip())
     print_plan(states)
 

@@ -26,6 +26,14 @@ class Device(StrEnum):
     cuda = "cuda"
 
 
+class Origin(StrEnum):
+    """Origin of the asset."""
+
+    auto = "auto"
+    bottom = "bottom"
+    centre = "centre"
+
+
 def complete_profile(incomplete: str) -> list[str]:
     """Shell completion of profile names."""
     from gsbake.config.load import shipped
@@ -73,6 +81,11 @@ def given_masks(text: str) -> Masks:
     return Masks(given_path(text))
 
 
+def mask_settings(masks: Masks | None, inverted: bool) -> tuple[str, ...]:
+    """Settings of `--masks` and `--invert-masks`."""
+    return (*(masks.settings if masks else ()), *(("ingest.invert_masks=true",) if inverted else ()))
+
+
 def given_distance(text: str) -> str:
     """A known distance that can be parsed."""
     from gsbake.config.lengths import parse_known_distance
@@ -106,6 +119,29 @@ def given_region(text: str) -> tuple[str, ...]:
     from gsbake.geometry.region import Region
 
     return ("poses.region=auto", f"poses.region_box={json.dumps(Region.read(given_path(text)).numbers)}")
+
+
+def given_up(text: str) -> tuple[str, ...]:
+    """Settings of the up axis that an argument names: by what is level, or by two or three points "X,Y,Z"."""
+    if text in ("cameras", "markers", "ground"):
+        return (f"export.up={text}", "export.up_points=[]")
+    try:
+        points = [[float(number) for number in part.split(",")] for part in text.split()]
+    except ValueError:
+        points = []
+    if len(points) not in (2, 3) or any(len(point) != 3 for point in points):
+        raise typer.BadParameter(f"'{text}' is neither cameras, markers or ground nor two or three points, as in '0,0,0 1,0,0 0,1,0'.")
+    return (f"export.up_points={json.dumps([number for point in points for number in point])}",)
+
+
+def placement_settings(leave_out: list[str] | None, front: str | None, origin: Origin | None) -> tuple[str, ...]:
+    """Settings of `--leave-out`, `--front` and `--origin`."""
+    left = (f"ingest.leave_out={json.dumps(leave_out, ensure_ascii=False)}",) if leave_out else ()
+    return (
+        *left,
+        *(() if front is None else (f"export.front={front}",)),
+        *(() if origin is None else (f"export.origin={origin.value}",)),
+    )
 
 
 def given_targets(text: str) -> tuple[str, ...]:
@@ -153,6 +189,10 @@ SetOption = Annotated[
         "--set", metavar="SECTION.KEY=VALUE", help="Override one setting; repeatable.", show_default=False, autocompletion=complete_setting
     ),
 ]
+UnsetOption = Annotated[
+    list[str] | None,
+    typer.Option("--unset", metavar="SECTION.KEY", help="Return one setting to the profile's value; repeatable.", show_default=False),
+]
 MasksOption = Annotated[
     Masks | None,
     typer.Option(
@@ -193,6 +233,27 @@ RegionOption = Annotated[
         help="Box that is baked, in the cameras' frame: JSON with centre, size and rotation. auto: that of Metashape's file; none: none.",
     ),
 ]  # fmt: skip
+LeaveOutOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--leave-out", metavar="PHOTO", show_default=False, rich_help_panel=PHOTO_OPTIONS,
+        help="Photo that is not used, by the name of its file. Repeatable.",
+    ),
+]  # fmt: skip
+UpOption = Annotated[
+    Any,
+    typer.Option(
+        "--up", parser=given_up, metavar="NAME|'X,Y,Z X,Y,Z [X,Y,Z]'", show_default=False,
+        help="What is up: cameras, markers, ground; or, in the cameras' frame, three points of the ground or the ends of an upright edge.",
+    ),
+]  # fmt: skip
+FrontOption = Annotated[
+    str | None, typer.Option("--front", metavar="PHOTO", help="Photo that shows the front of the object.", show_default=False)
+]
+OriginOption = Annotated[
+    Origin | None,
+    typer.Option("--origin", help="Origin of the asset, by its box.  [default: auto: of given poses theirs]", show_default=False),
+]
 TargetOption = Annotated[
     list[Any] | None,
     typer.Option(
@@ -292,12 +353,12 @@ class Options:
     moved: bool = False
     require: Bounds = ()
 
-    def session(self, observer: Observer | None = None) -> Session:
-        """Session of the run that the options describe; nothing is written."""
+    def session(self, observer: Observer | None = None, unset: frozenset[str] = frozenset()) -> Session:
+        """Session of the run that the options describe, without the stored settings that `unset` names; nothing is written."""
         from gsbake.api import RunOptions, open_session
 
         run = RunOptions(
             self.photos, self.out, self.profile, self.overrides, self.masks, self.poses, self.device, self.threads, self.seed,
-            self.store, self.overwrite, self.moved,
+            self.store, self.overwrite, self.moved, unset,
         )  # fmt: skip
         return open_session(run, observer)

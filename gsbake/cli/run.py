@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 from gsbake.api import Result, Session
@@ -14,10 +15,9 @@ from gsbake.cli.inspect import plan_document, print_plan
 from gsbake.cli.kernels import compiling
 from gsbake.cli.options import Options
 from gsbake.cli.output import print_json, print_text
-from gsbake.errors import UsageError
-from gsbake.live.server import LiveView
-from gsbake.live.state import LiveState
+from gsbake.errors import GsbakeError, UsageError
 from gsbake.pipeline.plan import StageState
+from gsbake.studio.live import LiveState
 from gsbake.text import duration, number, size
 from gsbake.timing.expectations import Expectations
 
@@ -28,12 +28,9 @@ def run_pipeline(options: Options, until: str | None) -> None:
         raise UsageError("--require checks the report's figures: use it with `gsbake run` or `gsbake report`.")
     start = time.perf_counter()
     display = choose_display(quiet=options.quiet, verbose=options.verbose, as_json=options.as_json)
-    state = LiveState(display) if options.view else None
-    session = options.session(state or display)
+    session = options.session(display)
     expectations = Expectations(session.engine.request, session.engine.registry.names)
     display.expected = expectations.of
-    if state is not None:
-        state.expected = expectations.of
     if options.dry_run:
         states = session.engine.plan(until)
         if options.as_json:
@@ -41,8 +38,10 @@ def run_pipeline(options: Options, until: str | None) -> None:
         elif not options.quiet:
             print_plan(states)
         return
+    state = session.engine.observer = LiveState(display, session.out)
+    state.expected = expectations.of
     try:
-        with compiling(session, until, display), serving(state, session):
+        with recorded(state), compiling(session, until, display), serving(session, options.view):
             result = session.run(until)
     finally:
         close_display(display)
@@ -57,13 +56,31 @@ def run_pipeline(options: Options, until: str | None) -> None:
 
 
 @contextmanager
-def serving(state: LiveState | None, session: Session) -> Iterator[None]:
-    """Serve the live view while the run lasts; its address goes to stderr. Nothing without a state."""
-    if state is None:
+def recorded(state: LiveState) -> Iterator[None]:
+    """Record how the run ends."""
+    try:
+        yield
+    except GsbakeError as error:
+        state.end(error.exit_code, str(error))
+        raise
+    except BaseException as error:
+        state.end(1, f"{type(error).__name__}: {error}")
+        raise
+    state.end(0)
+
+
+@contextmanager
+def serving(session: Session, view: bool) -> Iterator[None]:
+    """With `view`, serve the studio for this run alone while it lasts; its address goes to stderr."""
+    if not view:
         yield
         return
-    with LiveView(state, session.out, session.profile.profile.surfels.transfer) as view:
-        print_text(f"Live view: {view.address}", error=True)
+    from gsbake.studio.server import Studio
+    from gsbake.studio.workspace import OneRun
+
+    assert session.project.photos is not None
+    with Studio(OneRun.of(Path(session.project.photos), session.out)) as studio:
+        print_text(f"Live view: {studio.address}", error=True)
         yield
 
 

@@ -50,6 +50,16 @@ def _box(numbers: tuple[float, ...]) -> tuple[float, ...]:
 
 #: Box of a region, empty for none.
 BoxNumbers = Annotated[tuple[float, ...], Field(max_length=15), AfterValidator(_box)]
+
+
+def _up_points(numbers: tuple[float, ...]) -> tuple[float, ...]:
+    if len(numbers) not in (0, 6, 9):
+        raise ValueError("it takes three points or the two ends of an edge, so nine or six numbers")
+    return numbers
+
+
+#: Points that show what is up.
+UpPoints = Annotated[tuple[float, ...], AfterValidator(_up_points)]
 #: A target that can be parsed, in its usual spelling.
 TargetText = Annotated[str, AfterValidator(_target)]
 #: A known distance that can be parsed.
@@ -70,6 +80,7 @@ class Ingest(Section):
     masks: Literal["auto", "require", "ignore"] = Field("auto", description="auto: use the masks there are, and make those that are missing (ingest.mask_network); require: a photo without a mask is an error; ignore: use none and make none.")
     mask_network: Literal["auto", "u2netp", "none"] = Field("auto", description="Network that guesses missing masks, which agreement between photos then corrects. auto: u2netp where its weights are installed; none: masks are not made.")
     invert_masks: bool = Field(False, description="Masks are white on the background instead of the object.")
+    leave_out: tuple[str, ...] = Field((), max_length=10_000, description="Photos that are not used: names of their files, or of frames of a video. --leave-out adds one.")
     max_megapixels: float = Field(250.0, gt=0, le=10_000, description="Photos and masks with more megapixels are skipped, from their header alone.")
     frames: int = Field(120, ge=3, le=10_000, description="Most photos taken from a video: evenly along its motion, the sharpest frame of each stretch.")
     min_photos: int = Field(3, ge=2, le=10_000, description="Minimum number of usable photos; fewer are an error.")
@@ -279,6 +290,9 @@ class Export(Section):
     """GLB and the files beside it."""
 
     up: Literal["cameras", "markers", "ground"] = Field("cameras", description="What is level. cameras: as they were held, or as given poses say; markers: the plane of the printed markers in the photos; ground: the plane on which the object stands (photos without masks).")
+    up_points: UpPoints = Field((), max_length=9, description="What is up, by points in the cameras' frame, before export.up: three points of the ground, or the lower and the upper end of an upright edge. --up takes them.")
+    front: str = Field("", description="Photo that shows the front: the asset is turned about its up axis to face that camera. Empty: as the cameras' frame has it.")
+    origin: Literal["auto", "bottom", "centre"] = Field("auto", description="Origin of the asset. bottom: the middle of its box's bottom; centre: the middle of its box; auto: that of given poses, else bottom.")
     max_megabytes: float = Field(5.0, gt=0, le=4096, description="Maximum file size in MB: normal and material maps are reduced to meet it; the audit warns above it.")
     max_triangles: int = Field(100_000, ge=100, le=10_000_000, description="Maximum triangle count; the audit fails above it.")
     copyright: str = Field("", description="Copyright line of the asset.")

@@ -27,7 +27,8 @@ from gsbake.imaging.exr import write_hdr
 from gsbake.imaging.png import encode_png
 from gsbake.monitor import SILENT, Monitor
 from gsbake.scale.measure import MetricScale, measure_scale
-from gsbake.scale.upright import measure_rotation
+from gsbake.scale.triangulation import find_entry
+from gsbake.scale.upright import front_rotation, measure_rotation
 
 #: Height of the exported environment map in pixels.
 LIGHT_HEIGHT = 256
@@ -74,9 +75,12 @@ def export_asset(
         to_world = cameras.to_world.then(Similarity(scale.metres))
         cameras = replace(cameras, to_world=to_world, metric=True)
     with monitor.part("up axis"):
-        rotation = measure_rotation(ingest, posed, surfels, settings.up, options.scale, monitor=monitor)
+        rotation = measure_rotation(ingest, posed, surfels, settings, options.scale, monitor=monitor)
     cameras = replace(cameras, to_world=cameras.to_world.then(Similarity(1.0, rotation)))
-    frame = asset_frame(cameras, arrays["position"])
+    if settings.front:
+        turn = _front(ingest, cameras, settings.front, arrays["position"])
+        cameras = replace(cameras, to_world=cameras.to_world.then(Similarity(1.0, turn)))
+    frame = asset_frame(cameras, arrays["position"], settings.origin)
     mesh = mesh_in_frame(arrays, frame)
     if not np.isfinite(mesh.position).all():
         raise BadInputError("export: the object is too large for the asset's single precision; check the scale of the poses.")
@@ -111,6 +115,20 @@ def export_asset(
         "audit_passed": passed,
         "audit_rules": rules,
     }
+
+
+def _front(ingest: Path, cameras: CameraSet, photo: str, position: NDArray[Any]) -> NDArray[np.float64]:
+    """The rotation (3, 3) of the world that makes the mesh with vertices (v, 3) face the camera of a photo.
+
+    Raises BadInputError for a photo that is none, or has no camera.
+    """
+    entries = json.loads((ingest / "photos.json").read_text(encoding="utf-8"))["photos"]
+    name = find_entry(entries, photo, "export.front")["name"]
+    camera = next((camera for camera in cameras.cameras if camera.name == name), None)
+    if camera is None:
+        raise BadInputError(f"The photo {photo} of export.front was not registered and has no camera; use another photo.")
+    placed = cameras.to_world.apply(np.asarray(position, np.float64))
+    return front_rotation(camera.moved(cameras.to_world), (placed.min(0) + placed.max(0)) / 2)
 
 
 def _size(mesh: GltfMesh, scale: MetricScale) -> dict[str, Any]:

@@ -1,7 +1,7 @@
 """The asset frame: glTF's right-handed +Y up axes, and the origin.
 
 The world is Z-up; (x, y, z) maps to (x, z, −y), so Blender's front (−Y) is glTF's front (+Z). Given poses keep their origin; that of solved
-poses is arbitrary, so the origin moves to the bottom centre of the object.
+poses is arbitrary, so the origin moves to the bottom centre of the object, unless the settings say where it is.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,15 +21,20 @@ from gsbake.geometry.cameras import Camera, CameraSet, Similarity
 Y_UP = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
 
 
-def asset_frame(cameras: CameraSet, position: NDArray[Any]) -> Similarity:
-    """The map from the unit frame of `cameras` to the asset frame; `position` (v, 3) are the mesh's vertices in the unit frame."""
+def asset_frame(cameras: CameraSet, position: NDArray[Any], origin: Literal["auto", "bottom", "centre"] = "auto") -> Similarity:
+    """The map from the unit frame of `cameras` to the asset frame; `position` (v, 3) are the mesh's vertices in the unit frame.
+
+    `origin`: the middle of the bottom or of the whole of their box; "auto" keeps that of given poses, and is else the bottom.
+    """
     to_gltf = cameras.to_world.then(Similarity(1.0, Y_UP, np.zeros(3)))
-    if cameras.poses == "given":
+    if cameras.poses == "given" and origin == "auto":
         return to_gltf
     placed = to_gltf.apply(np.asarray(position, np.float64))
     low, high = placed.min(0), placed.max(0)
-    origin = np.array([(low[0] + high[0]) / 2, low[1], (low[2] + high[2]) / 2])
-    return to_gltf.then(Similarity(1.0, np.eye(3), -origin))
+    place = (low + high) / 2
+    if origin != "centre":
+        place[1] = low[1]
+    return to_gltf.then(Similarity(1.0, np.eye(3), -place))
 
 
 def transforms_json(cameras: CameraSet, frame: Similarity, sources: dict[str, str]) -> dict[str, Any]:

@@ -61,7 +61,7 @@ class PickedPhotos:
 
     def ray(self, position: PixelPosition) -> Ray:
         """The ray of a pixel position in the user's file. Raises BadInputError for a photo without a camera or a pixel outside of it."""
-        entry = self._entry(position.photo)
+        entry = find_entry(self.entries, position.photo, "A known distance")
         width, height = entry["source_width"], entry["source_height"]
         if not (0 <= position.x <= width and 0 <= position.y <= height):
             pixel, pixels = f"{position.x:g},{position.y:g}", f"{width} × {height} pixels"
@@ -71,14 +71,16 @@ class PickedPhotos:
             raise BadInputError(f"The photo {position.photo} of a known distance was not registered and has no camera; use another photo.")
         return camera_rays(camera, np.array([[position.x * camera.width / width, position.y * camera.height / height]]))[0]
 
-    def _entry(self, photo: str) -> Mapping[str, Any]:
-        """The entry whose file has this path, file name, or name without suffix."""
-        for key in (lambda e: e["source"], lambda e: e["source"].rsplit("/", 1)[-1], lambda e: e["name"]):
-            found = [entry for entry in self.entries if key(entry) == photo]
-            if len(found) == 1:
-                return found[0]
-        names = shortlist([entry["source"] for entry in self.entries])
-        raise BadInputError(f"A known distance names the photo '{photo}', which is none of the photos ({names}).")
+
+def find_entry(entries: Sequence[Mapping[str, Any]], photo: str, what: str) -> Mapping[str, Any]:
+    """The entry of photos.json whose file has this path, file name, or name without suffix. Raises BadInputError, which says `what` names
+    the photo."""
+    for key in (lambda e: e["source"], lambda e: e["source"].rsplit("/", 1)[-1], lambda e: e["name"]):
+        found = [entry for entry in entries if key(entry) == photo]
+        if len(found) == 1:
+            return found[0]
+    names = shortlist([entry["source"] for entry in entries])
+    raise BadInputError(f"{what} names the photo '{photo}', which is none of the photos ({names}).")
 
 
 def triangulate(rays: Sequence[Ray], noise: float = PICK_NOISE) -> Point | None:

@@ -48,6 +48,22 @@ def test_two_photos_are_too_few(tmp_path: Path, runner: Runner) -> None:
         runner.ingest(photos(tmp_path / "images", 2))
 
 
+def test_photos_are_left_out_by_path_or_file_name(tmp_path: Path, runner: Runner) -> None:
+    folder = photos(tmp_path / "images", 6)
+    photos(folder / "side", 2, "jpg")
+    results, _ = runner.ingest(folder, settings={"leave_out": ("p4.png", "side/p0.jpg", "p1.jpg")})
+    assert results["photos"] == 5
+    assert [s["source"] for s in listing(runner)["skipped"]] == ["p4.png", "side/p0.jpg", "side/p1.jpg"]
+
+
+@pytest.mark.parametrize("name, problem", [("p9.png", "none"), ("p0.jpg", "2")])
+def test_a_photo_that_is_left_out_is_one_of_them(name: str, problem: str, tmp_path: Path, runner: Runner) -> None:
+    for folder in ("images", "images/side", "images/above"):
+        photos(tmp_path / folder, 2, "jpg" if folder != "images" else "png")
+    with pytest.raises(BadInputError, match=f"leave_out names '{name}', which is {problem} of the photos"):
+        runner.ingest(tmp_path / "images", settings={"leave_out": (name,)})
+
+
 def test_truncated_jpeg_is_skipped(tmp_path: Path, runner: Runner) -> None:
     folder = photos(tmp_path / "images", 4, "jpg")
     data = (folder / "p2.jpg").read_bytes()

@@ -323,8 +323,8 @@ def test_help_groups_commands_and_options_in_panels(run: Run) -> None:
     assert titles == ["Make", "Inspect", "Edit", "Many captures", "Files", "Single stages", "Options"]
     panels = dict(zip(titles, re.split(r"(?m)^\S.*:$", text)[1:], strict=True))
     listed = {title: re.findall(r"(?m)^  ([a-z]+) ", panels[title]) for title in titles[:-1]}
-    assert listed["Make"] == ["run", "check", "synth"] and listed["Many captures"] == ["plan", "batch", "cache"]
-    assert listed["Single stages"] == list(ORDER) and sum(map(len, listed.values())) == 25
+    assert listed["Make"] == ["run", "check", "studio", "synth"] and listed["Many captures"] == ["plan", "batch", "cache"]
+    assert listed["Single stages"] == list(ORDER) and sum(map(len, listed.values())) == 27
     assert "..." not in re.sub(r"\[ARGS\]\.\.\.", "", text)  # no sentence is cut
     for command in ("run", "mesh"):
         options = run(command, "--help").out
@@ -346,3 +346,36 @@ def test_a_run_says_the_time_left_or_that_it_is_unknown(run: Run, capture: Path,
     monkeypatch.setattr(gsbake.cli.display, "PROGRESS_INTERVAL", 0.0)
     lines = [line for line in run("run", capture).out.splitlines() if " of 3" in line]
     assert lines and all(re.search(r", (time left unknown|about [\d.]+ s left)$", line) for line in lines)
+
+
+def test_settings_are_stored_for_the_next_run(run: Run, capture: Path) -> None:
+    """`gsbake settings` runs nothing; the next run has what it stored, and each flag is its setting."""
+    box = Path("box.json")
+    box.write_text('{"centre": [0, 0, 1], "size": [1, 1, 2]}')
+    flags = ("--leave-out", "a.jpg", "--up", "0,0,0 1,0,0 0,1,0", "--front", "b.jpg", "--origin", "centre", "--region", box)
+    found = run("settings", capture, "--out", "o", "--set", "mesh.faces=777", *flags, "--json").json
+    turn = "1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0"
+    assert found["settings"] == [
+        "mesh.faces=777", "poses.region=auto", f"poses.region_box=[0.0, 0.0, 1.0, 1.0, 1.0, 2.0, {turn}]",
+        "export.up_points=[0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0]", 'ingest.leave_out=["a.jpg"]', "export.front=b.jpg",
+        "export.origin=centre",
+    ]  # fmt: skip
+    assert not Path("o/stages").exists()
+    assert run("run", "--out", "o", "--json").json["stages"][1]["results"] == {"faces": 777}
+    changed = run("settings", "--out", "o", "--unset", "mesh.faces", "--up", "ground", "--json").json["settings"]
+    assert {"export.up=ground", "export.up_points=[]", "export.front=b.jpg"} < set(changed) and "mesh.faces=777" not in changed
+    assert run("run", "--out", "o", "--json").json["stages"][1]["results"] == {"faces": 30_000}
+
+
+@pytest.mark.parametrize(
+    "words, sentence",
+    [
+        (("--unset", "mesh.triangles"), "There is no setting 'mesh.triangles' to unset"),
+        (("--up", "sideways"), "'sideways' is neither cameras, markers or ground nor two or three points"),
+        (("--up", "0,0,0 1,0"), "nor two or three points"),
+        (("--set", "export.up_points=[1, 2]"), "so nine or six numbers"),
+    ],
+)
+def test_settings_that_are_none(words: tuple[str, ...], sentence: str, run: Run, capture: Path) -> None:
+    end = run("settings", capture, "--out", "o", *words)
+    assert end.code in (2, 42) and sentence in end.err and not Path("o").exists()

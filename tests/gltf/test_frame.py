@@ -35,6 +35,15 @@ def test_solved_poses_have_their_origin_below_the_object() -> None:
     assert np.allclose(np.ptp(placed, axis=0), np.ptp(FRAME.apply(POINTS)[:, [0, 2, 1]], axis=0))
 
 
+def test_the_origin_that_the_settings_name() -> None:
+    for poses in ("given", "solved"):
+        cameras = CameraSet((VIEW,), FRAME, poses)
+        bottom, centre = (asset_frame(cameras, POINTS, origin).apply(POINTS) for origin in ("bottom", "centre"))  # type: ignore[arg-type]
+        middle = (bottom.min(0) + bottom.max(0)) / 2
+        assert np.isclose(bottom[:, 1].min(), 0) and np.allclose(middle[[0, 2]], 0)
+        assert np.allclose((centre.min(0) + centre.max(0)) / 2, 0)
+
+
 def test_exported_cameras_project_the_asset_to_the_photos_pixels() -> None:
     cameras = CameraSet((VIEW,), FRAME, "solved")
     frame = asset_frame(cameras, POINTS)

@@ -151,6 +151,17 @@ def test_the_up_axis_turns_asset_cameras_and_light(run: Path, asset: GltfAsset, 
     assert np.allclose(after[:, :3, :3], quarter @ before[:, :3, :3], atol=1e-6)
 
 
+def test_the_front_is_the_side_of_a_photo(run: Path, tmp_path: Path) -> None:
+    export(run, tmp_path / "turned", front="P03.JPG", origin="centre")
+    placed = read_glb(tmp_path / "turned/asset.glb").attributes["POSITION"]
+    assert np.allclose((placed.min(0) + placed.max(0)) / 2, 0, atol=1e-5)
+    frames = json.loads((tmp_path / "turned/cameras.json").read_text())["frames"]
+    at = np.array(frames[3]["transform_matrix"])[:3, 3]
+    assert abs(at[0]) < 1e-5 * np.linalg.norm(at) and at[2] > 0
+    with pytest.raises(BadInputError, match=r"export.front names the photo 'z.jpg', which is none"):
+        export(run, tmp_path / "none", front="z.jpg")
+
+
 def test_files(run: Path) -> None:
     assert {p.name for p in (run / "bake").iterdir()} == {"mesh.safetensors", "base_color.exr", "orm.exr", "normal.exr", "coverage.exr"}
     names = {str(p.relative_to(run / "export")) for p in (run / "export").rglob("*") if p.is_file()}

@@ -12,10 +12,11 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from gsbake.config.schema import Scale
+from gsbake.config.schema import Export, Scale
+from gsbake.errors import BadInputError
 from gsbake.geometry.cameras import Array, CameraSet, Similarity
 from gsbake.scale.markers import Marker
-from gsbake.scale.upright import marker_axis, measure_rotation
+from gsbake.scale.upright import front_rotation, marker_axis, measure_rotation, points_axis
 from gsbake.surfels.initialisation import fibonacci_sphere
 from gsbake.surfels.model import Surfels, create
 from tests.scale.test_markers import photograph, ring
@@ -56,10 +57,10 @@ def test_markers_in_photos_level_the_world(tmp_path: Path) -> None:
         photograph(tmp_path / "photos", cameras, "aruco-5x5", number, at)
     CameraSet(tuple(c.moved(Similarity(1.0, TILT)) for c in cameras)).save(tmp_path / "photo_cameras.json")
     monitor = Recorder()
-    rotation = measure_rotation(tmp_path, posed(tmp_path), tmp_path, "markers", Scale(), monitor=monitor)
+    rotation = measure_rotation(tmp_path, posed(tmp_path), tmp_path, Export(up="markers"), Scale(), monitor=monitor)
     assert np.degrees(np.arccos((rotation @ TILT[:, 2])[2])) < 0.2
     assert monitor.decisions["up axis"][0] == f"markers, {np.degrees(np.arccos(TILT[2, 2])):.1f}° off that of the cameras"
-    assert np.array_equal(measure_rotation(tmp_path, posed(tmp_path), tmp_path, "cameras", Scale()), np.eye(3))
+    assert np.array_equal(measure_rotation(tmp_path, posed(tmp_path), tmp_path, Export(), Scale()), np.eye(3))
 
 
 @pytest.mark.parametrize("masks", [False, True])
@@ -73,7 +74,7 @@ def test_the_ground_under_an_object(masks: bool, tmp_path: Path) -> None:
     surfels = create(points @ lean.T, normals @ lean.T, np.full(len(points), 0.02), None, "colour", 0, 0.0, 50.0)
     surfels.save(tmp_path / "surfels.safetensors")
     monitor = Recorder()
-    rotation = measure_rotation(tmp_path, posed(tmp_path, masks), tmp_path, "ground", Scale(), monitor=monitor)
+    rotation = measure_rotation(tmp_path, posed(tmp_path, masks), tmp_path, Export(up="ground"), Scale(), monitor=monitor)
     if masks:
         assert np.array_equal(rotation, np.eye(3)) and "the photos have masks" in monitor.warnings[0]
     else:
@@ -85,5 +86,33 @@ def test_without_ground_up_stays_that_of_the_cameras(tmp_path: Path) -> None:
     ball: Surfels = create(0.5 * p, p, np.full(len(p), 0.03), None, "colour", 0, 0.0, 50.0)
     replace(ball, sdf=torch.zeros(len(p))).save(tmp_path / "surfels.safetensors")
     monitor = Recorder()
-    assert np.array_equal(measure_rotation(tmp_path, posed(tmp_path), tmp_path, "ground", Scale(), monitor=monitor), np.eye(3))
+    assert np.array_equal(measure_rotation(tmp_path, posed(tmp_path), tmp_path, Export(up="ground"), Scale(), monitor=monitor), np.eye(3))
     assert "up is that of the cameras" in monitor.warnings[0]
+
+
+def test_up_by_points() -> None:
+    """Three points of the ground give its normal on the cameras' side in either order; an edge gives its own direction."""
+    ground, above = np.array([(0.2, 0, 0), (1, 0.1, 0), (0, 1, 0)]) @ TILT.T, np.array([(0, 0, 2.0)]) @ TILT.T
+    for order in ([0, 1, 2], [2, 1, 0]):
+        axis, evidence = points_axis(ground[order], above)
+        assert np.allclose(axis, TILT[:, 2]) and evidence == "three points of the ground"
+    assert np.allclose(points_axis(np.array([(1, 1, 3.0), (1, 1, 1)]), above)[0], (0, 0, -1))
+    for points in (ground[[0, 0, 1]], np.array([(0, 0, 0), (1, 1, 1), (2, 2, 2.001)]), ground[[1, 1]]):
+        with pytest.raises(BadInputError, match="coincide or lie on one line"):
+            points_axis(points, above)
+
+
+def test_up_by_points_comes_before_what_is_level(tmp_path: Path) -> None:
+    numbers = tuple((np.array([(0, 0, 0), (1, 0, 0), (0, 1, 0)]) @ TILT.T).ravel())
+    monitor = Recorder()
+    rotation = measure_rotation(tmp_path, posed(tmp_path), tmp_path, Export(up="markers", up_points=numbers), Scale(), monitor=monitor)
+    assert np.allclose(rotation @ TILT[:, 2], (0, 0, 1)) and monitor.decisions["up axis"][1] == "three points of the ground"
+
+
+def test_the_front_is_where_a_camera_stands() -> None:
+    camera = ring()[2]
+    turn = front_rotation(camera, np.array([0.1, 0.2, 0]))
+    towards = turn @ (camera.centre - (0.1, 0.2, 0))
+    assert abs(towards[0]) < 1e-9 and towards[1] < 0 and np.allclose(turn @ (0, 0, 1), (0, 0, 1)) and np.isclose(np.linalg.det(turn), 1)
+    with pytest.raises(BadInputError, match="straight above or below"):
+        front_rotation(camera, camera.centre - (0, 0, 1))

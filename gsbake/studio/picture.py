@@ -1,6 +1,6 @@
 """The present picture of a run: surfels of the last checkpoint, then those of the finished stages, then the mesh, then the asset.
 
-It is drawn by a process of its own at low priority, `python -m gsbake.live.picture OUT FILE TRANSFER` (JPEG on standard output): the
+It is drawn by a process of its own at low priority, `python -m gsbake.studio.picture OUT FILE TRANSFER` (JPEG on standard output): the
 process that serves the page then imports neither torch nor kernels, and training loses as little as possible.
 """
 
@@ -50,7 +50,7 @@ def newest_source(out: Path, since: float) -> Source | None:
 
 def draw_in_process(out: Path, source: Path, transfer: str) -> bytes | None:
     """JPEG of a source, drawn by a child at low priority; None where that fails, as while a stage replaces the file."""
-    command = python_command("-m", "gsbake.live.picture", str(out), str(source), transfer)
+    command = python_command("-m", "gsbake.studio.picture", str(out), str(source), transfer)
     try:
         done = subprocess.run(command, capture_output=True, env=python_environment({"OMP_NUM_THREADS": "1"}), timeout=TIMEOUT, check=False)
     except (OSError, subprocess.TimeoutExpired):
