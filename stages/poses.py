@@ -19,12 +19,15 @@ def run(ctx: Context) -> dict[str, Any]:
 
 
 #: Modules with the kernels of this stage.
-KERNELS = ("gsbake.capture.hull.visual_hull", "gsbake.capture.sfm.matching", "gsbake.capture.hull.ray_distance")
+KERNELS = (
+    "gsbake.capture.hull.visual_hull", "gsbake.capture.sfm.matching", "gsbake.capture.sfm.patch_alignment",
+    "gsbake.capture.hull.ray_distance",
+)  # fmt: skip
 
 
 STAGE = Stage(
     name="poses",
-    version=14,
+    version=15,
     title="Camera poses",
     run=run,
     summary="{registered} photos registered, {points} tie points, {reprojection_px:px} reprojection error",
