@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 from gsbake.capture.sfm import solve
-from gsbake.capture.sfm.mask_agreement import MIN_AGREEMENT, mask_agreement
 from gsbake.capture.sfm.lenses import is_plausible_lens
+from gsbake.capture.sfm.mask_agreement import MIN_AGREEMENT, mask_agreement
 from gsbake.capture.sfm.solve import PoseSolver
 from gsbake.config.schema import Poses
 from gsbake.errors import BadInputError
