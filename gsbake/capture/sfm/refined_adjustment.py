@@ -22,6 +22,7 @@ from gsbake.capture.colmap import pycolmap
 from gsbake.capture.poses.colmap_model import camera_of
 from gsbake.capture.sfm.lenses import is_plausible_lens
 from gsbake.capture.sfm.track_refinement import Observations, refine_observations
+from gsbake.geometry.cameras import Camera, Similarity
 
 Doubles = NDArray[np.float64]
 #: {(image, feature): position (2,)}.
@@ -31,6 +32,8 @@ Positions = Mapping[tuple[int, int], Doubles]
 LEFT_OUT, MIN_LEFT_OUT = 10, 30
 #: Residual in pixels from which an observation loses weight (Cauchy): three times what refined ones have.
 LOSS_SCALE = 0.3
+#: Largest error in pixels and smallest angle between rays in degrees of what is kept, as in COLMAP's mapping.
+MAX_ERROR, MIN_ANGLE = 4.0, 1.5
 #: Lens models that are tried, and what they have more than SIMPLE_RADIAL: the second coefficient of the distortion shows where observations
 #: are this precise.
 LENSES = {"RADIAL": 1, "SIMPLE_RADIAL": 0}
@@ -60,15 +63,18 @@ def adjust_refined(model: Any, photos: Path, detected_size: int, tick: Callable[
         before = test.errors(model)
         for lens in LENSES:
             trained = _bundle_adjust(_with_lens(_moved(_without(model, left_out), positions), lens))
-            if not all(is_plausible_lens(camera_of(image, image.name, "the model")) for image in trained.images.values() if image.has_pose):
+            if not all(map(is_plausible_lens, _cameras(trained))):
                 continue
+            _align(trained, model)
             after = test.errors(trained)
             better = [float((a < b).mean()) for a, b in zip(after, before, strict=True)]
             medians = [[float(np.median(b)), float(np.median(a))] for a, b in zip(after, before, strict=True)]
             figures |= {"lens": lens, "refined_px": medians[0], "detected_px": medians[1], "better": better}
             certain = 1 / len(left_out) ** 0.5
             if better[0] > 0.5 + certain and better[1] > 0.5 - certain:
-                model = _bundle_adjust(_take_cameras(_moved(copy.deepcopy(model), positions), trained))
+                all_tracks = _take_cameras(_moved(copy.deepcopy(model), positions), trained)
+                model = _bundle_adjust(_bundle_adjust(all_tracks, points_only=True))
+                pycolmap.ObservationManager(model).filter_all_points3D(MAX_ERROR, MIN_ANGLE)
                 figures["used"] = True
                 break
     return Adjusted(model, figures | {"decision": _decision(figures), "seconds": time.perf_counter() - start})
@@ -140,6 +146,21 @@ def _take_cameras(model: Any, other: Any) -> Any:
         if frame.has_pose():
             model.frames[key].rig_from_world = frame.rig_from_world
     return model
+
+
+def _cameras(model: Any) -> list[Camera]:
+    """The cameras of a model, in the order of its images."""
+    return [
+        camera_of(model.images[key], model.images[key].name, "the solved model")
+        for key in sorted(model.images)
+        if model.images[key].has_pose
+    ]
+
+
+def _align(model: Any, other: Any) -> None:
+    """Move a model in place to where `other`, of the same photos, has its cameras: adjustment leaves the frame free."""
+    to_other = Similarity.between(*(np.stack([camera.centre for camera in _cameras(each)]) for each in (model, other)))
+    model.transform(pycolmap.Sim3d(to_other.scale, pycolmap.Rotation3d(to_other.rotation), to_other.translation))
 
 
 def _bundle_adjust(model: Any, points_only: bool = False) -> Any:
