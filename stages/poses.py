@@ -19,7 +19,10 @@ def run(ctx: Context) -> dict[str, Any]:
 
 
 #: Modules with the kernels of this stage.
-KERNELS = ("gsbake.capture.hull.visual_hull", "gsbake.capture.sfm.matching", "gsbake.capture.hull.ray_distance")
+KERNELS = (
+    "gsbake.capture.hull.visual_hull", "gsbake.capture.sfm.matching", "gsbake.capture.sfm.patch_alignment",
+    "gsbake.capture.hull.ray_distance",
+)  # fmt: skip
 
 
 STAGE = Stage(

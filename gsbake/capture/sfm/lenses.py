@@ -1,7 +1,8 @@
-"""Which photos share intrinsics: those of one camera at one focal length and size, or with equal given intrinsics.
+"""Lenses: which photos share one, and which are plausible.
 
-Two bodies of one model have different lenses and sensors; the serial number in EXIF tells them apart. Where EXIF names a model without one
-(telephones), photos of each sub-folder are taken for those of one body, unless they are too few to calibrate it.
+Photos share intrinsics that are of one camera at one focal length and size, or that were given equal. Two bodies of one model differ in
+lenses and sensors; the serial number in EXIF tells them apart. Where EXIF names a model without one (telephones), photos of each sub-folder
+are taken for those of one body, unless they are too few to calibrate it.
 """
 
 from __future__ import annotations
@@ -10,11 +11,17 @@ from collections import Counter
 from collections.abc import Sequence
 from typing import Any
 
-from gsbake.capture.photos.undistortion import intrinsics_key
+import numpy as np
+
+from gsbake.capture.photos.undistortion import distort, intrinsics_key, pinhole_camera
+from gsbake.errors import BadInputError
 from gsbake.geometry.cameras import Camera
 
 #: Photos in each of several sub-folders from which each folder has a camera of its own.
 MIN_FOLDER_PHOTOS = 12
+#: Largest shift that a lens's distortion plausibly causes at the corner of a photo, as a share of the corner's distance from the centre;
+#: wide-angle lenses reach a quarter.
+MAX_DISTORTION = 0.35
 
 
 def _folder(entry: dict[str, Any]) -> str:
@@ -51,3 +58,18 @@ def given_lenses(cameras: Sequence[Camera]) -> list[dict[str, Any]]:
         {"names": [c.name for c in members], "width": members[0].width, "height": members[0].height, "focal": None}
         for members in groups.values()
     ]
+
+
+def is_plausible_lens(camera: Camera) -> bool:
+    """Whether a lens may have the distortion of `camera`.
+
+    Photos that show two things that move against each other, such as an object on a turntable and the room, have no common cameras; what is
+    left of the contradiction ends up in the distortion.
+    """
+    corner = np.array([camera.width / 2 / camera.fx, camera.height / 2 / camera.fy])
+    try:
+        pinhole_camera(camera)
+    except BadInputError:
+        return False
+    moved = distort(corner, camera.distortion or (0.0,))
+    return bool(np.linalg.norm(moved - corner) <= MAX_DISTORTION * np.linalg.norm(corner))

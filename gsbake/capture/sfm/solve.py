@@ -11,12 +11,9 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-import numpy as np
-
-from gsbake.capture.photos.undistortion import distort, pinhole_camera
 from gsbake.capture.sfm.coincidence import MAX_COINCIDING, coinciding
 from gsbake.capture.sfm.feature_masks import FeatureMasks
-from gsbake.capture.sfm.lenses import given_lenses, solved_lenses
+from gsbake.capture.sfm.lenses import given_lenses, is_plausible_lens, solved_lenses
 from gsbake.capture.sfm.pairs import choose_matching
 from gsbake.capture.sfm.process import JobCallbacks, run_job
 from gsbake.capture.sfm.standing_background import StandingBackground, find_standing_background
@@ -33,9 +30,6 @@ from gsbake.text import shortlist
 SECONDS_PER_PHOTO, MIN_SECONDS = 60.0, 1800.0
 #: Share of registered photos below which the other kind of features is tried too.
 MIN_PLACED_SHARE = 0.85
-#: Largest shift that a lens's distortion plausibly causes at the corner of a photo, as a share of the corner's distance from the centre;
-#: wide-angle lenses reach a quarter.
-MAX_DISTORTION = 0.35
 _FEATURES: dict[Region, str] = {
     "whole photos": "in whole photos", "moving parts": "on what moves", "masks": "inside the masks",
     "outside the masks": "outside the masks",
@@ -126,6 +120,7 @@ class PoseSolver:
             self.monitor.decide("registration", f"{count} of {len(names)} photos after {len(result['steps'])} steps", f"photos by {gains}")
         error = f"reprojection error {result['reprojection_px']:.2f} px"
         self.monitor.decide("structure from motion", f"{count} of {len(names)} photos registered", error)
+        self.monitor.decide("sub-pixel observations", *result["refinement"].pop("decision"))
         figures = {
             "registered": count,
             "registered_share": count / len(names),
@@ -141,6 +136,7 @@ class PoseSolver:
             "photos_detected": result["detected"],
             "pairs_matched": result["matched"],
             "pairs_verified": result["verified"],
+            "refinement": result["refinement"],
             "seconds": result["seconds"],
         }
         if found.folder != self.folder:
@@ -308,21 +304,6 @@ class PoseSolver:
             self.monitor.check_stop()
             raise InterruptedRun("Stopped on request.")
         return result
-
-
-def is_plausible_lens(camera: Camera) -> bool:
-    """Whether a lens may have the distortion of `camera`.
-
-    Photos that show two things that move against each other, such as an object on a turntable and the room, have no common cameras; what is
-    left of the contradiction ends up in the distortion.
-    """
-    corner = np.array([camera.width / 2 / camera.fx, camera.height / 2 / camera.fy])
-    try:
-        pinhole_camera(camera)
-    except BadInputError:
-        return False
-    moved = distort(corner, camera.distortion or (0.0,))
-    return bool(np.linalg.norm(moved - corner) <= MAX_DISTORTION * np.linalg.norm(corner))
 
 
 def _tied_together(masked: bool, masks: bool) -> str:

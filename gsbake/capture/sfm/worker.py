@@ -14,6 +14,7 @@ import traceback
 from collections.abc import Mapping
 from contextlib import closing
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,7 @@ from gsbake.capture.sfm.epipolar import epipolar_error
 from gsbake.capture.sfm.feature_cache import FeatureCache
 from gsbake.capture.sfm.pairs import exhaustive, neighbouring_views
 from gsbake.capture.sfm.reconstruction import FeatureOptions, Lens, SfmPipeline, registered_names
+from gsbake.capture.sfm.refined_adjustment import adjust_refined
 from gsbake.errors import InterruptedRun
 from gsbake.geometry.cameras import Camera, CameraSet
 from gsbake.geometry.ply import write_cloud
@@ -92,9 +94,13 @@ def solve(job: Mapping[str, Any]) -> dict[str, Any]:
     if model is None or model.num_reg_images() == 0:
         return {"registered": 0, "points": 0, "reprojection_px": None, "missing": pipeline.names, "seconds": pipeline.seconds}
     out = Path(job["out"])
+    _report_progress("refinement", 0, 1)
+    adjusted = adjust_refined(model, pipeline.folder, pipeline.options.max_size, partial(_report_progress, "refinement"))
+    pipeline.seconds["refinement"] = adjusted.figures.pop("seconds")
+    model = adjusted.model
     model.extract_colors_for_all_images(str(pipeline.folder))
     counts = {"detected": len(pipeline.detected), "matched": pipeline.matched, "verified": pipeline.verified}
-    figures = counts | {"steps": pipeline.steps, "seconds": pipeline.seconds}
+    figures = counts | {"steps": pipeline.steps, "seconds": pipeline.seconds, "refinement": adjusted.figures}
     return _write(model, out, pipeline, True) | figures
 
 

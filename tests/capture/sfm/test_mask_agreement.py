@@ -13,8 +13,9 @@ import numpy as np
 import pytest
 
 from gsbake.capture.sfm import solve
+from gsbake.capture.sfm.lenses import is_plausible_lens
 from gsbake.capture.sfm.mask_agreement import MIN_AGREEMENT, mask_agreement
-from gsbake.capture.sfm.solve import PoseSolver, is_plausible_lens
+from gsbake.capture.sfm.solve import PoseSolver
 from gsbake.config.schema import Poses
 from gsbake.errors import BadInputError
 from gsbake.geometry.cameras import Camera, CameraSet
@@ -72,7 +73,8 @@ def answers(monkeypatch: pytest.MonkeyPatch) -> Callable[[Callable[[Mapping[str,
             CameraSet(tuple(cameras), poses="solved").save(out / "cameras.json")
             figures = {"reprojection_px": 0.4, "points": 100, "track_length": 4.0, "fine_features": False, "seconds": {}}
             counts = {"detected": 0, "matched": 0, "verified": 0, "steps": [["strict thresholds", len(cameras)]]}
-            return {"registered": len(cameras), "missing": [], **counts, **figures}
+            refinement = {"refinement": {"used": False, "decision": ["not used", "no photos"]}}
+            return {"registered": len(cameras), "missing": [], **counts, **figures, **refinement}
 
         monkeypatch.setattr(solve, "run_job", run_job)
         return jobs
