@@ -48,7 +48,7 @@ def kernels(settings: Any) -> tuple[str, ...]:
 
 STAGE = Stage(
     name="mesh",
-    version=12,
+    version=11,
     title="Mesh",
     run=run,
     summary="{faces} triangles, {dense_faces} before decimation",

@@ -350,11 +350,10 @@ class _Extraction:
             self.monitor.check_stop()
             return load_photo(self.posed, chosen[index], self.options.stereo_size)
 
-        def depth(index: int) -> tuple[NDArray[np.float32], NDArray[np.float32]] | None:
-            """Patches compare brightness: they are of use only where that confirmed the depth."""
-            return read_depth(files[index], with_phase=False) if files[index].exists() else None
-
-        return PatchTargets(PhotometricViews(cameras, photo, depth, tolerance), self.threads)
+        return PatchTargets(
+            PhotometricViews(cameras, photo, lambda index: read_depth(files[index]) if files[index].exists() else None, tolerance),
+            self.threads,
+        )
 
     def _decimate(self, vertices: Doubles, faces: Faces, cell: float) -> dict[str, Any]:
         """Decimate and write the low-poly mesh; its results for the manifest."""

@@ -46,16 +46,15 @@ class DepthMap:
         return z_depth(self.camera, self.plane, self.confidence > 0)
 
     def save(self, path: Path) -> None:
-        """Write depth, confidence and where local phase found them as a NumPy archive."""
-        by_phase = np.zeros(self.confidence.shape, bool) if self.by_phase is None else self.by_phase
-        np.savez(path, depth=self.depth(), confidence=self.confidence.astype(np.float16), by_phase=by_phase)
+        """Write depth and confidence as a NumPy archive, without those that local phase found: they are less exact."""
+        keep = np.True_ if self.by_phase is None else ~self.by_phase
+        np.savez(path, depth=np.where(keep, self.depth(), 0), confidence=np.where(keep, self.confidence, 0).astype(np.float16))
 
 
-def read_depth(path: Path, *, with_phase: bool = True) -> tuple[Floats, Floats]:
-    """z-depth (h, w; 0 = none) and confidence (h, w) in 0..1 that `DepthMap.save` wrote; without those of local phase if so asked."""
+def read_depth(path: Path) -> tuple[Floats, Floats]:
+    """z-depth (h, w; 0 = none) and confidence (h, w) in 0..1 that `DepthMap.save` wrote."""
     with np.load(path) as body:
-        keep = np.True_ if with_phase else ~body["by_phase"]
-        return np.where(keep, body["depth"], 0), np.where(keep, body["confidence"], 0).astype(np.float32)
+        return body["depth"], body["confidence"].astype(np.float32)
 
 
 def inverse_depth(camera: Camera, plane: Floats) -> Floats:

@@ -3,7 +3,7 @@
 The phase of the local signal does not depend on its brightness or contrast (Fleet & Jepson, *Computation of component image velocity
 from local phase information*, IJCV 1990). Here it is the even part, the Laplacian, as a share of the even and the odd part, the length of
 the gradient (compare Felsberg & Sommer, *The monogenic signal*, IEEE Transactions on Signal Processing 2001). Where photos confirm little
-by their brightness, what they confirm by this is added.
+by their brightness, what they confirm by this gives surfels more points to start on.
 """
 
 from __future__ import annotations

@@ -62,7 +62,6 @@ def test_confirmed_depths_stay(tmp_path: Path) -> None:
     np.testing.assert_array_equal(both.plane[0, :3, 0], [1, 2, 1])
     np.testing.assert_array_equal(both.views, [[5, 4, 2, 0]])
     both.save(tmp_path / "both.npz")
-    for phase in (True, False):
-        depth, confidence = read_depth(tmp_path / "both.npz", with_phase=phase)
-        np.testing.assert_array_equal(depth > 0, [[True, phase, True, False]])
-        np.testing.assert_array_equal(confidence > 0, depth > 0)
+    depth, confidence = read_depth(tmp_path / "both.npz")
+    np.testing.assert_array_equal(depth > 0, [[True, False, True, False]])
+    np.testing.assert_array_equal(confidence > 0, depth > 0)
