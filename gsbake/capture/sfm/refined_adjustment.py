@@ -170,6 +170,6 @@ def _bundle_adjust(model: Any, points_only: bool = False) -> Any:
     options.refine_focal_length = options.refine_extra_params = options.refine_rig_from_world = not points_only
     options.ceres.loss_function_type, options.ceres.loss_function_scale = pycolmap.LossFunctionType.CAUCHY, LOSS_SCALE
     options.ceres.solver_options.num_threads = 1
-    options.ceres.solver_options.function_tolerance, options.ceres.solver_options.max_num_iterations = 1e-6, 50
+    options.ceres.solver_options.function_tolerance, options.ceres.solver_options.max_num_iterations = 1e-4, 50
     pycolmap.bundle_adjustment(model, options)
     return model
