@@ -3,7 +3,8 @@
 Cameras are judged by tracks left out of the adjustment: their points are triangulated with the cameras held still, and what remains is the
 cameras' error and that of the observations, which is the same for all cameras. Refined positions show the difference best. Those of SIFT
 are a second, independent witness: a bias of the alignment would not carry over to them. The cameras are better when refined positions are
-explained better in more than half of the tracks, by two standard errors of that share, and those of SIFT are not worse by as much.
+explained better in more than half of the tracks, by two standard errors of that share, and the error at SIFT's is not larger by a tenth:
+the cameras before have the advantage that they were adjusted to these.
 """
 
 from __future__ import annotations
@@ -28,8 +29,11 @@ Doubles = NDArray[np.float64]
 #: {(image, feature): position (2,)}.
 Positions = Mapping[tuple[int, int], Doubles]
 
-#: One of so many tracks is left out, if at least three of its observations were refined; fewer tracks than the least number decide nothing.
-LEFT_OUT, MIN_LEFT_OUT = 10, 30
+#: Of the tracks with at least three refined observations one in so many is left out, up to one in three where that gives too few tracks;
+#: fewer than the least number decide nothing.
+LEFT_OUT, MOST_LEFT_OUT, ENOUGH_LEFT_OUT, MIN_LEFT_OUT = 10, 3, 40, 30
+#: Factor by which the error at SIFT's positions may grow.
+TOLERANCE = 1.1
 #: Residual in pixels from which an observation loses weight (Cauchy): three times what refined ones have.
 LOSS_SCALE = 0.3
 #: Largest error in pixels and smallest angle between rays in degrees of what is kept, as in COLMAP's mapping.
@@ -55,7 +59,8 @@ def adjust_refined(model: Any, photos: Path, detected_size: int, tick: Callable[
     keys = [(observed.images[p], int(f)) for p, f in zip(observed.photo, observed.feature, strict=True)]
     positions = {key: refined.xy[k] for k, key in enumerate(keys) if refined.refined[k]}
     lengths = np.bincount(observed.track[refined.refined], minlength=len(observed.track_ids))
-    left_out = set(observed.track_ids[(np.arange(len(lengths)) % LEFT_OUT == 0) & (lengths >= 3)].tolist())
+    judges = observed.track_ids[lengths >= 3]
+    left_out = set(judges[:: max(MOST_LEFT_OUT, min(LEFT_OUT, len(judges) // ENOUGH_LEFT_OUT))].tolist())
     share = float(refined.refined.mean()) if len(keys) else 0.0
     figures: dict[str, Any] = {"used": False, "refined_share": share, "left_out_tracks": len(left_out)}
     if len(left_out) >= MIN_LEFT_OUT:
@@ -70,8 +75,7 @@ def adjust_refined(model: Any, photos: Path, detected_size: int, tick: Callable[
             better = [float((a < b).mean()) for a, b in zip(after, before, strict=True)]
             medians = [[float(np.median(b)), float(np.median(a))] for a, b in zip(after, before, strict=True)]
             figures |= {"lens": lens, "refined_px": medians[0], "detected_px": medians[1], "better": better}
-            certain = 1 / len(left_out) ** 0.5
-            if better[0] > 0.5 + certain and better[1] > 0.5 - certain:
+            if better[0] > 0.5 + len(left_out) ** -0.5 and medians[1][1] <= TOLERANCE * medians[1][0]:
                 all_tracks = _take_cameras(_moved(copy.deepcopy(model), positions), trained)
                 model = _bundle_adjust(_bundle_adjust(all_tracks, points_only=True))
                 pycolmap.ObservationManager(model).filter_all_points3D(MAX_ERROR, MIN_ANGLE)
@@ -82,8 +86,10 @@ def adjust_refined(model: Any, photos: Path, detected_size: int, tick: Callable[
 
 def _decision(figures: Mapping[str, Any]) -> tuple[str, str]:
     """What was chosen, and the evidence."""
-    if "refined_px" not in figures:
+    if figures["left_out_tracks"] < MIN_LEFT_OUT:
         return "not used", f"{figures['left_out_tracks']} tracks to judge the cameras by, fewer than {MIN_LEFT_OUT}"
+    if "refined_px" not in figures:
+        return "not used", "the adjusted lenses are none that exist"
     refined, detected = (" → ".join(f"{error:.3f}" for error in figures[key]) for key in ("refined_px", "detected_px"))
     better, as_detected = (f"better in {100 * part:.0f} %" for part in figures["better"])
     evidence = f"{figures['left_out_tracks']} tracks left out: {refined} px ({better}), at SIFT's positions {detected} px ({as_detected})"
@@ -170,6 +176,6 @@ def _bundle_adjust(model: Any, points_only: bool = False) -> Any:
     options.refine_focal_length = options.refine_extra_params = options.refine_rig_from_world = not points_only
     options.ceres.loss_function_type, options.ceres.loss_function_scale = pycolmap.LossFunctionType.CAUCHY, LOSS_SCALE
     options.ceres.solver_options.num_threads = 1
-    options.ceres.solver_options.function_tolerance, options.ceres.solver_options.max_num_iterations = 1e-6, 50
+    options.ceres.solver_options.function_tolerance, options.ceres.solver_options.max_num_iterations = 1e-4, 50
     pycolmap.bundle_adjustment(model, options)
     return model

@@ -11,8 +11,9 @@ from PIL import Image
 
 from gsbake.capture.colmap import pycolmap
 from gsbake.capture.poses.colmap_model import camera_of
+from gsbake.capture.sfm import refined_adjustment
 from gsbake.capture.sfm.refined_adjustment import adjust_refined
-from gsbake.capture.sfm.track_refinement import Observations, refine_observations
+from gsbake.capture.sfm.track_refinement import Observations, Refined, refine_observations
 from gsbake.geometry.cameras import Camera, Similarity
 from tests.capture.test_poses import board_capture
 
@@ -95,6 +96,19 @@ def test_observations_lie_where_the_first_photo_of_a_track_has_them(tmp_path: Pa
     assert spread(refined.xy) < 0.1 < 0.4 < spread(observed.xy)
     assert np.linalg.norm(refined.xy - observed.xy, axis=1).max() <= 4 * max(1, 320 / detected_size)
     assert ticks[-1][0] == ticks[-1][1] and all(a[0] < b[0] for a, b in zip(ticks, ticks[1:], strict=False))
+
+
+def test_cameras_that_do_not_explain_tracks_better_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Positions that an alignment has moved at random, as it would in photos of something that moves."""
+    true = board_capture(tmp_path)
+    rng = np.random.default_rng(3)
+    model = model_of(true, rng)
+    observed = Observations.of(model)
+    moved = Refined(observed.xy + rng.normal(0, 2, observed.xy.shape), np.ones(len(observed.xy), np.bool_))
+    monkeypatch.setattr(refined_adjustment, "refine_observations", lambda *arguments: moved)
+    adjusted = adjust_refined(model, tmp_path / "images", 1600, lambda done, total: None)
+    assert adjusted.model is model and not adjusted.figures["used"] and adjusted.figures["left_out_tracks"] >= 30
+    assert adjusted.figures["decision"][0] == "not used" and "tracks left out" in adjusted.figures["decision"][1]
 
 
 def test_photos_that_show_nothing_change_nothing(tmp_path: Path) -> None:
