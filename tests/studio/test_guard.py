@@ -109,7 +109,7 @@ def test_hostile_requests_get_a_refusal(browser: Browser) -> None:
     assert sorted(p for p in browser.folder.rglob("*") if ".gsbake-studio" not in p.parts) == before
 
 
-def test_the_server_listens_on_loopback_and_is_gone_afterwards(tmp_path: Path) -> None:
+def test_the_server_listens_on_loopback_and_is_gone_afterwards(extra: None, tmp_path: Path) -> None:
     with Studio(Folder(tmp_path)) as studio:
         assert studio.address.startswith("http://127.0.0.1:") and len(studio.token) >= 22
         answer = urllib.request.urlopen(studio.address, timeout=10)
