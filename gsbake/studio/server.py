@@ -8,6 +8,7 @@ import secrets
 import socket
 import threading
 from types import TracebackType
+from urllib.parse import quote
 
 from gsbake.errors import UsageError
 from gsbake.studio.workspace import Workspace
@@ -29,7 +30,8 @@ def require_packages() -> None:
 class Studio:
     """A server for a workspace; a context, in which `address` is valid. Raises UsageError where the extra is not installed."""
 
-    def __init__(self, workspace: Workspace, port: int = 0) -> None:
+    def __init__(self, workspace: Workspace, port: int = 0, *, run: str = "") -> None:
+        """`run` names the capture at whose run the page opens; without it the page lists all."""
         require_packages()
         import uvicorn
 
@@ -37,6 +39,7 @@ class Studio:
         from gsbake.studio.services import Services
 
         self.token = secrets.token_urlsafe(16)
+        self._place = f"#/{quote(run, safe='')}/run" if run else ""
         self._socket = socket.socket(proto=socket.IPPROTO_TCP)  # asyncio sends at once only where the protocol is named
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
@@ -61,7 +64,7 @@ class Studio:
     @property
     def address(self) -> str:
         """The page's address, with the token."""
-        return f"http://{HOST}:{self.port}/?token={self.token}"
+        return f"http://{HOST}:{self.port}/?token={self.token}{self._place}"
 
     def wait(self) -> None:
         """Serve until the thread ends, or an exception such as that of Ctrl-C."""

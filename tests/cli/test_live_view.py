@@ -17,7 +17,7 @@ def test_a_run_says_where_its_page_is(run: Run, capture: Path) -> None:
     for module in MODULES:
         pytest.importorskip(module, reason="the extra `studio` is not installed")
     end = run("run", capture, "--out", "o", "--view", "--quiet")
-    assert end.code == 0 and re.search(r"Live view: http://127\.0\.0\.1:\d+/\?token=[\w-]{20,}\n", end.err)
+    assert end.code == 0 and re.search(r"Live view: http://127\.0\.0\.1:\d+/\?token=[\w-]{20,}#/o/run\n", end.err)
     assert Path("o/asset.glb").exists() and "Live view" not in run("run", "--out", "o").err
 
 
