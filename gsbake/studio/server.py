@@ -51,12 +51,18 @@ class Studio:
         self.port: int = self._socket.getsockname()[1]
         self._services = Services()
         config = uvicorn.Config(
-            guarded_app(workspace, self._services, self.token, self.port), http="h11", ws="none", lifespan="off", log_config=None,
+            guarded_app(workspace, self._services, self.token, self.port), http="h11", ws="none", lifespan="off",
+            log_config=None, log_level="critical",
             access_log=False, server_header=False, date_header=False, timeout_keep_alive=KEEP_ALIVE, limit_concurrency=MAX_CONNECTIONS,
             timeout_graceful_shutdown=LAST_SECONDS,
         )  # fmt: skip
-        self._server = uvicorn.Server(config)
-        self._server.main_loop = self._idle  # type: ignore[method-assign]
+        studio = self
+
+        class Server(uvicorn.Server):
+            async def main_loop(self) -> None:
+                await studio._idle()
+
+        self._server = Server(config)
         self._ready = threading.Event()
         self._end: tuple[asyncio.AbstractEventLoop, asyncio.Event] | None = None
         self._thread = threading.Thread(target=self._serve, name="studio", daemon=True)
