@@ -79,7 +79,8 @@ def serving(session: Session, view: bool) -> Iterator[None]:
     from gsbake.studio.workspace import OneRun
 
     assert session.project.photos is not None
-    with Studio(OneRun.of(Path(session.project.photos), session.out)) as studio:
+    one = OneRun.of(Path(session.project.photos), session.out)
+    with Studio(one, run=one.name) as studio:
         print_text(f"Live view: {studio.address}", error=True)
         yield
 

@@ -17,6 +17,7 @@ from starlette.responses import Response
 from gsbake.errors import BadInputError, GsbakeError, UsageError
 from gsbake.studio.services import Services
 from gsbake.studio.workspace import Capture, NotFoundError, Workspace
+from gsbake.text import printable
 
 #: Largest body of a request in bytes: settings, and the image of a mask.
 MAX_JSON, MAX_IMAGE = 1_000_000, 40_000_000
@@ -84,6 +85,8 @@ def endpoint(work: Work, limit: int = 0, *, raw: bool = False) -> Callable[[Requ
             return Response(status_code=400)
         except OSError as error:
             return refusal(BadInputError(f"A file cannot be read or written ({error.strerror or error})."))
+        except Exception as error:
+            return document({"error": printable(f"Internal error ({type(error).__name__}: {str(error)[:300]}).")}, 500)
         return found if isinstance(found, Response) else document(found)
 
     return answer

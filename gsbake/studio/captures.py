@@ -10,6 +10,7 @@ from gsbake.batch.captures import CapturePlan, states_of
 from gsbake.batch.page import COLUMNS, Cell, figures_of
 from gsbake.errors import GsbakeError
 from gsbake.pipeline.engine import artifacts_by_stage
+from gsbake.pipeline.uses import in_use
 from gsbake.publish import published_results
 from gsbake.studio.answers import Call
 from gsbake.studio.images import SMALL
@@ -50,6 +51,8 @@ def details(call: Call) -> dict[str, Any]:
         state, message = "empty" if not capture.photos() else "failed", str(error)
     if live is not None and live.runs:
         state, message = "running", live.summary
+    elif in_use(capture.out):  # a job of a batch, which writes no live.json
+        state = "running"
     elif live is not None and state == "unfinished" and live.document.get("exit_code") not in (0, None):
         state, message = "failed" if live.document.get("exit_code") != 75 else "unfinished", str(live.document.get("message", ""))
     return {

@@ -21,6 +21,7 @@ from gsbake.imaging.image_process import read_pixels
 from gsbake.imaging.png import encode_png, write_png
 from gsbake.own_files import SET_ASIDE, set_aside
 from gsbake.studio.answers import Call
+from gsbake.studio.grab_cut import grab_cut
 from gsbake.studio.images import LARGE, Shown
 from gsbake.studio.outputs import Output, entries, outputs
 from gsbake.studio.sessions import session_of
@@ -32,9 +33,6 @@ Bytes = NDArray[np.uint8]
 MASKS = "masks"
 #: File in the cache with the digests of the masks that the studio wrote.
 WRITTEN = "masks.json"
-#: Longer side in pixels at which GrabCut works, its iterations, and how far beyond a stroke it looks: a share of the stroke's longer side,
-#: and one of the picture's.
-CUT_SIZE, CUT_STEPS, CUT_MARGIN, CUT_ROOM = 640, 4, 1.0, 0.12
 #: Deflate level of masks on their way to the page.
 LEVEL = 1
 
@@ -106,33 +104,6 @@ def cut(call: Call) -> Response:
     photo: Any = cv2.imread(str(shown.file), cv2.IMREAD_COLOR)
     mask = np.asarray(np.where(red, 255, 0), np.uint8)
     return Response(encode_png(grab_cut(photo, mask, green, blue), LEVEL), media_type="image/png")
-
-
-def grab_cut(photo: Bytes, mask: Bytes, inside: NDArray[np.bool_], outside: NDArray[np.bool_]) -> Bytes:
-    """The mask (h, w) of a photo (h, w, 3, BGR) with strokes (h, w) `inside` and `outside` the object, around which GrabCut (Rother et al.,
-    SIGGRAPH 2004) finds the border. Raises UsageError without a stroke."""
-    rows, columns = np.nonzero(inside | outside)
-    if not len(rows):
-        raise UsageError("There is no stroke; draw one over the part that the mask lacks, or has too much.")
-    margin = int(CUT_MARGIN * max(np.ptp(rows), np.ptp(columns)) + CUT_ROOM * max(mask.shape)) + 1
-    box = [slice(max(int(at.min()) - margin, 0), int(at.max()) + margin) for at in (rows, columns)]
-    window = tuple(box)
-    height, width = mask[window].shape
-    scale = min(1.0, CUT_SIZE / max(height, width))
-    size = (max(1, round(width * scale)), max(1, round(height * scale)))
-    labels = np.where(cv2.resize(mask[window], size, interpolation=cv2.INTER_AREA) > 127, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
-    for stroke, label in ((inside, cv2.GC_FGD), (outside, cv2.GC_BGD)):
-        labels[cv2.resize(stroke[window].astype(np.uint8), size, interpolation=cv2.INTER_AREA) > 0] = label
-    if not np.isin(labels, (cv2.GC_BGD, cv2.GC_PR_BGD)).any() or not np.isin(labels, (cv2.GC_FGD, cv2.GC_PR_FGD)).any():
-        raise UsageError("The stroke covers everything around it; draw a thinner one.")
-    small = cv2.resize(photo[window], size, interpolation=cv2.INTER_AREA)
-    cv2.setRNGSeed(0)
-    cv2.grabCut(small, labels, (0, 0, 0, 0), np.zeros((1, 65)), np.zeros((1, 65)), CUT_STEPS, cv2.GC_INIT_WITH_MASK)
-    found = np.asarray(np.where((labels == cv2.GC_FGD) | (labels == cv2.GC_PR_FGD), 255, 0), np.uint8)
-    out = mask.copy()
-    out[window] = np.where(cv2.resize(found, (width, height), interpolation=cv2.INTER_LINEAR) > 127, 255, 0)
-    out[inside], out[outside] = 255, 0
-    return out
 
 
 def _shown(call: Call, name: str) -> Shown:

@@ -57,7 +57,7 @@ class Runs:
                     known = None
             message = "" if known is None or starting else self._reason(known)
         state: dict[str, Any] = {"starting": starting, "runs": False, "message": message}
-        if live is not None:
+        if live is not None and not starting:  # else it is that of the run before
             state |= {**live.document, "runs": live.runs, "message": message or live.document.get("message", "")}
             state["killed"] = not live.runs and not live.document.get("ended", True)
         return state

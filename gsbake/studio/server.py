@@ -8,6 +8,7 @@ import secrets
 import socket
 import threading
 from types import TracebackType
+from urllib.parse import quote
 
 from gsbake.errors import UsageError
 from gsbake.studio.workspace import Workspace
@@ -29,7 +30,8 @@ def require_packages() -> None:
 class Studio:
     """A server for a workspace; a context, in which `address` is valid. Raises UsageError where the extra is not installed."""
 
-    def __init__(self, workspace: Workspace, port: int = 0) -> None:
+    def __init__(self, workspace: Workspace, port: int = 0, *, run: str = "") -> None:
+        """`run` names the capture at whose run the page opens; without it the page lists all."""
         require_packages()
         import uvicorn
 
@@ -37,6 +39,7 @@ class Studio:
         from gsbake.studio.services import Services
 
         self.token = secrets.token_urlsafe(16)
+        self._place = f"#/{quote(run, safe='')}/run" if run else ""
         self._socket = socket.socket(proto=socket.IPPROTO_TCP)  # asyncio sends at once only where the protocol is named
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
@@ -48,12 +51,18 @@ class Studio:
         self.port: int = self._socket.getsockname()[1]
         self._services = Services()
         config = uvicorn.Config(
-            guarded_app(workspace, self._services, self.token, self.port), http="h11", ws="none", lifespan="off", log_config=None,
+            guarded_app(workspace, self._services, self.token, self.port), http="h11", ws="none", lifespan="off",
+            log_config=None, log_level="critical",
             access_log=False, server_header=False, date_header=False, timeout_keep_alive=KEEP_ALIVE, limit_concurrency=MAX_CONNECTIONS,
             timeout_graceful_shutdown=LAST_SECONDS,
         )  # fmt: skip
-        self._server = uvicorn.Server(config)
-        self._server.main_loop = self._idle  # type: ignore[method-assign]
+        studio = self
+
+        class Server(uvicorn.Server):
+            async def main_loop(self) -> None:
+                await studio._idle()
+
+        self._server = Server(config)
         self._ready = threading.Event()
         self._end: tuple[asyncio.AbstractEventLoop, asyncio.Event] | None = None
         self._thread = threading.Thread(target=self._serve, name="studio", daemon=True)
@@ -61,7 +70,7 @@ class Studio:
     @property
     def address(self) -> str:
         """The page's address, with the token."""
-        return f"http://{HOST}:{self.port}/?token={self.token}"
+        return f"http://{HOST}:{self.port}/?token={self.token}{self._place}"
 
     def wait(self) -> None:
         """Serve until the thread ends, or an exception such as that of Ctrl-C."""

@@ -57,11 +57,18 @@ class Views:
         return path
 
     def close(self) -> None:
-        """End the child."""
-        with self._lock:
-            if self._timer is not None:
-                self._timer.cancel()
-            self._child.close()
+        """End the child, also while it draws."""
+        if self._timer is not None:
+            self._timer.cancel()
+        self._child.close()
+
+    def _rest(self) -> None:
+        """End the child that nobody has asked for a while."""
+        if self._lock.acquire(blocking=False):
+            try:
+                self._child.close()
+            finally:
+                self._lock.release()
 
     def _drawn(self, capture: Capture, key: str, request: dict[str, Any]) -> dict[str, Any]:
         """What the child answered to a request, which is kept beside the files that it wrote."""
@@ -76,7 +83,7 @@ class Views:
                     Path(scratch, "answer.json").write_bytes(json.dumps(found).encode())
                     shutil.rmtree(place, ignore_errors=True)
                     shutil.copytree(scratch, place)
-                self._timer = threading.Timer(IDLE, self.close)
+                self._timer = threading.Timer(IDLE, self._rest)
                 self._timer.daemon = True
                 self._timer.start()
             answer: dict[str, Any] = json.loads((place / "answer.json").read_bytes())

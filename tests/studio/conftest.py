@@ -95,9 +95,13 @@ class Browser:
 
 
 @pytest.fixture
-def browser(tmp_path: Path) -> Iterator[Browser]:
+def extra() -> None:
     for module in MODULES:
         pytest.importorskip(module, reason="the extra `studio` is not installed")
+
+
+@pytest.fixture
+def browser(extra: None, tmp_path: Path) -> Iterator[Browser]:
     folder = tmp_path / "captures"
     folder.mkdir()
     with Studio(Folder(folder)) as studio:

@@ -400,7 +400,7 @@ def kill_the_server_in_a_run(page: Any, folder: Path) -> None:
         session.open(address)
         page.goto(re.sub(r"[#?].*", "", page.url) + "#/mug/run")
         page.click("#stop:not([disabled])")
-        session.wait("document.getElementById('end').textContent.includes('Stopped')", 300)
+        session.wait("document.getElementById('end').textContent.includes('on request')", 300)
         wait_for_the_end(live["pid"])
         page.fill("[data-key='train.iterations'] input", "310")
         page.press("[data-key='train.iterations'] input", "Enter")

@@ -8,12 +8,13 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import psutil
 import pytest
 
 from gsbake.geometry.cameras import CameraSet, Similarity
 from gsbake.geometry.ply import write_cloud
 from gsbake.pipeline.store import _seal
-from gsbake.studio.masks import grab_cut
+from gsbake.studio.grab_cut import grab_cut
 from tests.studio.conftest import Browser, photo, write_capture
 from tests.support.cameras import look_at
 
@@ -293,5 +294,9 @@ def test_a_run_is_a_process_of_its_own(browser: Browser) -> None:
         assert time.monotonic() < deadline
         time.sleep(0.1)
     assert "2 usable photos" in found["message"] and found["exit_code"] == 42
+    while psutil.pid_exists(found["pid"]):  # the server reaps it when it is asked
+        assert time.monotonic() < deadline
+        time.sleep(0.1)
+        browser.get("/api/captures/a/run")
     assert "No run of a is in progress" in browser.send("DELETE", "/api/captures/a/run", {}, 400)["error"]
     assert browser.send("POST", "/api/captures/a/run", {"until": "cake"}, 400)["error"] == "There is no such stage."

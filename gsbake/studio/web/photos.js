@@ -80,7 +80,7 @@ export const open = async (capture, current) => {
     cell.classList.toggle("out", photo.left_out);
     const out = action(photo.left_out ? t.takeAgain : t.leaveOut,
       () => commands.leaveOut(capture, photo.left_out ? leftOut().filter((name) => name !== photo.name) : [...leftOut(), photo.name]), () => toggle(photo), { tabindex: -1, class: "small" });
-    const image = h("img", { src: photoUrl(capture.name, photo), alt: "", loading: "lazy", decoding: "async", onerror: () => image.classList.add("broken") });
+    const image = h("img", { src: photoUrl(capture.name, photo), alt: "", loading: "lazy", decoding: "async", onerror: () => { image.classList.add("broken"); image.alt = t.unreadable; } });
     replace(cell, image,
       h("div", { class: "flags" }, photo.left_out ? h("span", { class: "flag" }, t.leftOut) : null, flags.map((flag) => h("span", { class: "flag bad" }, flag))),
       h("div", { class: "cell-foot" }, h("span", { class: "name", title: photo.name }, photo.name), out));
@@ -113,7 +113,7 @@ export const open = async (capture, current) => {
 
   const drawFindings = () => replace(findings, found.checking ? h("p", { class: "soft busy" }, t.checking)
     : found.error ? h("p", { class: "bad" }, found.error)
-    : found.checked ? found.findings.map((finding) => h("div", { class: `finding ${finding.level}` },
+    : found.checked ? found.findings.map((finding) => h("div", { class: `finding ${finding.level}`, title: t.levels[finding.level] },
         h("b", {}, finding.about), h("span", {}, finding.text), finding.do ? h("span", { class: "soft" }, finding.do) : null))
     : found.photos.length ? h("p", { class: "soft" }, t.notChecked) : null);
 

@@ -2,7 +2,6 @@
 export const t = {
   brand: "gsbake studio",
   tabs: { photos: "Photos", masks: "Masks", setup: "Set-up", run: "Run", asset: "Asset" },
-  captures: "Captures",
   back: "All captures",
   copy: "Copy",
   copied: "Copied",
@@ -12,13 +11,10 @@ export const t = {
   keys: "Keys",
   close: "Close",
   cancel: "Cancel",
-  save: "Save",
   saved: "Saved",
   remove: "Remove",
-  none: "none",
   loading: "Loading…",
   offline: "The studio's server does not answer. Runs go on without it; start `gsbake studio` again and open its new address.",
-  failed: (what) => `That did not work: ${what}`,
 
   keyHelp: [
     ["Everywhere", [["0", "all captures"], ["1 – 5", "Photos, Masks, Set-up, Run, Asset"], ["C", "copy the command at the bottom"], ["T", "light or dark"], ["?", "this list"], ["Tab, Enter", "reach and press any button"]]],
@@ -32,7 +28,6 @@ export const t = {
   capturesTitle: (folder) => `Captures in ${folder}`,
   noCaptures: "Nothing here yet",
   noCapturesHint: "Drop photos or a video on this page to make a capture, or choose files.",
-  newCapture: "New capture",
   chooseFiles: "Choose photos or a video",
   captureName: "Name of the capture",
   create: "Create",
@@ -60,7 +55,6 @@ export const t = {
   photoFacts: (blur, stops, clipped) => `blur ${blur}, exposure ${stops} stops, ${clipped} % clipped`,
   levels: { problem: "Problem", advice: "Advice", good: "Good" },
   unreadable: "cannot be shown",
-  previous: "Previous",
   next: "Next",
 
   // masks
@@ -81,7 +75,6 @@ export const t = {
   saveMask: "Save mask",
   maskSaved: (file) => `Written: ${file}`,
   unsaved: "changed",
-  fullScreen: "Whole picture",
   writesMask: (file) => `# writes ${file}, which every run reads`,
   noPhotos: "There are no photos yet.",
 
@@ -132,7 +125,6 @@ export const t = {
   more: "All settings",
   search: "Search settings",
   reset: "Profile's value",
-  changed: "changed",
   run: "Run",
   resume: "Go on",
   runAgain: "Up to date",
@@ -148,7 +140,6 @@ export const t = {
   noDecisions: "No decisions yet.",
   noRun: "No run yet.",
   picture: "Present state",
-  left: (text) => text,
   until: "Run up to",
   untilAll: "the end",
 
@@ -156,7 +147,6 @@ export const t = {
   noAsset: "There is no asset yet.",
   viewer: "Asset",
   lights: { neutral: "Neutral", own: "Fitted light", studio: "Studio", sunset: "Sunset" },
-  maps: "Maps",
   mapNames: { base_color: "Base colour", orm: "Occlusion, roughness, metallic", normal: "Normals", emissive: "Emission", uv: "UV layout" },
   compare: "Against a photo",
   comparePhoto: "Photo",
@@ -182,5 +172,4 @@ export const t = {
   download: "Download",
   report: "Report",
   otherFiles: "All files",
-  textureFormTitle: "compression of the file",
 };
