@@ -58,5 +58,5 @@ def _asset_frame(current: Mapping[str, Artifact | None]) -> Similarity | None:
     try:
         cameras = PosedPhotos.open(poses.folder, refine.folder).cameras.cameras
         return frame_between(cameras, read_transforms_json(export.folder / "cameras.json"))
-    except BadInputError:
+    except (BadInputError, OSError, ValueError, LookupError, TypeError):  # files that the user put there may be anything
         return None

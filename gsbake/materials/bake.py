@@ -194,8 +194,8 @@ class _Baking:
             except ValueError as error:
                 raise BadInputError(f"bake: {error}.") from error
         if atlas.fill < MIN_FILL:
-            advice = "padding; raise bake.size, or join the mesh's pieces" if uv is None else "empty; pack them tighter"
-            self.monitor.warn(f"bake: {number(atlas.charts)} charts use {atlas.fill:.0%} of the texture, the rest is {advice}.")
+            advice = "the rest is padding; raise bake.size, or join the mesh's pieces" if uv is None else "pack them tighter"
+            self.monitor.warn(f"bake: {number(atlas.charts)} charts use {atlas.fill:.0%} of the texture; {advice}.")
         with self.monitor.part("texels"):
             surface = UnwrappedMesh.of(vertices, faces, atlas, size, self.threads)
         return surface

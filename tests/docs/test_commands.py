@@ -16,6 +16,8 @@ import cv2
 import numpy as np
 import psutil
 import pytest
+import trimesh
+import xatlas
 
 from gsbake.cli import main
 from tests.docs import toy_stages
@@ -71,6 +73,10 @@ def prepared(tmp_path_factory: pytest.TempPathFactory) -> Path:
     frames = [{"file_path": f"photos/{name}.jpg", "transform_matrix": pose} for name, pose in zip("abcd", poses, strict=True)]
     (folder / "transforms.json").write_text(json.dumps({"fl_x": 60, "cx": 32, "cy": 24, "w": 64, "h": 48, "frames": frames}))
     (folder / "edited.ply").write_text("ply\n")
+    ball = trimesh.creation.icosphere(subdivisions=1)
+    source, corners, uv = xatlas.parametrize(ball.vertices, ball.faces)
+    unwrapped = trimesh.Trimesh(ball.vertices[source], corners, process=False, visual=trimesh.visual.TextureVisuals(uv=uv))
+    unwrapped.export(folder / "lowpoly.glb")
     (folder / "box.json").write_text('{"centre": [0, 0, 0.5], "size": [1, 1, 1]}')
     (folder / "mine.toml").write_text('extends = "relight"\n[mesh]\nfaces = 10000\n')
     with pytest.MonkeyPatch.context() as monkeypatch:

@@ -8,7 +8,9 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+import trimesh
 
+from gsbake.geometry.ply import write_mesh
 from gsbake.imaging.png import write_png
 from gsbake.pipeline.registry import Registry
 from gsbake.pipeline.stage import Context
@@ -18,6 +20,8 @@ from gsbake.stages import REGISTRY as REAL
 #: What `gsbake masks` reads: one photo with an automatic mask.
 PHOTOS = {"photos": [{"name": "a", "source": "a.jpg", "source_width": 8, "source_height": 6, "mask": None}], "skipped": []}
 
+#: The dense mesh, which a low-poly one is compared with.
+BALL = trimesh.creation.icosphere(subdivisions=2)
 #: What each stage writes.
 FILES = {
     "ingest": ("photos.json",),
@@ -45,6 +49,8 @@ def _toy(name: str) -> Callable[[Context], dict[str, Any]]:
             (ctx.out / file).parent.mkdir(exist_ok=True)
             if file == "photos.json":
                 (ctx.out / file).write_text(json.dumps(PHOTOS))
+            elif file == "dense.ply":
+                write_mesh(ctx.out / file, BALL.vertices, BALL.faces)
             elif file.endswith(".png"):
                 write_png(ctx.out / file, np.full((6, 8), 255, np.uint8))
             else:

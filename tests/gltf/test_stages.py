@@ -205,7 +205,7 @@ def test_normal_map_gives_the_true_normals_in_the_asset_frame(asset: GltfAsset) 
 
 
 def test_a_mesh_unwrapped_elsewhere_keeps_its_topology_and_uvs(run: Path, tmp_path: Path) -> None:
-    """Decimated and unwrapped outside, edited in the frame of the asset, half of its charts mirrored."""
+    """Decimated and unwrapped outside, edited in the frame of the asset, its charts mirrored."""
     points, faces = read_mesh(run / "mesh/dense.ply")
     points, faces = fast_simplification.simplify(points.astype(np.float32), faces, target_count=1500)
     source, corners, uv = xatlas.parametrize(points, faces)

@@ -13,10 +13,11 @@ import numpy as np
 from gsbake.capture.sfm.standing_background import moved_between
 from gsbake.geometry.cameras import Array, Camera
 
-#: Largest distance of cameras that coincide, as a share of that of the scene, and largest angle between them in radians.
-MAX_DISTANCE, MAX_ANGLE = 0.01, 0.02
-#: Share of the cameras that coincide with others from which a solution is none.
-MAX_COINCIDING = 0.5
+#: Largest distance of cameras that coincide, as a share of that of the scene, and largest angle between them in radians: both move a small
+#: photo by less than a pixel.
+MAX_DISTANCE, MAX_ANGLE = 0.004, 0.004
+#: Share of the cameras that coincide with others from which a solution is none, and how many of them are worth a warning.
+MAX_COINCIDING, MIN_WARNED = 0.5, 4
 
 
 def coinciding(cameras: Sequence[Camera], points: Array, files: Mapping[str, Path]) -> list[str]:

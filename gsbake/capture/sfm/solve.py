@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-from gsbake.capture.sfm.coincidence import MAX_COINCIDING, coinciding
+from gsbake.capture.sfm.coincidence import MAX_COINCIDING, MIN_WARNED, coinciding
 from gsbake.capture.sfm.feature_masks import FeatureMasks
 from gsbake.capture.sfm.lenses import given_lenses, is_plausible_lens, solved_lenses
 from gsbake.capture.sfm.pairs import choose_matching
@@ -110,7 +110,7 @@ class PoseSolver:
             self.monitor.warn(f"{len(missing)} of {len(names)} photos could not be registered and were dropped ({shortlist(missing)}).")
             if found.masked and len(missing) > (1 - MIN_PLACED_SHARE) * len(names):
                 self.monitor.warn("If they show the object in another position, too few of its features join both: bake each by itself.")
-        if together := self._coinciding(found):
+        if len(together := self._coinciding(found)) >= MIN_WARNED:
             self.monitor.warn(
                 f"{len(together)} cameras coincide with others, but their photos differ ({shortlist(together)}); if the object moved "
                 "before a camera that stood, give masks of it (--masks)."

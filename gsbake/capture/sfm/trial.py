@@ -21,7 +21,7 @@ Region = Literal["whole photos", "moving parts", "masks", "outside the masks"]
 #: Regions of a trial, in this order.
 TRIED: tuple[Region, ...] = ("whole photos", "masks", "outside the masks")
 #: Photos of a trial, their longer side in pixels, and their features. They follow each other by name, so that they overlap.
-PHOTOS, SIZE, FEATURES = 24, 600, 4096
+PHOTOS, SIZE, FEATURES = 24, 600, 2048
 #: Captures of fewer photos are solved without a trial: they take no longer.
 MIN_CAPTURE = 36
 #: Share of the photos of a trial that a usable solution registers.

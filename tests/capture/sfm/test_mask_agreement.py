@@ -19,6 +19,7 @@ from gsbake.capture.sfm.solve import PoseSolver
 from gsbake.config.schema import Poses
 from gsbake.errors import BadInputError
 from gsbake.geometry.cameras import Camera, CameraSet
+from gsbake.geometry.ply import write_cloud
 from tests.support.cameras import look_at
 from tests.support.recorder import Recorder
 from tests.support.shapes import bar_masks
@@ -71,6 +72,7 @@ def answers(monkeypatch: pytest.MonkeyPatch) -> Callable[[Callable[[Mapping[str,
             out.mkdir(parents=True)
             cameras = cameras_of(job)
             CameraSet(tuple(cameras), poses="solved").save(out / "cameras.json")
+            write_cloud(out / "points.ply", np.random.default_rng(0).normal(0, 0.3, (50, 3)), np.zeros((50, 3)))
             figures = {"reprojection_px": 0.4, "points": 100, "track_length": 4.0, "fine_features": False, "seconds": {}}
             counts = {"detected": 0, "matched": 0, "verified": 0, "steps": [["strict thresholds", len(cameras)]]}
             refinement = {"refinement": {"used": False, "decision": ["not used", "no photos"]}}
@@ -155,3 +157,15 @@ def test_a_trial_on_small_photos_decides_what_is_mapped_at_full_size(
     assert [job["masks"] is not None for job in trials] == ([False, True] if right == "masks" else [False])
     assert all(Path(job["photos"]).parent.name == "trial" for job in trials) and not (tmp_path / "scratch" / "trial").exists()
     assert "16 small photos: whole photos: 16 registered" in run.monitor.line("features")  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize("setting", ["auto", False])
+def test_cameras_that_coincide_are_no_solution(setting: Any, tmp_path: Path, answers: Callable[..., Jobs]) -> None:
+    """A standing camera, whatever the silhouettes say; where nothing else is tried, a warning."""
+    standing = [replace(ring()[0], name=camera.name) for camera in ring()]
+    entries = write_capture(tmp_path / "ingest", standing, "mask")  # equal silhouettes: their hull agrees with all
+    jobs = answers(lambda job: ring() if job["masks"] else standing)
+    run = solver(tmp_path, entries, setting)
+    run.solve()
+    warned = [text for text in run.monitor.warnings if "16 cameras coincide with others" in text]  # type: ignore[attr-defined]
+    assert (len(jobs), len(warned)) == ((2, 0) if setting == "auto" else (1, 1))

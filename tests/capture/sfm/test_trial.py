@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from gsbake.capture.sfm.coincidence import coinciding
+from gsbake.capture.sfm.feature_masks import FeatureMasks
 from gsbake.capture.sfm.mapping_gain import MappingGain
 from gsbake.capture.sfm.trial import PHOTOS, Trial, best_region, write_small_photos
 from tests.support.cameras import look_at
@@ -40,6 +41,17 @@ def test_small_photos_keep_the_field_of_view(tmp_path: Path) -> None:
     assert {(e["width"], e["height"], e["focal_px"], e["mask"]) for e in small} == {(600, 450, 500.0, None)}
     assert [e["guess"] for e in small[:2]] == ["g.png", "m1.png"]
     assert cv2.imread(str(tmp_path / "small" / "p00.png")).shape == (450, 600, 3)
+
+
+def test_features_outside_the_masks(tmp_path: Path) -> None:
+    """What a dilated guess does not show, at the size of the photo."""
+    guess = np.zeros((60, 80), np.uint8)
+    guess[20:40, 30:50] = 255
+    cv2.imwrite(str(tmp_path / "g.png"), guess)
+    entry = {"name": "a", "mask": None, "guess": "g.png", "width": 160, "height": 120}
+    inside = cv2.imread(str(FeatureMasks(tmp_path, [entry], tmp_path / "in").write() / "a.png.png"), cv2.IMREAD_GRAYSCALE)
+    outside = cv2.imread(str(FeatureMasks(tmp_path, [entry], tmp_path / "out").write(outside=True) / "a.png.png"), cv2.IMREAD_GRAYSCALE)
+    assert inside.shape == (120, 160) and (outside == 255 - inside).all() and 0.08 < (inside > 0).mean() < 0.15
 
 
 def test_cameras_of_different_photos_coincide(tmp_path: Path) -> None:
