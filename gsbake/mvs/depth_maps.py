@@ -32,23 +32,20 @@ HULL_MARGIN = 1.5
 
 @dataclass(frozen=True)
 class DepthMap:
-    """One photo's depth map: `camera`, `plane` (h, w, 3), `confidence` (h, w) in 0..1 (0 = no depth), consistent `views` (h, w), and where
-    (h, w) the depth was found by local phase, not by brightness; None: nowhere."""
+    """One photo's depth map: `camera`, `plane` (h, w, 3), `confidence` (h, w) in 0..1 (0 = no depth), consistent `views` (h, w)."""
 
     camera: Camera
     plane: Floats
     confidence: Floats
     views: NDArray[np.uint8]
-    by_phase: NDArray[np.bool_] | None = None
 
     def depth(self) -> Floats:
         """z-depth (h, w), 0 = none."""
         return z_depth(self.camera, self.plane, self.confidence > 0)
 
     def save(self, path: Path) -> None:
-        """Write depth and confidence as a NumPy archive, without those that local phase found: they are less exact."""
-        keep = np.True_ if self.by_phase is None else ~self.by_phase
-        np.savez(path, depth=np.where(keep, self.depth(), 0), confidence=np.where(keep, self.confidence, 0).astype(np.float16))
+        """Write depth and confidence as a NumPy archive."""
+        np.savez(path, depth=self.depth(), confidence=self.confidence.astype(np.float16))
 
 
 def read_depth(path: Path) -> tuple[Floats, Floats]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,6 @@ from gsbake.mvs.consistency import check_consistency
 from gsbake.mvs.depth_bounds import depth_bounds, seed_depths
 from gsbake.mvs.depth_maps import DepthMap, consistent_pixels, filter_depth_map, matched_pixels, z_depth
 from gsbake.mvs.fusion import fuse
-from gsbake.mvs.local_phase import complete, local_phase
 from gsbake.mvs.point_cloud import StereoCloud
 from gsbake.mvs.pyramids import Photo, image_pyramid, load_photo
 from gsbake.mvs.view_selection import select_views
@@ -153,14 +152,6 @@ class StereoRun:
             return filter_depth_map(camera, cost, check(index, consistent), min_views, self.hull)
 
         return self.parallel(final_check, "consistency", MAX_CONSISTENCY_THREADS)
-
-    def completed(self, maps: Sequence[DepthMap]) -> list[DepthMap]:
-        """The depth maps with what matching the photos' local phase adds. `consistent_depths` stay those of brightness."""
-        pyramids = self.parallel(lambda i: image_pyramid(local_phase(self.pyramids[i][-1])), "local phase")
-        second = replace(self, pyramids=pyramids, planes_folder=self.planes_folder.with_name("phase"))
-        second.match()
-        added = second.filter_depths()
-        return [complete(one, other) for one, other in zip(maps, added, strict=True)]
 
     def carved_hull(self, softness: NDArray[np.float32]) -> CarvedHull:
         """The hull carved by `consistent_depths`; `softness` as from `surface_softness`. Call after `filter_depths`.

@@ -30,8 +30,6 @@ from gsbake.shape_refinement.samples import Photo, load_photos
 MIN_PHOTOS, MIN_SIZE = 5, 200
 #: Blur in pixels of the photos that open hollows.
 HOLLOW_BLUR = 0.8
-#: Local phase is matched too where brightness confirms less of the object's pixels.
-PHASE_BELOW = 0.3
 #: Density of points on thin parts, as a number of points over the whole object.
 THIN_POINTS = 40_000
 
@@ -75,7 +73,6 @@ def run_stereo(
             run.match()
         with monitor.part("consistency"):
             maps = run.filter_depths()
-        maps = _completed(run, maps, monitor)
         if hull is not None and softness is not None:
             with monitor.part("mirror images"):
                 maps = _without_mirror_images(maps, hull, softness, monitor)
@@ -117,18 +114,6 @@ def _hull(posed: PosedPhotos, monitor: Monitor) -> tuple[Hull | None, NDArray[np
     bounds = "visual hull" if hull is not None else "unit sphere"
     monitor.decide("depth bounds", bounds, "all photos have masks" if hull is not None else "not all photos have masks")
     return hull, softness
-
-
-def _completed(run: StereoRun, maps: list[DepthMap], monitor: Monitor) -> list[DepthMap]:
-    """The depth maps with what the photos' local phase adds, where brightness confirms little."""
-    confirmed = _confirmed(run, maps)
-    if confirmed >= PHASE_BELOW:
-        return maps
-    with monitor.part("local phase"):
-        maps = run.completed(maps)
-    evidence = f"brightness confirms {100 * confirmed:.1f} % of the object's pixels, both {100 * _confirmed(run, maps):.1f} %"
-    monitor.decide("local phase", "matched too", evidence)
-    return maps
 
 
 def _without_mirror_images(maps: list[DepthMap], hull: Hull, softness: NDArray[np.float32], monitor: Monitor) -> list[DepthMap]:
@@ -197,15 +182,10 @@ def _thin_parts(posed: PosedPhotos, hull: Hull, out: Path, seed: int, monitor: M
     thin.save(out / "thin.npz")
 
 
-def _confirmed(run: StereoRun, maps: list[DepthMap]) -> float:
-    """Share of the object's pixels with a depth."""
-    inside = sum(int(sizes[-1].inside.sum()) for sizes in run.pyramids)
-    return sum(int((one.confidence > 0).sum()) for one in maps) / max(inside, 1)
-
-
 def _figures(run: StereoRun, maps: list[DepthMap], cloud: StereoCloud, options: Stereo, monitor: Monitor) -> dict[str, Any]:
     """The figures for the manifest."""
-    inside, confirmed = sum(int(sizes[-1].inside.sum()) for sizes in run.pyramids), _confirmed(run, maps)
+    inside = sum(int(sizes[-1].inside.sum()) for sizes in run.pyramids)
+    confirmed = sum(int((one.confidence > 0).sum()) for one in maps) / max(inside, 1)
     unmatched = sum(not n for n in run.sources)
     views = options.min_consistent_views
     evidence = f"{100 * confirmed:.0f} % of the object's pixels are confirmed by {views} or more other photos"

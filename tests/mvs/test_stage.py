@@ -75,18 +75,6 @@ def test_nothing_is_matched_outside_the_region(poses: Path, done: tuple[Path, di
     assert len(points) and points[:, 2].min() > -1e-6
 
 
-def test_local_phase_completes_what_brightness_does_not_confirm(poses: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    results = []
-    for bound in (0.0, 1.0):
-        monkeypatch.setattr("gsbake.mvs.stereo.PHASE_BELOW", bound)
-        monitor = Recorder()
-        results.append(run(poses, tmp_path / str(bound), monitor))
-        assert ("local phase" in monitor.decisions) == ("local phase" in monitor.parts) == (bound > 0)
-    assert results[0]["confirmed_share"] < results[1]["confirmed_share"] < 1
-    depths = [StereoCloud.load(tmp_path / str(bound) / "points.ply").points for bound in (0.0, 1.0)]
-    assert np.median(np.abs(np.linalg.norm(depths[1], axis=1) - RADIUS)) < 0.002 and len(depths[1]) > len(depths[0])
-
-
 def test_files_and_figures(done: tuple[Path, dict[str, Any]]) -> None:
     out, results = done
     cloud = StereoCloud.load(out / "points.ply")
