@@ -18,8 +18,8 @@ from gsbake.geometry.ply import read_mesh
 from gsbake.geometry.raycast import RayCaster
 from gsbake.imaging.exr import write_exr
 from gsbake.kernels.threads import configure
-from gsbake.materials.remaining_shading import find_irradiance, remove_shading
 from gsbake.materials.fitting import RAY_OFFSET, SMOOTHING_RADIUS, FitSettings, fit_materials
+from gsbake.materials.remaining_shading import find_irradiance, remove_shading
 from gsbake.meshing.repair import repair_foreign
 from gsbake.monitor import SILENT, Monitor, Rule, decide_skip
 from gsbake.text import number

@@ -21,12 +21,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsbake.imaging.srgb import decode, encode
-from gsbake.materials.bilateral import EdgeAwareFilter
 from gsbake.materials.descent import Steps, descend
 from gsbake.materials.linear_shading import BaseColourSolver, PhotoSamples, observed_weight
-from gsbake.materials.materials import Materials
 from gsbake.materials.passes import Scene
 from gsbake.materials.state import State
+from gsbake.materials.surface import EdgeAwareFilter, Materials
 from gsbake.texturing.texels import Texels
 
 Floats = NDArray[np.float64]
@@ -49,7 +48,7 @@ class MetalNoise:
         for turn in range(self.rounds):
             metal, surface, m = state.metal & state.emits_nothing, state.level.surface, state.materials
             base, texel = without_noise(state.metal_samples(), m, metal, surface.texels, surface.pairs), np.flatnonzero(metal)
-            state = state.with_inside(texel, replace(m.of(texel), base_color=base[texel].astype(np.float32))).with_transport().judged()
+            state = state.with_inside(texel, replace(m.of(texel), base_color=base[texel].astype(np.float32))).with_transport()
             if self.steps is not None:
                 state = descend(scene.seeded(turn), state, self.steps, scene.each("trials of metal and dielectric"))
         return state

@@ -36,11 +36,11 @@ from numpy.typing import NDArray
 
 from gsbake.imaging.srgb import encode
 from gsbake.materials.linear_shading import LinearShading, PhotoSamples, unclipped_weights
-from gsbake.materials.materials import Materials
 from gsbake.materials.metallic import MIN_METAL_ALBEDO
 from gsbake.materials.passes import Scene
 from gsbake.materials.photo import PhotoReader
 from gsbake.materials.state import State
+from gsbake.materials.surface import Materials
 from gsbake.texturing.texels import Texels
 
 Floats = NDArray[np.float32]

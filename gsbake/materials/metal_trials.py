@@ -23,11 +23,11 @@ from scipy.cluster.vq import kmeans2
 
 from gsbake.materials.descent import Steps, descend
 from gsbake.materials.linear_shading import BaseColourSolver, observed_weight
-from gsbake.materials.materials import Materials
 from gsbake.materials.metallic import TRIED_ROUGHNESS, candidate_model, shaded
 from gsbake.materials.passes import Scene
 from gsbake.materials.photo import texel_weight
 from gsbake.materials.state import LIMITS, State
+from gsbake.materials.surface import Materials
 from gsbake.shading.environment import EnvironmentLight
 
 Floats = NDArray[np.float64]
@@ -126,7 +126,7 @@ class _Tried:
         """Before all trials: texels and light adapt once, so that trials are compared with a state that had as many steps."""
 
         def adapt(state: State) -> State:
-            return descend(scene, state, steps, scene.each("trials of metal and dielectric"))
+            return descend(scene, state, steps, scene.each("trials of metal and dielectric")).judged()
 
         base = adapt(state)
         return cls(adapt, base.restarted(), adapt(base).error)

@@ -46,8 +46,6 @@ MAJORITY = 0.5
 CLEAR_EVIDENCE = 2.0
 #: Noise of sRGB values (0..1), and degrees of freedom of Student's t distribution of their errors.
 NOISE, DEGREES_OF_FREEDOM = 0.01, 3.0
-#: Standard deviation of normals, as a length added to the unit normal along each tangent.
-NORMAL_ERROR = 0.035
 #: Texels with less weight of unclipped pixels than the first are undecided, as are those visible in fewer photos than the second: from few
 #: directions a dielectric under a slightly wrong light passes for metal. A photo counts from the third share of pixels around a texel.
 MIN_WEIGHT, MIN_PHOTOS, MIN_PHOTO_SHARE = 0.3, 6, 0.05

@@ -10,8 +10,7 @@ from __future__ import annotations
 
 from gsbake.materials.base_color_noise import MetalNoise
 from gsbake.materials.descent import Steps
-from gsbake.materials.levels import FineLevel, FullTexture, GradientSteps, PureMetals
-from gsbake.materials.map_selection import MapSelection
+from gsbake.materials.levels import FineLevel, FullTexture, GradientSteps, MapSelection, PureMetals
 from gsbake.materials.metal_superresolution import MetalSuperresolution
 from gsbake.materials.metal_trials import KindTrials, LightLevel
 from gsbake.materials.passes import Pass

@@ -10,12 +10,11 @@ from numpy.typing import NDArray
 
 from gsbake.materials.emission import find_emission
 from gsbake.materials.light_intensity import LightAdjustment, adjust_radiance, search_light
-from gsbake.materials.linear_shading import PhotoSamples
-from gsbake.materials.materials import Materials
+from gsbake.materials.linear_shading import PhotoLights, PhotoSamples, linear_samples
 from gsbake.materials.metallic import find_metals
 from gsbake.materials.passes import Scene
-from gsbake.materials.shading import PhotoLights, linear_samples
 from gsbake.materials.state import LIMITS, State
+from gsbake.materials.surface import Materials
 from gsbake.shading.cubemap import solid_angles
 from gsbake.shading.environment import EnvironmentLight
 from gsbake.shading.light_motion import mean_radiance

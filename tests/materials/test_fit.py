@@ -132,7 +132,7 @@ class Sphere:
 
 def after(state: State, steps: int, plan: Steps = ALL, priors: Priors = WEAK_PRIORS, seed: int = 0, diffuse: bool = False) -> State:
     """The state after gradient steps."""
-    return descend(Scene(priors, 400, 16, seed, diffuse), state, plan, skip, steps)
+    return descend(Scene(priors, 400, 16, seed, diffuse), state, plan, skip, steps).judged()
 
 
 def skip(done: int, total: int) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from gsbake.materials import starts as starts_module
-from gsbake.materials.intensity_prior import RADIANCE, IntensityPrior
+from gsbake.materials.light_intensity import RADIANCE, IntensityPrior
 from gsbake.materials.passes import Scene
 from gsbake.materials.recipe import COARSE, TRIAL
 from gsbake.materials.starts import Start, StartComparison, Trials, started
