@@ -57,20 +57,32 @@ Floats = NDArray[np.float64]
 
 #: Search steps: factor on intensity, exponent of contrast, shift of logit(roughness).
 INTENSITY_FACTOR, CONTRAST_EXPONENT, ROUGHNESS_STEP = 1.2, 1.15, 0.4
-#: Directions of search in steps of intensity, contrast and roughness, in order. Never smoother: a blurred environment favours that.
-DIRECTIONS = ((-1, 0, 0), (1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (1, 0, 1), (0, 1, 1))
-#: Start of a second search, in steps: bright light on rough material is a separate local minimum.
-SECOND_START = (2, 0, 4)
+
+
+@dataclass(frozen=True)
+class LightSearchOptions:
+    """Constants of the search for the light, and of the prior of its intensity."""
+
+    #: Directions of search in steps of intensity, contrast and roughness, in order. Never smoother: a blurred environment favours that.
+    directions: tuple[tuple[int, ...], ...] = ((-1, 0, 0), (1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (1, 0, 1), (0, 1, 1))
+    #: Start of a second search, in steps: bright light on rough material is a separate local minimum.
+    second_start: tuple[int, ...] = (2, 0, 4)
+    #: Relative decrease of the residual that a step must bring; a step with more roughness; the result of the second search.
+    min_decrease: float = 0.002
+    min_rougher_decrease: float = 0.01
+    min_second_decrease: float = 0.03
+    #: Costs below this are noise.
+    min_cost: float = 1e-9
+
+
+OPTIONS = LightSearchOptions()
+
 #: Factor on the intensity of single channels, tried at the end.
 TINT_FACTOR = 1.1
 #: Bounds of the search: factor of intensity, factor of the contrast exponent, shift of logit(roughness).
 LIMITS = (3.0, 2.0, 3.0)
-#: Relative decrease of the residual that a step must bring; a step with more roughness; the result of the second search.
-MIN_DECREASE, MIN_ROUGHER_DECREASE, MIN_SECOND_DECREASE = 0.002, 0.01, 0.03
 #: Number of independent residuals that evidence for the intensity counts as: errors of the model are shared by all pixels.
 OBSERVATIONS = 10.0
-#: Costs below this are noise.
-MIN_COST = 1e-9
 
 
 @dataclass(frozen=True)
@@ -126,7 +138,7 @@ def search_light(
 
     `samples` gives the pixels of all photos under the environment of an intensity (3,) and a contrast; `roughness` (n,) is that of the
     texels. Without `tint` the ratio of the channels is fixed. Without `rough` the roughness is fixed; with it, a second search starts at
-    `SECOND_START`. A `prior` of the intensity counts as well.
+    `second_start`. A `prior` of the intensity counts as well.
     """
     residuals: dict[_Candidate, Floats] = {}
     lit: dict[tuple[float, ...], Sequence[PhotoSamples]] = {}
@@ -147,15 +159,15 @@ def search_light(
         moved = True
         while moved:
             moved = False
-            for direction in (direction for direction in DIRECTIONS if rough or not direction[2]):
-                bound = 1 - (MIN_ROUGHER_DECREASE if direction[2] else MIN_DECREASE)
+            for direction in (direction for direction in OPTIONS.directions if rough or not direction[2]):
+                bound = 1 - (OPTIONS.min_rougher_decrease if direction[2] else OPTIONS.min_decrease)
                 tried = best.step(*direction)
                 while tried.within_limits and cost(tried) < bound * cost(best):
                     best, tried, moved = tried, tried.step(*direction), True
         return best
 
     def between_steps(best: _Candidate) -> _Candidate:
-        below, here, above = (math.log(max(cost(best.step(k, 0, 0)), MIN_COST)) for k in (-1, 0, 1))
+        below, here, above = (math.log(max(cost(best.step(k, 0, 0)), OPTIONS.min_cost)) for k in (-1, 0, 1))
         if (curvature := below - 2 * here + above) <= 0:
             return best
         tried = best.step(float(np.clip((below - above) / (2 * curvature), -1, 1)), 0, 0)
@@ -164,8 +176,8 @@ def search_light(
     start = _Candidate(0, 0, 0)
     best = descend(start)
     if rough:
-        second = descend(start.step(*SECOND_START))
-        best = second if cost(second) < (1 - MIN_SECOND_DECREASE) * cost(best) else best
+        second = descend(start.step(*OPTIONS.second_start))
+        best = second if cost(second) < (1 - OPTIONS.min_second_decrease) * cost(best) else best
     best = between_steps(best)
     if tint:
         best = _tinted(best, residual)
@@ -205,7 +217,7 @@ def _tinted(best: _Candidate, residual: Callable[[_Candidate], Floats]) -> _Cand
     """`best` with one or two channels a step dimmer or brighter, where that lowers the residual."""
     for sign in (-1, 1):
         all_channels = replace(best, tint=(sign, sign, sign))
-        lower = residual(all_channels) < (1 - MIN_DECREASE) * residual(best)
+        lower = residual(all_channels) < (1 - OPTIONS.min_decrease) * residual(best)
         tried = replace(best, tint=tuple(sign * int(channel) for channel in lower))
         if 0 < lower.sum() < 3 and residual(tried).sum() < residual(best).sum():
             return tried

@@ -28,17 +28,28 @@ from gsbake.imaging.srgb import encode
 from gsbake.texturing.resampling import CoarseTexture
 from gsbake.texturing.texels import Texels
 
-#: Change of colour (sRGB, sum of channels) between adjacent texels over which a wide and a near neighbourhood extend, and the factor on a
-#: change of roughness beside it.
-WIDE_SCALE, NEAR_SCALE, ROUGHNESS_FACTOR = 0.3, 0.15, 0.5
+
+@dataclass(frozen=True)
+class FilterOptions:
+    """Constants of the edge-aware filter."""
+
+    #: Change of colour (sRGB, sum of channels) between adjacent texels over which a wide and a near neighbourhood extend, and the factor on
+    #: a change of roughness beside it.
+    wide_scale: float = 0.3
+    near_scale: float = 0.15
+    roughness_factor: float = 0.5
+    #: Width in texels of the smoothing of appearance before they are compared: fine patterns are one material.
+    prefilter_width: float = 2.0
+    #: Variance, in square texels, that averaging a texel with its four neighbours adds along either axis.
+    averaging_variance: float = 0.4
+    #: Edge of a graph node in texels.
+    node_size: int = 2
+
+
+OPTIONS = FilterOptions()
+
 #: Radius of the filter on a uniform surface, in texels.
 FILTER_RADIUS = 60.0
-#: Width in texels of the smoothing of appearance before they are compared: fine patterns are one material.
-PREFILTER_WIDTH = 2.0
-#: Variance, in square texels, that averaging a texel with its four neighbours adds along either axis.
-AVERAGING_VARIANCE = 0.4
-#: Edge of a graph node in texels.
-NODE_SIZE = 2
 
 
 class EdgeAwareFilter:
@@ -50,12 +61,12 @@ class EdgeAwareFilter:
     def __init__(self, texels: Texels, pairs: NDArray[np.int64], appearance: NDArray[np.float32], scale: float) -> None:
         smooth = _prefiltered(appearance, pairs)
         row, column = np.divmod(texels.index, texels.size)
-        self._node = np.unique(row // NODE_SIZE * texels.size + column // NODE_SIZE, return_inverse=True)[1]
+        self._node = np.unique(row // OPTIONS.node_size * texels.size + column // OPTIONS.node_size, return_inverse=True)[1]
         size = np.bincount(self._node)
         smooth = np.stack([np.bincount(self._node, c) for c in smooth.T], 1) / size[:, None]
         edge = np.sort(self._node[pairs], axis=1)
         edge = np.unique(edge[edge[:, 0] != edge[:, 1]], axis=0)
-        change = np.abs(smooth[edge[:, 0]] - smooth[edge[:, 1]]).sum(1) / NODE_SIZE
+        change = np.abs(smooth[edge[:, 0]] - smooth[edge[:, 1]]).sum(1) / OPTIONS.node_size
         weight = (FILTER_RADIUS / (1 + FILTER_RADIUS / scale * change)) ** 2
         graph = _symmetric(edge, weight, len(size))
         degree = scipy.sparse.diags(np.asarray(graph.sum(1)).ravel() + size)
@@ -80,20 +91,20 @@ class Neighbourhoods:
     def wide(self) -> EdgeAwareFilter:
         """The filter over texels of similar colour in photos; built on first use."""
         colour = encode(np.clip(np.asarray(self._photographed, np.float32), 0, 1))
-        return EdgeAwareFilter(self._texels, self._pairs, colour, WIDE_SCALE)
+        return EdgeAwareFilter(self._texels, self._pairs, colour, OPTIONS.wide_scale)
 
     def near(self, base_color: NDArray[np.float32], roughness: NDArray[np.float32]) -> EdgeAwareFilter:
         """The filter over texels of nearly the same material: linear `base_color` (n, 3) and `roughness` (n,)."""
-        material = np.column_stack([encode(base_color), ROUGHNESS_FACTOR * roughness])
-        return EdgeAwareFilter(self._texels, self._pairs, material, NEAR_SCALE)
+        material = np.column_stack([encode(base_color), OPTIONS.roughness_factor * roughness])
+        return EdgeAwareFilter(self._texels, self._pairs, material, OPTIONS.near_scale)
 
 
 def _prefiltered(values: NDArray[np.float32], pairs: NDArray[np.int64]) -> NDArray[np.float64]:
-    """`values` (n, c) smoothed over about `PREFILTER_WIDTH` texels of the surface."""
+    """`values` (n, c) smoothed over about `prefilter_width` texels of the surface."""
     adjacency = _symmetric(pairs, np.ones(len(pairs)), len(values))
     count = 1 + np.asarray(adjacency.sum(1)).ravel()
     out = np.asarray(values, np.float64)
-    for _ in range(round(PREFILTER_WIDTH**2 / AVERAGING_VARIANCE)):
+    for _ in range(round(OPTIONS.prefilter_width**2 / OPTIONS.averaging_variance)):
         out = (out + adjacency @ out) / count[:, None]
     return out
 
