@@ -58,9 +58,9 @@ class LightSearch:
     def run(self, scene: Scene, state: State) -> State:
         """The light found, with roughness and base colours of dielectrics adapted."""
         if not state.mostly_dielectric:
+            factor = np.full(3, state.intensity_prior.mean_factor())
             scaled = LightScaling().run(scene, state)
-            scale = 1 / state.intensity_prior.mean_factor()
-            return replace(scaled, adjustments=(*state.adjustments, LightAdjustment(np.full(3, 1 / scale), 1.0, 0.0, 0.0)))
+            return replace(scaled, adjustments=(*state.adjustments, LightAdjustment(factor, 1.0, 0.0, 0.0)))
         found = self._search(scene, state)
         dielectric = np.flatnonzero(state.dielectric)
         after = replace(state, adjustments=(*state.adjustments, found))

@@ -319,6 +319,21 @@ def test_fit_is_deterministic_and_base_colour_prior_darkens(glossy: Sphere) -> N
     assert darker.materials.base_color.mean() < 0.9 * first.materials.base_color.mean()
 
 
+def test_momentum_of_the_light_goes_on_until_another_light(glossy: Sphere) -> None:
+    fitted = after(glossy.start(0.2), 3, PLAIN)
+    again = after(fitted, 2, PLAIN)
+    assert fitted.light_moments is not None and again.light_moments is not None
+    assert [float(state[2]) for state in (fitted.light_moments, again.light_moments)] == [3, 5]
+    assert fitted.with_light(fitted.light).light_moments is None
+
+
+def test_a_light_that_is_given_stays(glossy: Sphere) -> None:
+    start = glossy.start(0.2)
+    fitted = after(replace(start, light_given=True), 3, PLAIN)
+    assert np.array_equal(fitted.radiance, start.radiance) and not np.array_equal(fitted.values, start.values)
+    assert not np.array_equal(after(start, 3, PLAIN).radiance, start.radiance)
+
+
 def test_without_photos_nothing_changes(glossy: Sphere) -> None:
     fitted = after(glossy.start(0.4, []), 10)
     assert np.allclose(fitted.materials.roughness, 0.4, atol=1e-6)
