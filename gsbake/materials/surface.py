@@ -4,9 +4,9 @@ The fit works on a texture of about a pixel of the photos per texel, and on one 
 starts are compared and searches are made. Visibility and indirect light vary slowly over the surface: they are traced on the coarse
 texture and interpolated. Neighbours are texels that share an edge in the texture, and texels across seams between charts.
 
-Texels that look alike decide together: averages of texel values over the surface stop at edges of its appearance. The average u of values f
-solves (1 + L) u = f, where L is the Laplacian of the graph of neighbouring texels, across seams included; edge weights fall with the change
-of appearance, such as colour. Two by two texels are one node; the system is factored once and solved for every f.
+Texels of similar appearance decide together: averages of texel values over the surface stop at edges of its appearance. The average u of
+values f solves (1 + L) u = f, where L is the Laplacian of the graph of neighbouring texels, across seams included; edge weights fall with
+the change of appearance, such as colour. Two by two texels are one node; the system is factored once and solved for every f.
 
 Farbman, Fattal, Lischinski & Szeliski, *Edge-preserving decompositions for multi-scale tone and detail manipulation*, SIGGRAPH 2008
 (weighted least squares).
