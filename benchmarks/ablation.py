@@ -1,6 +1,6 @@
 """Ablation of the material fit's rules over many objects: the bake of finished runs once more without each of them, scored.
 
-python -m benchmarks.ablation RUNS CAPTURES OUT [--only brass_vase,toy] [--rules 'metal trials,emission'] [--seed 0] [--views 0]
+python -m benchmarks.ablation RUNS CAPTURES OUT [--only brass_vase,toy] [--rules metal-trials,emission] [--seed 0] [--views 0]
     [--scorer DIR] [--csv FILE]
 
 RUNS has a folder of a finished run (`--profile relight`) per object, CAPTURES the capture of the same name with its reference in `gt/`;

@@ -4,7 +4,7 @@ python -m benchmarks.light_levels FOLDER [FOLDER ...]
 
 Reads `*.exr`, `*.hdr` and the modules `*.exr.js` of the npm package @pmndrs/assets (the file as base64) in the folders, equirectangular.
 Prints the mean over the sphere by luminance of each, and the median and the scale of the logarithm by which Student's t with two degrees of
-freedom has their quartiles: the constants of `gsbake.materials.intensity_prior`.
+freedom has their quartiles: the constants of `gsbake.materials.light_intensity`.
 """
 
 from __future__ import annotations

@@ -21,12 +21,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsbake.imaging.srgb import decode, encode
-from gsbake.materials.bilateral import EdgeAwareFilter
 from gsbake.materials.descent import Steps, descend
 from gsbake.materials.linear_shading import BaseColourSolver, PhotoSamples, observed_weight
-from gsbake.materials.materials import Materials
 from gsbake.materials.passes import Scene
 from gsbake.materials.state import State
+from gsbake.materials.surface import EdgeAwareFilter, Materials
 from gsbake.texturing.texels import Texels
 
 Floats = NDArray[np.float64]
@@ -49,18 +48,26 @@ class MetalNoise:
         for turn in range(self.rounds):
             metal, surface, m = state.metal & state.emits_nothing, state.level.surface, state.materials
             base, texel = without_noise(state.metal_samples(), m, metal, surface.texels, surface.pairs), np.flatnonzero(metal)
-            state = state.with_inside(texel, replace(m.of(texel), base_color=base[texel].astype(np.float32))).with_transport().judged()
+            state = state.with_inside(texel, replace(m.of(texel), base_color=base[texel].astype(np.float32))).with_transport()
             if self.steps is not None:
                 state = descend(scene.seeded(turn), state, self.steps, scene.each("trials of metal and dielectric"))
         return state
 
 
-#: Change of base colour (sRGB, sum of channels) between adjacent texels over which a neighbourhood extends.
-SCALE = 0.5
+@dataclass(frozen=True)
+class NoiseOptions:
+    """Constants of the filter of noise."""
+
+    #: Change of base colour (sRGB, sum of channels) between adjacent texels over which a neighbourhood extends.
+    scale: float = 0.5
+    #: Weights and variances below are none.
+    tiny: float = 1e-6
+
+
+OPTIONS = NoiseOptions()
+
 #: Weight of unclipped pixels in each half from which a texel's noise is measured; least share of metal for it to be filtered.
 MIN_WEIGHT, MIN_SHARE = 0.15, 0.01
-#: Weights and variances below are none.
-TINY = 1e-6
 
 
 def without_noise(
@@ -75,10 +82,10 @@ def without_noise(
         return base
     colour, weight = encode(np.clip(base, 0, 1)).astype(np.float64), observed_weight(photos, len(base)) * metal
     noise, measured = _noise(photos, np.ascontiguousarray(materials.roughness))
-    near = EdgeAwareFilter(texels, pairs, np.where(metal[:, None], colour, 0).astype(np.float32), SCALE)
+    near = EdgeAwareFilter(texels, pairs, np.where(metal[:, None], colour, 0).astype(np.float32), OPTIONS.scale)
     mean = _mean(near, colour, weight)
     variance = _mean(near, np.square(colour - mean), weight)
-    share = np.clip(1 - _mean(near, noise, weight * measured) / np.maximum(variance, TINY), 0, 1)
+    share = np.clip(1 - _mean(near, noise, weight * measured) / np.maximum(variance, OPTIONS.tiny), 0, 1)
     return np.where(metal[:, None], decode(np.clip(mean + share * (colour - mean), 0, 1)), base)
 
 
@@ -96,4 +103,4 @@ def _noise(photos: Sequence[PhotoSamples], roughness: NDArray[np.float32]) -> tu
 def _mean(near: EdgeAwareFilter, values: Floats, weight: Floats) -> Floats:
     """Weighted means (n, c) of `values` (n, c) over the neighbourhoods of `near`."""
     total = near(weight)
-    return np.stack([near(weight * column) for column in values.T], 1) / np.maximum(total, TINY)[:, None]
+    return np.stack([near(weight * column) for column in values.T], 1) / np.maximum(total, OPTIONS.tiny)[:, None]

@@ -28,9 +28,10 @@ import torch
 from numpy.typing import NDArray
 
 from gsbake.materials import fit_kernel
-from gsbake.materials.passes import Each, Pass, Priors, Scene, run_passes
+from gsbake.materials.concurrent_fits import Each
+from gsbake.materials.linear_shading import KernelTables, ShadingStep
+from gsbake.materials.passes import Pass, Priors, Scene, run_passes
 from gsbake.materials.photo import Photo
-from gsbake.materials.shading import KernelTables, ShadingStep
 from gsbake.materials.sparsity_prior import KERNEL_WIDTHS, common_materials
 from gsbake.materials.state import Level, State, copied
 from gsbake.shading.light_motion import rotated
@@ -93,12 +94,12 @@ OPTIONS = DescentOptions()
 
 
 def descend(scene: Scene, state: State, plan: Steps, each: Each, steps: int | None = None) -> State:
-    """The state after the gradient steps of `plan` and the passes among them, judged on validation photos; `steps`, where given, is their
+    """The state after the gradient steps of `plan` and the passes among them; `steps`, where given, is their
     number. The order of photos follows from the scene's seed. `each(done, total)` is called after every step."""
     total = scene.steps(plan.share) if steps is None else steps
     photos = [photo for photo in state.level.photos if len(photo)]
     if not photos or not total:
-        return state.judged()
+        return state
     scene = replace(scene, random=np.random.default_rng(scene.seed))
     work = _Work(state, scene.priors)
     order: list[int] = []
@@ -117,7 +118,7 @@ def descend(scene: Scene, state: State, plan: Steps, each: Each, steps: int | No
         decay, light_decay = (plan.rate * final ** (step / total) for final in (o.final_rate, o.light_final_rate))
         work.step(photos[order.pop()], decay, light_decay, plan.normals)
         each(step + 1, total)
-    return work.finished().judged()
+    return work.finished()
 
 
 class _Work:

@@ -28,20 +28,32 @@ from gsbake.materials.metallic import MIN_WEIGHT
 
 Floats = NDArray[np.float64]
 
-#: Neighbours join a region when they differ by less than this share of their strongest channel, and are brighter than this (linear).
-MAX_DIFFERENCE, MIN_RADIANCE = 0.08, 0.08
-#: Smallest region tested, in texels.
-MIN_REGION = 64
-#: Median radiance / E (strongest channel) from which a region is tested.
-MIN_ALBEDO = 0.7
-#: Standard deviations of logarithms: of the irradiance at least; of the radiance at most, as a share of that. Largest slope.
-MIN_IRRADIANCE_DEVIATION, MAX_DEVIATION_RATIO, MAX_SLOPE = 0.025, 0.5, 0.25
-#: Texels of a region beyond this many robust standard deviations are outliers (prints, boundaries).
-OUTLIER_DEVIATIONS = 3.0
+
+@dataclass(frozen=True)
+class EmissionOptions:
+    """Constants of the detection of emissive regions."""
+
+    #: Neighbours join a region when they differ by less than this share of their strongest channel, and are brighter than this (linear).
+    max_difference: float = 0.08
+    min_radiance: float = 0.08
+    #: Smallest region tested, in texels.
+    min_region: int = 64
+    #: Median radiance / E (strongest channel) from which a region is tested.
+    min_albedo: float = 0.7
+    #: Standard deviations of logarithms: of the irradiance at least; of the radiance at most, as a share of that. Largest slope.
+    min_irradiance_deviation: float = 0.025
+    max_deviation_ratio: float = 0.5
+    max_slope: float = 0.25
+    #: Texels of a region beyond this many robust standard deviations are outliers (prints, boundaries).
+    outlier_deviations: float = 3.0
+    #: Beyond the boundary, within as many steps, the median texel must differ from the region by this share of its strongest channel.
+    min_edge_contrast: float = 0.3
+
+
+OPTIONS = EmissionOptions()
+
 #: A region's boundary mixes with its surroundings: texels within this many steps with the same hue (cosine) are emissive too.
 BOUNDARY_STEPS, MIN_HUE_COSINE = 2, 0.97
-#: Beyond the boundary, within as many steps, the median texel must differ from the region by this share of its strongest channel.
-MIN_EDGE_CONTRAST = 0.3
 
 
 @dataclass(frozen=True)
@@ -61,15 +73,15 @@ def find_emission(
     radiance, irradiance = _diffuse_radiance(photos, roughness)
     peak = radiance.max(1)
     pairs = pairs[(observed_weight(photos, n) > MIN_WEIGHT)[pairs].all(1)]
-    first, second = pairs[(peak > MIN_RADIANCE)[pairs].all(1)].T
+    first, second = pairs[(peak > OPTIONS.min_radiance)[pairs].all(1)].T
     difference = np.abs(radiance[first] - radiance[second]).max(1)
-    similar = difference < MAX_DIFFERENCE * np.maximum(peak[first], peak[second])
+    similar = difference < OPTIONS.max_difference * np.maximum(peak[first], peak[second])
     region = _components(n, first[similar], second[similar])
     emissive_regions: list[NDArray[np.int64]] = []
     sizes = np.bincount(region)
     order = np.argsort(region, kind="stable")
     ends = np.cumsum(sizes)
-    for index in np.flatnonzero(sizes >= MIN_REGION):
+    for index in np.flatnonzero(sizes >= OPTIONS.min_region):
         member = order[ends[index] - sizes[index] : ends[index]]
         inlier = member[_inliers(radiance[member].mean(1))]
         if _is_emissive(radiance[inlier], irradiance[inlier], position[inlier]) and _ends_at_edge(member, radiance, pairs):
@@ -104,20 +116,24 @@ def _inliers(brightness: Floats) -> NDArray[np.bool_]:
     """Which texels (m,) of a region are not outliers in `brightness` (m,)."""
     median = np.median(brightness)
     deviation = np.abs(brightness - median)
-    return np.asarray(deviation <= OUTLIER_DEVIATIONS * 1.4826 * np.median(deviation) + 0.01 * median)
+    return np.asarray(deviation <= OPTIONS.outlier_deviations * 1.4826 * np.median(deviation) + 0.01 * median)
 
 
 def _is_emissive(radiance: Floats, irradiance: Floats, position: NDArray[np.floating]) -> bool:
     """Whether a region of m texels emits: diffuse `radiance` (m, 3), `irradiance` / π (m, 3), `position` (m, 3)."""
     albedo = np.median(radiance / np.maximum(irradiance, 1e-6), 0).max()
-    if not albedo > MIN_ALBEDO:
+    if not albedo > OPTIONS.min_albedo:
         return False
     linear = np.column_stack([np.ones(len(position)), position - position.mean(0)])
     mean_irradiance = irradiance.mean(1)
     smooth = linear @ np.linalg.lstsq(linear, mean_irradiance, rcond=None)[0]
     x, y = np.log(np.maximum(smooth, 1e-6)), np.log(np.maximum(radiance.mean(1), 1e-6))
     x, y = x - x.mean(), y - y.mean()
-    return bool(x.std() > MIN_IRRADIANCE_DEVIATION and y.std() < MAX_DEVIATION_RATIO * x.std() and (x @ y) < MAX_SLOPE * (x @ x))
+    return bool(
+        x.std() > OPTIONS.min_irradiance_deviation
+        and y.std() < OPTIONS.max_deviation_ratio * x.std()
+        and (x @ y) < OPTIONS.max_slope * (x @ x)
+    )
 
 
 def _ends_at_edge(member: NDArray[np.int64], radiance: Floats, pairs: NDArray[np.int64]) -> bool:
@@ -125,7 +141,7 @@ def _ends_at_edge(member: NDArray[np.int64], radiance: Floats, pairs: NDArray[np
     median = np.median(radiance[member], 0)
     inside = _dilate(member, len(radiance), pairs, BOUNDARY_STEPS)
     ring = _dilate(np.flatnonzero(inside), len(radiance), pairs, BOUNDARY_STEPS) & ~inside
-    return bool(ring.any()) and bool(np.median(np.abs(radiance[ring] - median).max(1)) > MIN_EDGE_CONTRAST * median.max())
+    return bool(ring.any()) and bool(np.median(np.abs(radiance[ring] - median).max(1)) > OPTIONS.min_edge_contrast * median.max())
 
 
 def _dilate(

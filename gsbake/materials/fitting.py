@@ -13,14 +13,12 @@ from gsbake.capture.posed_photos import PosedPhotos
 from gsbake.capture.view_dependence import is_diffuse
 from gsbake.config.schema import Bake
 from gsbake.geometry.cameras import Camera
-from gsbake.materials.materials import Materials
 from gsbake.materials.passes import Finer, Priors, Scene, Target, run_passes
-from gsbake.materials.photo import Photo, PhotoReader, texel_weight
+from gsbake.materials.photo import SURFACE_POINTS, MeshBrightness, Photo, PhotoReader, texel_weight
 from gsbake.materials.recipe import FIT, MAPS
 from gsbake.materials.starts import MOTIONS
 from gsbake.materials.state import Level, State
-from gsbake.materials.surface import InterpolatedTransport, Surface, neighbours
-from gsbake.materials.view_dependence import SURFACE_POINTS, MeshBrightness
+from gsbake.materials.surface import InterpolatedTransport, Materials, Surface, neighbours
 from gsbake.materials.visibility import Visibility
 from gsbake.meshing.resolution import pixel_footprint
 from gsbake.monitor import Monitor, PartSequence, Rule, decide_skip, skips

@@ -19,10 +19,24 @@ reweighting, so that misplaced reflections do not decide. Residuals are of sRGB 
 sharp reflection that is misplaced by a few pixels would otherwise favour a darker light, by regression dilution (Fuller, *Measurement
 Error Models*, 1987).
 
-On rough materials reflections hardly tell the intensity, and the residual is flat over a factor of three. There a prior decides
-(`intensity_prior`). The residuals count as `OBSERVATIONS` independent ones of a Laplace distribution:
+On rough materials reflections hardly tell the intensity, and the residual is flat over a factor of three. There a prior decides. The
+residuals count as `OBSERVATIONS` independent ones of a Laplace distribution:
 
     −log p = OBSERVATIONS · log residual − log prior
+
+The prior. A brighter light on a darker surface looks the same, on metal exactly so.
+
+Three quantities are known roughly before any photo is looked at, and an intensity is likely where all of them are:
+
+- the geometric mean of the strongest channel of dielectrics' base colours,
+- the median of that of metals. Those of pure metals are tabulated (silver, aluminium, gold, copper, chromium, nickel, titanium, cobalt,
+  platinum and iron: Lagarde & de Rousiers, *Moving Frostbite to PBR*, 2014, table 4),
+- the mean radiance of a light that stands, since photographers expose for it: in it white paper is as bright as that. `python -m
+  benchmarks.light_levels` measures environment maps that others have published. A flash, which moves with the camera, is one bright spot.
+
+The logarithm of each follows Student's t with two degrees of freedom: some objects are black, and some lights those of a night. The light's
+scale is that of the environment maps' quartiles; metals' .4 where the tabulated ones have .28, as worn and dirty ones differ more. Where
+two quantities contradict each other such a prior has two modes, between which small changes would decide; so its mean is taken.
 """
 
 from __future__ import annotations
@@ -34,27 +48,41 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from gsbake.materials.intensity_prior import IntensityPrior
 from gsbake.materials.linear_shading import BaseColourSolver, PhotoSamples
+from gsbake.materials.surface import Materials
+from gsbake.materials.visibility import LUMINANCE
+from gsbake.shading.cubemap import solid_angles
 
 Floats = NDArray[np.float64]
 
 #: Search steps: factor on intensity, exponent of contrast, shift of logit(roughness).
 INTENSITY_FACTOR, CONTRAST_EXPONENT, ROUGHNESS_STEP = 1.2, 1.15, 0.4
-#: Directions of search in steps of intensity, contrast and roughness, in order. Never smoother: a blurred environment favours that.
-DIRECTIONS = ((-1, 0, 0), (1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (1, 0, 1), (0, 1, 1))
-#: Start of a second search, in steps: bright light on rough material is a separate local minimum.
-SECOND_START = (2, 0, 4)
+
+
+@dataclass(frozen=True)
+class LightSearchOptions:
+    """Constants of the search for the light, and of the prior of its intensity."""
+
+    #: Directions of search in steps of intensity, contrast and roughness, in order. Never smoother: a blurred environment favours that.
+    directions: tuple[tuple[int, ...], ...] = ((-1, 0, 0), (1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (1, 0, 1), (0, 1, 1))
+    #: Start of a second search, in steps: bright light on rough material is a separate local minimum.
+    second_start: tuple[int, ...] = (2, 0, 4)
+    #: Relative decrease of the residual that a step must bring; a step with more roughness; the result of the second search.
+    min_decrease: float = 0.002
+    min_rougher_decrease: float = 0.01
+    min_second_decrease: float = 0.03
+    #: Costs below this are noise.
+    min_cost: float = 1e-9
+
+
+OPTIONS = LightSearchOptions()
+
 #: Factor on the intensity of single channels, tried at the end.
 TINT_FACTOR = 1.1
 #: Bounds of the search: factor of intensity, factor of the contrast exponent, shift of logit(roughness).
 LIMITS = (3.0, 2.0, 3.0)
-#: Relative decrease of the residual that a step must bring; a step with more roughness; the result of the second search.
-MIN_DECREASE, MIN_ROUGHER_DECREASE, MIN_SECOND_DECREASE = 0.002, 0.01, 0.03
 #: Number of independent residuals that evidence for the intensity counts as: errors of the model are shared by all pixels.
 OBSERVATIONS = 10.0
-#: Costs below this are noise.
-MIN_COST = 1e-9
 
 
 @dataclass(frozen=True)
@@ -110,7 +138,7 @@ def search_light(
 
     `samples` gives the pixels of all photos under the environment of an intensity (3,) and a contrast; `roughness` (n,) is that of the
     texels. Without `tint` the ratio of the channels is fixed. Without `rough` the roughness is fixed; with it, a second search starts at
-    `SECOND_START`. A `prior` of the intensity counts as well.
+    `second_start`. A `prior` of the intensity counts as well.
     """
     residuals: dict[_Candidate, Floats] = {}
     lit: dict[tuple[float, ...], Sequence[PhotoSamples]] = {}
@@ -131,15 +159,15 @@ def search_light(
         moved = True
         while moved:
             moved = False
-            for direction in (direction for direction in DIRECTIONS if rough or not direction[2]):
-                bound = 1 - (MIN_ROUGHER_DECREASE if direction[2] else MIN_DECREASE)
+            for direction in (direction for direction in OPTIONS.directions if rough or not direction[2]):
+                bound = 1 - (OPTIONS.min_rougher_decrease if direction[2] else OPTIONS.min_decrease)
                 tried = best.step(*direction)
                 while tried.within_limits and cost(tried) < bound * cost(best):
                     best, tried, moved = tried, tried.step(*direction), True
         return best
 
     def between_steps(best: _Candidate) -> _Candidate:
-        below, here, above = (math.log(max(cost(best.step(k, 0, 0)), MIN_COST)) for k in (-1, 0, 1))
+        below, here, above = (math.log(max(cost(best.step(k, 0, 0)), OPTIONS.min_cost)) for k in (-1, 0, 1))
         if (curvature := below - 2 * here + above) <= 0:
             return best
         tried = best.step(float(np.clip((below - above) / (2 * curvature), -1, 1)), 0, 0)
@@ -148,8 +176,8 @@ def search_light(
     start = _Candidate(0, 0, 0)
     best = descend(start)
     if rough:
-        second = descend(start.step(*SECOND_START))
-        best = second if cost(second) < (1 - MIN_SECOND_DECREASE) * cost(best) else best
+        second = descend(start.step(*OPTIONS.second_start))
+        best = second if cost(second) < (1 - OPTIONS.min_second_decrease) * cost(best) else best
     best = between_steps(best)
     if tint:
         best = _tinted(best, residual)
@@ -189,7 +217,7 @@ def _tinted(best: _Candidate, residual: Callable[[_Candidate], Floats]) -> _Cand
     """`best` with one or two channels a step dimmer or brighter, where that lowers the residual."""
     for sign in (-1, 1):
         all_channels = replace(best, tint=(sign, sign, sign))
-        lower = residual(all_channels) < (1 - MIN_DECREASE) * residual(best)
+        lower = residual(all_channels) < (1 - OPTIONS.min_decrease) * residual(best)
         tried = replace(best, tint=tuple(sign * int(channel) for channel in lower))
         if 0 < lower.sum() < 3 and residual(tried).sum() < residual(best).sum():
             return tried
@@ -206,3 +234,48 @@ def _residual(photos: Sequence[PhotoSamples], roughness: NDArray[np.float32]) ->
         total += [np.abs(np.bincount(photo.block, error[:, k])).sum() for k in range(3)]
         pixels += float(photo.weight.sum())
     return total / max(pixels, 1e-12)
+
+
+#: Median, and scale of the logarithm, of base colours of dielectrics and of metals, and of the light's mean radiance.
+DIELECTRICS, METALS, RADIANCE = (0.3, 0.66), (0.66, 0.4), (0.7, 0.29)
+#: Least share of texels of a kind whose base colours count; what is added to those of dielectrics, so that black places do not decide.
+MIN_SHARE, LOG_OFFSET = 0.05, 0.01
+#: Factors on the intensity over which `mean_factor` integrates.
+FACTORS = np.exp(np.linspace(-math.log(4), math.log(4), 121))
+
+
+@dataclass(frozen=True)
+class IntensityPrior:
+    """Present means of the base colours of `dielectrics` and of `metals`, and of the light's `radiance`; None where one does not count."""
+
+    dielectrics: float | None = None
+    metals: float | None = None
+    radiance: float | None = None
+
+    @classmethod
+    def of(cls, materials: Materials, dielectric: NDArray[np.bool_], radiance: NDArray[np.float32] | None) -> IntensityPrior:
+        """The prior for texels with `materials`, of which some (n,) are `dielectric`, under the environment map `radiance` (6, s, s, 3),
+        which does not count without."""
+        strongest, metal = materials.base_color.max(1), materials.metallic > 0.5
+        dielectrics = float(np.exp(np.log(strongest[dielectric] + LOG_OFFSET).mean())) if dielectric.mean() >= MIN_SHARE else None
+        metals = float(np.median(strongest[metal])) if metal.mean() >= MIN_SHARE else None
+        if radiance is None:
+            return cls(dielectrics, metals)
+        area = solid_angles(radiance.shape[1])
+        return cls(dielectrics, metals, float(((radiance @ LUMINANCE) * area).sum() / area.sum()))
+
+    def negative_log(self, factor: float) -> float:
+        """−log of the prior, up to a constant, of the light times `factor`, under which base colours are divided by it."""
+        known = ((self.dielectrics, 1 / factor, DIELECTRICS), (self.metals, 1 / factor, METALS), (self.radiance, factor, RADIANCE))
+        return sum(_negative_log(value * change, *prior) for value, change, prior in known if value)
+
+    def mean_factor(self) -> float:
+        """The geometric mean of the factor on the intensity under the prior, between 1/4 and 4."""
+        cost = np.array([self.negative_log(factor) for factor in FACTORS])
+        density = np.exp(cost.min() - cost)
+        return float(np.exp(density @ np.log(FACTORS) / density.sum()))
+
+
+def _negative_log(value: float, median: float, scale: float) -> float:
+    """−log of Student's t of log(value), up to a constant."""
+    return 1.5 * math.log1p(0.5 * (math.log(value / median) / scale) ** 2)

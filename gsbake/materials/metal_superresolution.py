@@ -36,42 +36,60 @@ from numpy.typing import NDArray
 
 from gsbake.imaging.srgb import encode
 from gsbake.materials.linear_shading import LinearShading, PhotoSamples, unclipped_weights
-from gsbake.materials.materials import Materials
 from gsbake.materials.metallic import MIN_METAL_ALBEDO
 from gsbake.materials.passes import Scene
 from gsbake.materials.photo import PhotoReader
 from gsbake.materials.state import State
+from gsbake.materials.surface import Materials
 from gsbake.texturing.texels import Texels
 
 Floats = NDArray[np.float32]
 
-#: Iterations of the solver.
-SOLVER_STEPS = 15
-#: Weight of the initial values, as a share of the median weight of the pixels.
-INITIAL_WEIGHT = 0.001
-#: A photo's gain is averaged over about this many pixels, lies within this factor of 1, and tends to 1 where expected colours are below
-#: this share of their mean.
-GAIN_RADIUS, MAX_GAIN, GAIN_REGULARISATION = 4.0, 8.0, 0.003
-#: A texel lies in a metal region where this share of texels around it, within about so many texels, is metal: holes belong to the region.
-REGION_RADIUS, MIN_METAL_SHARE = 2.0, 0.35
+
+@dataclass(frozen=True)
+class SuperresolutionOptions:
+    """Constants of the super-resolution; lengths are in texels unless said otherwise."""
+
+    #: Iterations of the solver.
+    solver_steps: int = 15
+    #: Weight of the initial values, as a share of the median weight of the pixels.
+    initial_weight: float = 0.001
+    #: A photo's gain is averaged over about this many pixels, lies within this factor of 1, and tends to 1 where expected colours are below
+    #: this share of their mean.
+    gain_radius: float = 4.0
+    max_gain: float = 8.0
+    gain_regularisation: float = 0.003
+    #: A texel lies in a metal region where this share of texels around it, within about so many texels, is metal: holes belong to the
+    #: region.
+    region_radius: float = 2.0
+    min_metal_share: float = 0.35
+    #: Metal is perforated where the share of texels darker than this share of the metal's brightness is between these bounds: others were
+    #: fitted as well and have less noise. Photos blur holes of a pixel or two, so these are not black before the binary prior acts.
+    dark: float = 0.5
+    hole_share: tuple[float, float] = (0.1, 0.7)
+    #: Radius in texels of local statistics, and of the smoothing below which detail begins.
+    local_radius: float = 12.0
+    detail_radius: float = 3.0
+    #: Least correlation of the detail in the two halves of the photos.
+    min_correlation: float = 0.25
+    #: Steps before the binary prior starts, the largest brightness while it acts, and the power of relative brightness that weighs texels
+    #: in the metal's colour (photos blur bars as well).
+    unconstrained_steps: int = 3
+    max_brightness: float = 1.5
+    brightness_power: int = 4
+    #: Thresholds between hole and bar that are interpolated, and the final one; shares of the metal's brightness.
+    bar_thresholds: tuple[float, ...] = (0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8)
+    hole_threshold: float = 0.25
+    #: Reflectance of dielectrics at normal incidence.
+    dielectric_f0: float = 0.04
+
+
+OPTIONS = SuperresolutionOptions()
+
 #: Hue is averaged over about this many texels: patterns differ in brightness, while a misplaced reflection has a hue.
 HUE_RADIUS = 4.0
-#: Metal is perforated where the share of texels darker than this share of the metal's brightness is between these bounds: others were
-#: fitted as well and have less noise. Photos blur holes of a pixel or two, so these are not black before the binary prior acts.
-DARK, HOLE_SHARE = 0.5, (0.1, 0.7)
-#: Radius in texels of local statistics, and of the smoothing below which detail begins.
-LOCAL_RADIUS, DETAIL_RADIUS = 12.0, 3.0
-#: Least correlation of the detail in the two halves of the photos.
-MIN_CORRELATION = 0.25
-#: Steps before the binary prior starts, the largest brightness while it acts, and the power of relative brightness that weighs texels in
-#: the metal's colour (photos blur bars as well).
-UNCONSTRAINED_STEPS, MAX_BRIGHTNESS, BRIGHTNESS_POWER = 3, 1.5, 4
-#: Thresholds between hole and bar that are interpolated, and the final one; shares of the metal's brightness.
-BAR_THRESHOLDS, HOLE_THRESHOLD = (0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8), 0.25
 #: sRGB errors beyond this count linearly.
 ROBUST_SCALE = 0.1
-#: Reflectance of dielectrics at normal incidence.
-DIELECTRIC_F0 = 0.04
 
 
 @dataclass(frozen=True)
@@ -114,7 +132,7 @@ class MetalSuperresolution:
 
 def metal_regions(texels: Texels, metal: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Mask (n,) of the texels in a neighbourhood of mostly `metal` (n,)."""
-    return np.asarray(_blur(texels, metal[:, None].astype(np.float32), REGION_RADIUS)[:, 0] > MIN_METAL_SHARE)
+    return np.asarray(_blur(texels, metal[:, None].astype(np.float32), OPTIONS.region_radius)[:, 0] > OPTIONS.min_metal_share)
 
 
 def superresolved(maps: Materials, texels: Texels, region: NDArray[np.bool_], photos: Sequence[MetalPixels]) -> Materials:
@@ -128,7 +146,7 @@ def superresolved(maps: Materials, texels: Texels, region: NDArray[np.bool_], ph
         _with_local_hue(_solve(some, initial), texels, region) for some in (systems, systems[::2], systems[1::2])
     )
     around, perforated = _metal_colour(everything, texels, region).mean(1), region.copy()
-    dark = everything.mean(1) < np.maximum(DARK * around, MIN_METAL_ALBEDO)
+    dark = everything.mean(1) < np.maximum(OPTIONS.dark * around, MIN_METAL_ALBEDO)
     perforated[region] = _has_holes(texels, region, dark) & _correlated(texels, region, half.mean(1), other_half.mean(1))
     if not perforated.any():
         return maps
@@ -139,9 +157,9 @@ def superresolved(maps: Materials, texels: Texels, region: NDArray[np.bool_], ph
     solved = _solve(_photo_systems(photos, perforated), maps.base_color[perforated], prior)
     base = _with_local_hue(solved, texels, perforated)
     metal = _metal_colour(base, texels, perforated).mean(1)
-    hole = base.mean(1) < np.maximum(HOLE_THRESHOLD * metal, MIN_METAL_ALBEDO)
+    hole = base.mean(1) < np.maximum(OPTIONS.hole_threshold * metal, MIN_METAL_ALBEDO)
     out = maps.copied()
-    out.base_color[perforated] = np.where(hole[:, None], np.maximum(base - DIELECTRIC_F0, 0), np.minimum(base, 1))
+    out.base_color[perforated] = np.where(hole[:, None], np.maximum(base - OPTIONS.dielectric_f0, 0), np.minimum(base, 1))
     if np.ptp(maps.roughness) > 0:  # a constant roughness stays constant
         out.roughness[perforated] = np.where(hole, 1, out.roughness[perforated])
     out.metallic[perforated] = ~hole
@@ -156,16 +174,16 @@ def _blur(texels: Texels, values: NDArray[np.floating], radius: float) -> Floats
 
 def _has_holes(texels: Texels, region: NDArray[np.bool_], hole: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Which of the t texels in `region` (n,) have both metal and holes (t,) around them."""
-    share = _local_mean(hole[:, None].astype(np.float32), texels, region, LOCAL_RADIUS)[:, 0]
-    return np.asarray((share > HOLE_SHARE[0]) & (share < HOLE_SHARE[1]))
+    share = _local_mean(hole[:, None].astype(np.float32), texels, region, OPTIONS.local_radius)[:, 0]
+    return np.asarray((share > OPTIONS.hole_share[0]) & (share < OPTIONS.hole_share[1]))
 
 
 def _correlated(texels: Texels, region: NDArray[np.bool_], first: Floats, second: Floats) -> NDArray[np.bool_]:
     """Where (t,) in `region` (n,) the detail of two brightnesses (t,) is locally correlated."""
     both = np.stack([first, second], 1)
-    a, b = (both - _local_mean(both, texels, region, DETAIL_RADIUS)).T
-    covariance, variance_a, variance_b = _local_mean(np.stack([a * b, a * a, b * b], 1), texels, region, LOCAL_RADIUS).T
-    return np.asarray(covariance > MIN_CORRELATION * np.sqrt(variance_a * variance_b))
+    a, b = (both - _local_mean(both, texels, region, OPTIONS.detail_radius)).T
+    covariance, variance_a, variance_b = _local_mean(np.stack([a * b, a * a, b * b], 1), texels, region, OPTIONS.local_radius).T
+    return np.asarray(covariance > OPTIONS.min_correlation * np.sqrt(variance_a * variance_b))
 
 
 def _local_mean(
@@ -188,25 +206,27 @@ def _with_local_hue(base: Floats, texels: Texels, region: NDArray[np.bool_]) -> 
 def _metal_colour(base: Floats, texels: Texels, region: NDArray[np.bool_]) -> Floats:
     """Colour (t, 3) of the metal around each texel of `base` (t, 3) in `region` (n,): the mean of the brighter ones."""
     brightness = base.mean(1)
-    ratio = brightness / np.maximum(_local_mean(base, texels, region, LOCAL_RADIUS).mean(1), 1e-6)
-    return _local_mean(base, texels, region, LOCAL_RADIUS, (ratio > 1) * ratio**BRIGHTNESS_POWER)
+    ratio = brightness / np.maximum(_local_mean(base, texels, region, OPTIONS.local_radius).mean(1), 1e-6)
+    return _local_mean(base, texels, region, OPTIONS.local_radius, (ratio > 1) * ratio**OPTIONS.brightness_power)
 
 
 def _metal_or_black(base: Floats, texels: Texels, region: NDArray[np.bool_]) -> Floats:
     """For each texel of `base` (t, 3) in `region` (n,) the colour (t, 3) of the metal around it, or black.
 
-    The brightest texels are metal. The threshold, a share of the metal's brightness, is interpolated between `BAR_THRESHOLDS` such that the
+    The brightest texels are metal. The threshold, a share of the metal's brightness, is interpolated between `bar_thresholds` such that the
     local mean of the binary image is that of `base`.
     """
     metal = _metal_colour(base, texels, region)
     share = base.mean(1) / np.maximum(metal.mean(1), 1e-6)
-    above = _local_mean(np.column_stack([share[:, None] > np.asarray(BAR_THRESHOLDS), share]), texels, region, DETAIL_RADIUS)
+    above = _local_mean(
+        np.column_stack([share[:, None] > np.asarray(OPTIONS.bar_thresholds), share]), texels, region, OPTIONS.detail_radius
+    )
     wanted = above[:, -1]
-    threshold = np.full(len(base), BAR_THRESHOLDS[0])
-    for k in range(1, len(BAR_THRESHOLDS)):
+    threshold = np.full(len(base), OPTIONS.bar_thresholds[0])
+    for k in range(1, len(OPTIONS.bar_thresholds)):
         more, fewer = above[:, k - 1], above[:, k]
         part = np.clip((more - wanted) / np.maximum(more - fewer, 1e-6), 0, 1)
-        interpolated = BAR_THRESHOLDS[k - 1] + part * (BAR_THRESHOLDS[k] - BAR_THRESHOLDS[k - 1])
+        interpolated = OPTIONS.bar_thresholds[k - 1] + part * (OPTIONS.bar_thresholds[k] - OPTIONS.bar_thresholds[k - 1])
         threshold = np.where(more > wanted, interpolated, threshold)
     return np.where((share > threshold)[:, None], metal, np.float32(0))
 
@@ -231,10 +251,10 @@ class _PhotoSystem:
         column, row = self.column - self.column.min(), self.row - self.row.min()
         image = np.zeros((row.max() + 1, column.max() + 1, 2), np.float32)
         image[row, column] = sums
-        observed, expected = cv2.GaussianBlur(image, (0, 0), GAIN_RADIUS)[row, column].T
-        prior = GAIN_REGULARISATION * expected.mean()
+        observed, expected = cv2.GaussianBlur(image, (0, 0), OPTIONS.gain_radius)[row, column].T
+        prior = OPTIONS.gain_regularisation * expected.mean()
         ratio = (observed + prior) / np.maximum(expected + prior, 1e-12)
-        return np.asarray(np.clip(ratio, 1 / MAX_GAIN, MAX_GAIN)[:, None], np.float32)
+        return np.asarray(np.clip(ratio, 1 / OPTIONS.max_gain, OPTIONS.max_gain)[:, None], np.float32)
 
     def normal_equations(self, base: Floats, gain: Floats) -> tuple[Floats, Floats]:
         """Gradient (t, 3) and weight (t, 3) for the texels where pixels have base colour `base` (m, 3) and `gain` (m, 1)."""
@@ -274,11 +294,11 @@ def _photo_systems(photos: Sequence[MetalPixels], region: NDArray[np.bool_]) -> 
 def _solve(systems: Sequence[_PhotoSystem], initial: Floats, prior: Callable[[Floats], Floats] | None = None) -> Floats:
     """Base colours (t, 3) in [0, 1] that reproduce the photos, near `initial` (t, 3).
 
-    With `prior` they are drawn increasingly to its value for the present ones, up to `MAX_BRIGHTNESS`, and photos have local gains.
+    With `prior` they are drawn increasingly to its value for the present ones, up to `max_brightness`, and photos have local gains.
     """
     base = initial.copy()
     gains = [np.ones((len(system.row), 1), np.float32) for system in systems]
-    for step in range(SOLVER_STEPS):
+    for step in range(OPTIONS.solver_steps):
         gradient, weight = np.zeros_like(initial), np.zeros_like(initial)
         for k, system in enumerate(systems):
             pixel_base = np.asarray(system.mean @ base)
@@ -288,9 +308,9 @@ def _solve(systems: Sequence[_PhotoSystem], initial: Floats, prior: Callable[[Fl
             gradient += photo_gradient
             weight += photo_weight
         median = np.median(weight[weight > 0]) if (weight > 0).any() else 1.0
-        gradient, weight = gradient + INITIAL_WEIGHT * median * (initial - base), weight + INITIAL_WEIGHT * median
-        if prior is not None and step >= UNCONSTRAINED_STEPS:
-            strength = median * (step + 1 - UNCONSTRAINED_STEPS) / (SOLVER_STEPS - UNCONSTRAINED_STEPS)
+        gradient, weight = gradient + OPTIONS.initial_weight * median * (initial - base), weight + OPTIONS.initial_weight * median
+        if prior is not None and step >= OPTIONS.unconstrained_steps:
+            strength = median * (step + 1 - OPTIONS.unconstrained_steps) / (OPTIONS.solver_steps - OPTIONS.unconstrained_steps)
             gradient, weight = gradient + strength * (prior(base) - base), weight + strength
-        base = np.asarray(np.clip(base + gradient / weight, 0, 1 if prior is None else MAX_BRIGHTNESS), np.float32)
+        base = np.asarray(np.clip(base + gradient / weight, 0, 1 if prior is None else OPTIONS.max_brightness), np.float32)
     return base

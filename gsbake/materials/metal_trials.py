@@ -23,11 +23,11 @@ from scipy.cluster.vq import kmeans2
 
 from gsbake.materials.descent import Steps, descend
 from gsbake.materials.linear_shading import BaseColourSolver, observed_weight
-from gsbake.materials.materials import Materials
 from gsbake.materials.metallic import TRIED_ROUGHNESS, candidate_model, shaded
 from gsbake.materials.passes import Scene
 from gsbake.materials.photo import texel_weight
 from gsbake.materials.state import LIMITS, State
+from gsbake.materials.surface import Materials
 from gsbake.shading.environment import EnvironmentLight
 
 Floats = NDArray[np.float64]
@@ -36,13 +36,26 @@ Floats = NDArray[np.float64]
 GROUPS, MIN_SHARE = 24, 0.008
 #: Weight from which a texel is observed.
 MIN_WEIGHT = 0.3
-#: What is added to linear colours before their logarithm is taken, and the factor on luminance beside chromaticity in groups.
-LOG_OFFSET, LUMINANCE_FACTOR = 0.02, 0.3
-#: Mean log-likelihood ratio per pixel for the present kind up to which a group has a trial.
-MAX_EVIDENCE = 2.0
-#: Groups change when that lowers the validation error by the first share, and by the second multiple of their share of the texels, so by as
-#: much of their own error if that is as large as elsewhere; a single one becomes dielectric when the error does not rise: most things are.
-MIN_DECREASE, MIN_OWN_DECREASE = 0.005, 0.5
+
+
+@dataclass(frozen=True)
+class KindTrialOptions:
+    """Constants of the trials of groups."""
+
+    #: What is added to linear colours before their logarithm is taken, and the factor on luminance beside chromaticity in groups.
+    log_offset: float = 0.02
+    luminance_factor: float = 0.3
+    #: Mean log-likelihood ratio per pixel for the present kind up to which a group has a trial.
+    max_evidence: float = 2.0
+    #: Groups change when that lowers the validation error by the first share, and by the second multiple of their share of the texels, so
+    #: by as much of their own error if that is as large as elsewhere; a single one becomes dielectric when the error does not rise: most
+    #: things are.
+    min_decrease: float = 0.005
+    min_own_decrease: float = 0.5
+
+
+OPTIONS = KindTrialOptions()
+
 
 #: A trial: the mean log-likelihood ratio per pixel of a group for its present kind, whether it is to be metal, and its texels (m,).
 Trial = tuple[float, bool, NDArray[np.int64]]
@@ -126,7 +139,7 @@ class _Tried:
         """Before all trials: texels and light adapt once, so that trials are compared with a state that had as many steps."""
 
         def adapt(state: State) -> State:
-            return descend(scene, state, steps, scene.each("trials of metal and dielectric"))
+            return descend(scene, state, steps, scene.each("trials of metal and dielectric")).judged()
 
         base = adapt(state)
         return cls(adapt, base.restarted(), adapt(base).error)
@@ -147,7 +160,7 @@ class _Tried:
         changed = self.base.with_inside(texel, Materials(both[:, :3], both[:, 3], kind)).with_transport()
         trial = self.adapt(changed)
         decrease = 1 - trial.error / max(self.error, 1e-12)
-        if not decrease > (max(MIN_DECREASE, MIN_OWN_DECREASE * share) if metal or len(groups) > 1 else 0):
+        if not decrease > (max(OPTIONS.min_decrease, OPTIONS.min_own_decrease * share) if metal or len(groups) > 1 else 0):
             return replace(self, count=self.count + 1)
         turns = (*self.turns, Turn(metal, share, decrease))
         return replace(self, base=trial.restarted(), error=self.adapt(trial).error, count=self.count + 1, turns=turns)
@@ -160,7 +173,7 @@ def _candidates(state: State, observed: NDArray[np.bool_]) -> tuple[_Models, lis
     for group in _groups(state.materials, state.level.surface.base_color, observed):
         share, for_dielectric = state.metal[group].mean(), models.evidence(group)
         for metal, for_present in ((True, for_dielectric), (False, -for_dielectric)):
-            if share != metal and for_present < MAX_EVIDENCE:
+            if share != metal and for_present < OPTIONS.max_evidence:
                 tries.append((for_present, metal, group))
     return models, sorted(tries, key=lambda entry: entry[0])
 
@@ -198,8 +211,8 @@ def _groups(materials: Materials, photographed: NDArray[np.floating], observed: 
     texel = np.flatnonzero(observed)
     columns = [np.column_stack([materials.roughness[texel], materials.metallic[texel]]).astype(np.float64)]
     for colour in (photographed, materials.base_color):
-        log = np.log(np.maximum(colour[texel], 0) + LOG_OFFSET)
-        columns.append(np.column_stack([log[:, 0] - log[:, 1], log[:, 2] - log[:, 1], LUMINANCE_FACTOR * log.mean(1)]))
+        log = np.log(np.maximum(colour[texel], 0) + OPTIONS.log_offset)
+        columns.append(np.column_stack([log[:, 0] - log[:, 1], log[:, 2] - log[:, 1], OPTIONS.luminance_factor * log.mean(1)]))
     points = np.column_stack(columns)
     count = min(GROUPS, len(points))
     if not count:

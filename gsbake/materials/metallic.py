@@ -36,18 +36,27 @@ Average = Callable[[Floats], Floats]
 
 #: Roughnesses tried beside a texel's own.
 TRIED_ROUGHNESS = (0.1, 0.2, 0.35, 0.55)
-#: Roughest metal: rougher ones shade like dielectrics, and oxides, which are rough, are dielectrics.
-MAX_METAL_ROUGHNESS = 0.6
+
+
+@dataclass(frozen=True)
+class MetalDetectionOptions:
+    """Constants of metal detection."""
+
+    #: Roughest metal: rougher ones shade like dielectrics, and oxides, which are rough, are dielectrics.
+    max_metal_roughness: float = 0.6
+    #: Share of metal among similar neighbours above which a texel is metal: removes isolated texels and fills isolated gaps.
+    majority: float = 0.5
+    #: Mean log-likelihood ratio per pixel from which the nearer neighbourhood decides.
+    clear_evidence: float = 2.0
+    #: Noise of sRGB values (0..1), and degrees of freedom of Student's t distribution of their errors.
+    noise: float = 0.01
+    degrees_of_freedom: float = 3.0
+
+
+OPTIONS = MetalDetectionOptions()
+
 #: Lowest linear base colour of a metal.
 MIN_METAL_ALBEDO = 0.1
-#: Share of metal among similar neighbours above which a texel is metal: removes isolated texels and fills isolated gaps.
-MAJORITY = 0.5
-#: Mean log-likelihood ratio per pixel from which the nearer neighbourhood decides.
-CLEAR_EVIDENCE = 2.0
-#: Noise of sRGB values (0..1), and degrees of freedom of Student's t distribution of their errors.
-NOISE, DEGREES_OF_FREEDOM = 0.01, 3.0
-#: Standard deviation of normals, as a length added to the unit normal along each tangent.
-NORMAL_ERROR = 0.035
 #: Texels with less weight of unclipped pixels than the first are undecided, as are those visible in fewer photos than the second: from few
 #: directions a dielectric under a slightly wrong light passes for metal. A photo counts from the third share of pixels around a texel.
 MIN_WEIGHT, MIN_PHOTOS, MIN_PHOTO_SHARE = 0.3, 6, 0.05
@@ -74,11 +83,11 @@ class ShadingModel:
         """Weighted sums (texels,) over pixels and channels, up to a constant, for base colours `base` (texels, 3)."""
         b = base[samples.texel]
         shown = self.shading.srgb(b)
-        variance = np.full(shown.shape, NOISE**2, np.float32)
+        variance = np.full(shown.shape, OPTIONS.noise**2, np.float32)
         for tilted in self.tilted:
             variance += np.square(tilted.srgb(b) - shown)
         error = np.square(shown - samples.encoded) / variance
-        nll = 0.5 * (DEGREES_OF_FREEDOM + 1) * np.log1p(error / DEGREES_OF_FREEDOM) + 0.5 * np.log(variance)
+        nll = 0.5 * (OPTIONS.degrees_of_freedom + 1) * np.log1p(error / OPTIONS.degrees_of_freedom) + 0.5 * np.log(variance)
         return np.asarray(np.bincount(samples.texel, samples.weight * nll.sum(1), len(base)), np.float64)
 
 
@@ -89,7 +98,7 @@ def _itself(values: Floats) -> Floats:
 def majority_vote(metal: NDArray[np.bool_], decided: NDArray[np.bool_], average: Average) -> NDArray[np.bool_]:
     """Which of the `decided` (n,) texels have a majority of `metal` (n,) among decided neighbours, weighed by the filter `average`."""
     share = average((metal & decided).astype(np.float64))
-    return np.asarray(decided & (share > MAJORITY * average(decided.astype(np.float64))))
+    return np.asarray(decided & (share > OPTIONS.majority * average(decided.astype(np.float64))))
 
 
 def find_metals(photos: Sequence[PhotoSamples], own: NDArray[np.float32], near: Average = _itself, wide: Average = _itself) -> MetalTexels:
@@ -105,7 +114,7 @@ def find_metals(photos: Sequence[PhotoSamples], own: NDArray[np.float32], near: 
     decided = (observed_weight(telling, texels) > MIN_WEIGHT) & (visible >= MIN_PHOTOS)
     difference = metal.cost - dielectric.cost
     evidence = near(difference) / np.maximum(near(observed_weight(photos, texels)), 1e-6)
-    better = np.where(np.abs(evidence) > CLEAR_EVIDENCE, evidence, wide(difference)) < 0
+    better = np.where(np.abs(evidence) > OPTIONS.clear_evidence, evidence, wide(difference)) < 0
     is_metal = majority_vote(better, decided, near)
     chosen, others = np.flatnonzero(is_metal), np.flatnonzero(decided & ~is_metal)
     rest = others, dielectric.base[others], dielectric.roughness[others]
@@ -143,7 +152,7 @@ def _compare_models(photos: Sequence[PhotoSamples], own: NDArray[np.float32]) ->
     """The best dielectric and the best metal of each texel over all roughnesses tried."""
     texels = len(own)
     solver, found = BaseColourSolver(photos, texels), (_BestModel(texels), _BestModel(texels))
-    smooth = np.minimum(own, np.float32(MAX_METAL_ROUGHNESS))
+    smooth = np.minimum(own, np.float32(OPTIONS.max_metal_roughness))
     for pair in ((own, smooth), *((r, r) for r in (np.full(texels, tried, np.float32) for tried in TRIED_ROUGHNESS))):
         parts = shaded(photos, pair[0])
         found[False].offer(*candidate_model(photos, solver, parts, False), pair[0])

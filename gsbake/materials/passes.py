@@ -11,14 +11,13 @@ from numpy.typing import NDArray
 
 from gsbake.config.schema import Bake
 from gsbake.geometry.cameras import Camera
+from gsbake.materials.concurrent_fits import Each
 from gsbake.materials.state import Level, State
 from gsbake.shading.light_motion import Motion
 from gsbake.texturing.resampling import CoarseTexture
 from gsbake.texturing.unwrapped_mesh import UnwrappedMesh
 
-#: Called after every step with the number of steps done and their total; may raise to stop.
-Each = Callable[[int, int], None]
-#: The same with what is being done.
+#: Called after every step with what is being done, the number of steps done and their total.
 Progress = Callable[[str, int, int], None]
 #: Decides on a rule of `[skip]`: its name, whether the measurement allows to skip, the evidence, and the choices if skipped and if not.
 Decide = Callable[[str, bool, str, str, str], bool]

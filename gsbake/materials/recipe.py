@@ -10,8 +10,7 @@ from __future__ import annotations
 
 from gsbake.materials.base_color_noise import MetalNoise
 from gsbake.materials.descent import Steps
-from gsbake.materials.levels import FineLevel, FullTexture, GradientSteps, PureMetals
-from gsbake.materials.map_selection import MapSelection
+from gsbake.materials.levels import FineLevel, FullTexture, GradientSteps, MapSelection, PureMetals
 from gsbake.materials.metal_superresolution import MetalSuperresolution
 from gsbake.materials.metal_trials import KindTrials, LightLevel
 from gsbake.materials.passes import Pass
@@ -20,52 +19,52 @@ from gsbake.materials.searches import EmissionSearch, LightScaling, LightSearch,
 from gsbake.materials.starts import MotionComparison, StartComparison
 
 #: Trials of how the light moves: metals take longer to find than such a fit, and have not changed which light fits better.
-MOTION_TRIAL = Steps(0.25, sparsity=False, passes=(Pass("light scaling", LightScaling(), at=(0.6,)),))
+MOTION_TRIAL = Steps(0.25, sparsity=False, passes=(Pass("light-scaling", LightScaling(), at=(0.6,)),))
 #: Trials from each start. The light of a mostly metallic object is scaled once metals are found, with the light that they have.
 TRIAL = Steps(
     0.25, sparsity=False,
-    passes=(Pass("light scaling", LightScaling(), at=(0.6,)), Pass("metal search", MetalSearch(), at=(0.4, 0.8))),
+    passes=(Pass("light-scaling", LightScaling(), at=(0.6,)), Pass("metal-search", MetalSearch(), at=(0.4, 0.8))),
 )  # fmt: skip
 #: The fit that continues the best of them, with all searches.
 COARSE = Steps(
     0.5,
     passes=(
         Pass("emission", EmissionSearch(), at=(0.5,)),
-        Pass("light search", LightSearch(), at=(0.5, 0.6, 0.7, 0.8)),
-        Pass("metal search", MetalSearch(), at=(0.3, 0.55, 0.8)),
+        Pass("light-search", LightSearch(), at=(0.5, 0.6, 0.7, 0.8)),
+        Pass("metal-search", MetalSearch(), at=(0.3, 0.55, 0.8)),
     ),
 )
 #: Texels and light adapt to a change; slowly, so that noise of single photos does not decide.
 ADAPT = Steps(0.15, rate=0.3, sparsity=False)
-ADAPT_AND_SEARCH = Steps(0.15, rate=0.3, sparsity=False, passes=(Pass("light search", LightSearch(), at=(0.0,)),))
+ADAPT_AND_SEARCH = Steps(0.15, rate=0.3, sparsity=False, passes=(Pass("light-search", LightSearch(), at=(0.0,)),))
 #: Texels adapt to a light that is given.
 RELIT = Steps(0.05, rate=0.5, normals=True)
 #: The fine level.
-FINE = Steps(0.25, normals=True, passes=(Pass("metal search", MetalSearch(), at=(0.3,)),))
+FINE = Steps(0.25, normals=True, passes=(Pass("metal-search", MetalSearch(), at=(0.3,)),))
 
 #: The fit.
 FIT = (
     # On the coarse level.
-    Pass("light motion", MotionComparison(MOTION_TRIAL)),
+    Pass("light-motion", MotionComparison(MOTION_TRIAL)),
     Pass(
         "starts", StartComparison(TRIAL, COARSE), instead=StartComparison(TRIAL, COARSE, dielectric_starts=((0.05, 0.45),), metal_starts=())
     ),
-    Pass("metal noise", MetalNoise(rounds=2, steps=ADAPT)),
-    Pass("metal trials", KindTrials(ADAPT)),
-    Pass("light level", LightLevel(ADAPT_AND_SEARCH)),
-    Pass("remaining shading", RemainingShading(RELIT, rounds=4)),
-    Pass("pure metals", PureMetals()),
+    Pass("metal-noise", MetalNoise(rounds=2, steps=ADAPT)),
+    Pass("metal-trials", KindTrials(ADAPT)),
+    Pass("light-level", LightLevel(ADAPT_AND_SEARCH)),
+    Pass("remaining-shading", RemainingShading(RELIT, rounds=4)),
+    Pass("pure-metals", PureMetals()),
     # On the fine level.
-    Pass("fine level", FineLevel()),
-    Pass("metal noise", MetalNoise()),
-    Pass("fine steps", GradientSteps(FINE, "material fit, fine level")),
-    Pass("metal noise", MetalNoise()),
+    Pass("fine-level", FineLevel()),
+    Pass("metal-noise", MetalNoise()),
+    Pass("fine-steps", GradientSteps(FINE, "material fit, fine level")),
+    Pass("metal-noise", MetalNoise()),
 )
 #: The maps at the texels of the asset.
 MAPS = (
-    Pass("map selection", MapSelection()),
-    Pass("full texture", FullTexture()),
-    Pass("metal superresolution", MetalSuperresolution()),
+    Pass("map-selection", MapSelection()),
+    Pass("full-texture", FullTexture()),
+    Pass("metal-superresolution", MetalSuperresolution()),
 )
 
 #: Names of the passes that can be left out.
@@ -73,6 +72,6 @@ OPTIONAL = tuple(
     dict.fromkeys(
         one.name
         for one in (*FIT, *MAPS, *TRIAL.passes, *COARSE.passes)
-        if one.name not in ("light scaling", "fine level", "fine steps", "full texture")
+        if one.name not in ("light-scaling", "fine-level", "fine-steps", "full-texture")
     )
 )

@@ -21,8 +21,8 @@ solved twice, once with scales that start wide (graduated non-convexity: Blake &
 solution with which more pairs agree is taken; the wide one must win clearly, as it may take a base colour that varies with the normal
 for shading.
 
-Delighting takes the light as white. Its intensity is not observable: the median shading is set to 1, and no base colour may exceed that of
-white paper.
+Delighting compares near points only, under one white light whose irradiance E(n) = 1 + Σ_k e_k Y_k(n) itself is of low order. Its intensity
+is not observable: the median shading is set to 1, and no base colour may exceed that of white paper.
 """
 
 from __future__ import annotations
@@ -62,8 +62,8 @@ RIDGE, ROUNDS, DAMPING = 1e-3, 25, 0.7
 WIDENING, WIDENED_SHARE, MIN_AGREEMENT_GAIN = 20.0, 0.6, 0.01
 #: Partial sums of the pairs: a fixed number, so that results do not depend on threads; and pairs that are summed at a time.
 CHUNKS, BLOCK = 16, 64
-#: Delighting: the irradiance is clamped to within this factor of its mean; lower bound of ambient occlusion, as indirect light fills cavities
-#: and photos show them least reliably; this quantile of base colour is at most that of white paper.
+#: Delighting: the irradiance is clamped to within this factor of its mean; lower bound of ambient occlusion, as indirect light fills
+#: cavities and photos show them least reliably; this quantile of base colour is at most that of white paper.
 MAX_IRRADIANCE_RATIO, MIN_OCCLUSION, ALBEDO_QUANTILE, MAX_ALBEDO = 3.0, 0.5, 0.995, 0.9
 #: Points at which the irradiance of a changed light is matched, Gauss-Newton steps, their ridge weight and largest exponent.
 MATCHED_POINTS, MATCHING_STEPS, MATCHING_RIDGE, MAX_EXPONENT = 4000, 4, 1e-3, 1.0
@@ -117,33 +117,72 @@ def moved_to_light(state: State, shading: Doubles, seed: int) -> State:
 
 
 @dataclass(frozen=True)
+class DelightingOptions:
+    """Constants of delighting. Its solution has one white light, near pairs alone, and weights of chromaticity that do not change: photos'
+    colours have stronger shading than what a fit leaves, which pairs anywhere would take for base colours."""
+
+    #: Pairs are formed with this many nearest points, within this share of the bounding-box diagonal.
+    neighbours: int = 24
+    neighbour_radius: float = 0.04
+    #: Scale of log-chromaticity differences above which two base colours are assumed.
+    chromaticity_scale: float = 0.05
+    #: Ridge weight on the squared coefficients, and rounds of reweighting.
+    ridge: float = 1e-4
+    rounds: int = 20
+
+
+DELIGHTING = DelightingOptions()
+
+
+@dataclass(frozen=True)
 class Irradiance:
-    """`coefficients` (8,) of the logarithm of the irradiance, in the order of `harmonics`."""
+    """`coefficients` (8,) of the irradiance over its mean, in the order of `harmonics`."""
 
     coefficients: Doubles
 
     def at(self, normal: NDArray[np.floating]) -> Doubles:
-        """Irradiance (n,) at unit normals (n, 3), over that of a light without direction, clamped to `MAX_IRRADIANCE_RATIO`."""
-        return np.clip(np.exp(harmonics(normal) @ self.coefficients), 1 / MAX_IRRADIANCE_RATIO, MAX_IRRADIANCE_RATIO)
+        """Irradiance over its mean (n,) at unit normals (n, 3), clamped to `MAX_IRRADIANCE_RATIO`."""
+        return np.clip(1 + harmonics(normal) @ self.coefficients, 1 / MAX_IRRADIANCE_RATIO, MAX_IRRADIANCE_RATIO)
 
     def light(self, size: int, intensity: float) -> EnvironmentLight:
-        """A white environment, cube map of edge `size`, with this irradiance (over π) times `intensity`."""
-        around = directions(4).reshape(-1, 3)
-        even, coefficients = np.ones((6, size, size, 3), np.float32), np.repeat(self.coefficients[:, None], 3, 1)
-        radiance = with_irradiance_factor(even, coefficients, around, partial(irradiance, normals=around))
-        wanted = intensity * self.at(around).mean()
-        return EnvironmentLight.from_radiance(radiance * np.float32(wanted / irradiance(radiance, around).mean()))
+        """A white environment, cube map of edge `size`, with this irradiance (over π) times `intensity`; negative radiance is clamped."""
+        order = np.array([1.5] * 3 + [4.0] * 5)  # π over the cosine lobe's own coefficients 2π/3 and π/4
+
+        def radiance(directions: Doubles) -> Doubles:
+            value = intensity * np.maximum(1 + harmonics(directions) @ (order * self.coefficients), 0)
+            return np.repeat(value[:, None], 3, 1)
+
+        return EnvironmentLight.from_function(radiance, size)
 
 
 def find_irradiance(
     colour: NDArray[np.floating], normal: NDArray[np.floating], position: NDArray[np.floating], occlusion: NDArray[np.floating]
 ) -> Irradiance:
-    """The white irradiance that best explains the differences between n points of the surface; uniform without usable pairs.
+    """The irradiance that best explains the differences between n points of the surface; uniform without usable pairs.
 
     `colour` (n, 3) linear, `normal` (n, 3) unit, `position` (n, 3), `occlusion` (n,) ambient occlusion, 1 = open.
     """
-    unoccluded = colour / np.maximum(occlusion, MIN_OCCLUSION)[:, None]
-    return Irradiance(remaining_shading(unoccluded, normal, position, np.random.default_rng(0)).mean(1))
+    o = DELIGHTING
+    a, b = nearby_pairs(np.asarray(position, np.float64), o.neighbours, o.neighbour_radius)
+    logs = np.log(np.maximum(colour, 0).astype(np.float64) + LOG_OFFSET)
+    brightness = logs.mean(1)
+    chroma = logs - brightness[:, None]
+    weight = np.exp(-((np.linalg.norm(chroma[a] - chroma[b], axis=1) / o.chromaticity_scale) ** 2))
+    unoccluded = brightness - np.log(np.maximum(occlusion, MIN_OCCLUSION))
+    difference = unoccluded[a] - unoccluded[b]
+    basis = harmonics(normal)
+    found = np.zeros(8)
+    if not weight.sum() > 0:
+        return Irradiance(found)
+    ridge = o.ridge * weight.sum()
+    for _ in range(o.rounds):
+        value = np.maximum(1 + basis @ found, 1 / MAX_IRRADIANCE_RATIO)
+        relative = basis / value[:, None]
+        slope = relative[a] - relative[b]
+        rest = difference - np.log(value[a] / value[b])
+        w = weight / np.maximum(np.abs(rest), NOISE_FLOOR)
+        found = found + DAMPING * np.linalg.solve((slope * w[:, None]).T @ slope + ridge * np.eye(8), slope.T @ (w * rest) - ridge * found)
+    return Irradiance(found)
 
 
 def remove_shading(

@@ -10,12 +10,11 @@ from numpy.typing import NDArray
 
 from gsbake.materials.emission import find_emission
 from gsbake.materials.light_intensity import LightAdjustment, adjust_radiance, search_light
-from gsbake.materials.linear_shading import PhotoSamples
-from gsbake.materials.materials import Materials
+from gsbake.materials.linear_shading import PhotoLights, PhotoSamples, linear_samples
 from gsbake.materials.metallic import find_metals
 from gsbake.materials.passes import Scene
-from gsbake.materials.shading import PhotoLights, linear_samples
 from gsbake.materials.state import LIMITS, State
+from gsbake.materials.surface import Materials
 from gsbake.shading.cubemap import solid_angles
 from gsbake.shading.environment import EnvironmentLight
 from gsbake.shading.light_motion import mean_radiance
@@ -59,9 +58,9 @@ class LightSearch:
     def run(self, scene: Scene, state: State) -> State:
         """The light found, with roughness and base colours of dielectrics adapted."""
         if not state.mostly_dielectric:
+            factor = np.full(3, state.intensity_prior.mean_factor())
             scaled = LightScaling().run(scene, state)
-            scale = 1 / state.intensity_prior.mean_factor()
-            return replace(scaled, adjustments=(*state.adjustments, LightAdjustment(np.full(3, 1 / scale), 1.0, 0.0, 0.0)))
+            return replace(scaled, adjustments=(*state.adjustments, LightAdjustment(factor, 1.0, 0.0, 0.0)))
         found = self._search(scene, state)
         dielectric = np.flatnonzero(state.dielectric)
         after = replace(state, adjustments=(*state.adjustments, found))

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from gsbake.imaging.srgb import encode
-from gsbake.materials.materials import Materials
+from gsbake.materials.surface import Materials
 
 Floats = NDArray[np.float32]
 

@@ -24,7 +24,7 @@ from functools import partial
 from typing import TypeVar
 
 from gsbake.capture.photos.roles import held_out
-from gsbake.materials.concurrent_fits import run_concurrently
+from gsbake.materials.concurrent_fits import Each, run_concurrently
 from gsbake.materials.descent import Steps, descend
 from gsbake.materials.light_intensity import OBSERVATIONS
 from gsbake.materials.passes import Scene
@@ -171,8 +171,12 @@ def started(scene: Scene, level: Level, starts: Sequence[Start]) -> Trials:
 
 
 def descend_all(states: Mapping[Key, State], steps: Steps, scene: Scene, name: str) -> dict[Key, State]:
-    """The `states` after gradient `steps`, several at a time."""
-    found = run_concurrently([partial(descend, scene, state, steps) for state in states.values()], scene.each(name))
+    """The `states` after gradient `steps`, several at a time, judged on validation photos."""
+
+    def fit(state: State, each: Each) -> State:
+        return descend(scene, state, steps, each).judged()
+
+    found = run_concurrently([partial(fit, state) for state in states.values()], scene.each(name))
     return dict(zip(states, found, strict=True))
 
 

@@ -14,13 +14,10 @@ from numpy.typing import NDArray
 
 from gsbake.imaging.metrics import decibels
 from gsbake.materials import fit_kernel
-from gsbake.materials.intensity_prior import IntensityPrior
-from gsbake.materials.light_intensity import LightAdjustment
-from gsbake.materials.linear_shading import PhotoSamples
-from gsbake.materials.materials import Materials
+from gsbake.materials.light_intensity import IntensityPrior, LightAdjustment
+from gsbake.materials.linear_shading import PhotoLights, PhotoSamples, Records, ShadingStep, linear_samples
 from gsbake.materials.photo import Photo
-from gsbake.materials.shading import PhotoLights, Records, ShadingStep, linear_samples
-from gsbake.materials.surface import Surface
+from gsbake.materials.surface import Materials, Surface
 from gsbake.shading.cubemap import solid_angles
 from gsbake.shading.environment import EnvironmentLight
 from gsbake.shading.light_motion import LightMotion, mean_radiance
@@ -91,7 +88,7 @@ class State:
     `values` (n, PARAMETERS) are what `materials` names, `logits` their logits (normal offsets as they are), `moments` Adam's two, after
     `steps`; `transport` (n,) of `fit_kernel.TRANSPORT`; `light` with Adam's moments and steps, None: none yet. `from_metal`: all texels
     started as metal; `light_given`: gradient steps leave the light as it is; `adjustments`, one per search for the light. `error` and
-    `psnr` on the validation photos after the last steps: mean robust error, 0 without any, and dB, None without any.
+    `psnr` on the validation photos when last judged: mean robust error, 0 without any, and dB, None without any.
 
     What passes found: the metallic and roughness of the `chosen_start` and the `evidence`; the light's mean `intensity` (3,) after
     searches; whether texels' `kinds_changed` since; how the light moves; the materials `selected` for the asset, and the `maps` made of

@@ -17,8 +17,8 @@ import torch
 from torch import Tensor
 
 from gsbake.imaging.srgb_torch import linear_to_srgb
+from gsbake.materials.linear_shading import Records
 from gsbake.materials.photo import Photo
-from gsbake.materials.shading import Records
 from gsbake.shading import brdf
 from gsbake.shading.light_tables import LightTables
 from gsbake.shading.reflection_kernel import MIN_BLOCKED

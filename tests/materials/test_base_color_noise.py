@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from gsbake.imaging.srgb import encode
 from gsbake.materials.base_color_noise import without_noise
 from gsbake.materials.linear_shading import PhotoSamples
-from gsbake.materials.materials import Materials
-from gsbake.materials.surface import neighbours
+from gsbake.materials.surface import Materials, neighbours
 from gsbake.texturing.texels import Texels, rasterise
 from tests.support.linear import linear
 

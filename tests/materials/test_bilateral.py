@@ -9,8 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from gsbake.imaging.srgb import encode
-from gsbake.materials.bilateral import FILTER_RADIUS, EdgeAwareFilter, Neighbourhoods
-from gsbake.materials.surface import neighbours
+from gsbake.materials.surface import FILTER_RADIUS, EdgeAwareFilter, Neighbourhoods, neighbours
 from gsbake.texturing.texels import Texels, rasterise
 
 SIZE, SCALE = 64, 0.3

@@ -132,7 +132,7 @@ class Sphere:
 
 def after(state: State, steps: int, plan: Steps = ALL, priors: Priors = WEAK_PRIORS, seed: int = 0, diffuse: bool = False) -> State:
     """The state after gradient steps."""
-    return descend(Scene(priors, 400, 16, seed, diffuse), state, plan, skip, steps)
+    return descend(Scene(priors, 400, 16, seed, diffuse), state, plan, skip, steps).judged()
 
 
 def skip(done: int, total: int) -> None:
@@ -317,6 +317,21 @@ def test_fit_is_deterministic_and_base_colour_prior_darkens(glossy: Sphere) -> N
     assert first.psnr is None
     darker = after(start, 30, priors=Priors.of(Bake(smoothness=0.01, base_color_l1=0.3)), seed=3)
     assert darker.materials.base_color.mean() < 0.9 * first.materials.base_color.mean()
+
+
+def test_momentum_of_the_light_goes_on_until_another_light(glossy: Sphere) -> None:
+    fitted = after(glossy.start(0.2), 3, PLAIN)
+    again = after(fitted, 2, PLAIN)
+    assert fitted.light_moments is not None and again.light_moments is not None
+    assert [float(state[2]) for state in (fitted.light_moments, again.light_moments)] == [3, 5]
+    assert fitted.with_light(fitted.light).light_moments is None
+
+
+def test_a_light_that_is_given_stays(glossy: Sphere) -> None:
+    start = glossy.start(0.2)
+    fitted = after(replace(start, light_given=True), 3, PLAIN)
+    assert np.array_equal(fitted.radiance, start.radiance) and not np.array_equal(fitted.values, start.values)
+    assert not np.array_equal(after(start, 3, PLAIN).radiance, start.radiance)
 
 
 def test_without_photos_nothing_changes(glossy: Sphere) -> None:

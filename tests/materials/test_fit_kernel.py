@@ -10,8 +10,8 @@ import torch
 from numba import set_num_threads
 
 from gsbake.materials import fit_kernel
+from gsbake.materials.linear_shading import KernelTables, PhotoLights, ShadingStep, linear_samples
 from gsbake.materials.photo import Photo
-from gsbake.materials.shading import KernelTables, PhotoLights, ShadingStep, linear_samples
 from gsbake.shading.environment import EnvironmentLight
 from gsbake.shading.light_tables import LightTables
 from tests.materials.reference import Batch, Transport, photo_loss, prior_loss

@@ -10,8 +10,8 @@ import pytest
 from scipy import integrate, stats
 
 from benchmarks.light_levels import mean_radiance, median_and_scale
-from gsbake.materials.intensity_prior import DIELECTRICS, METALS, RADIANCE, IntensityPrior
-from gsbake.materials.materials import Materials
+from gsbake.materials.light_intensity import DIELECTRICS, METALS, RADIANCE, IntensityPrior
+from gsbake.materials.surface import Materials
 
 #: Normal reflectances, strongest channel (Lagarde & de Rousiers 2014, table 4; iron from the same course).
 PURE_METALS = {

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gsbake.materials.map_selection import MapSelection, with_constant_roughness, without_metal
-from gsbake.materials.materials import Materials
+from gsbake.materials.levels import MapSelection, with_constant_roughness, without_metal
+from gsbake.materials.surface import Materials
 
 MAPS = Materials(
     np.array([[0.5, 0.4, 0.2], [0.8, 0.8, 0.8], [0.2, 0.2, 0.2]], np.float32), np.float32([0.7, 0.3, 0.9]), np.float32([0.1, 0.5, 0.0])

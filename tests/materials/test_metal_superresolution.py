@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from scipy.optimize import lsq_linear
 
 from gsbake.materials.linear_shading import LinearParts, LinearShading, PhotoSamples, unclipped_weights
-from gsbake.materials.materials import Materials
 from gsbake.materials.metal_superresolution import (
     HUE_RADIUS,
     MetalPixels,
@@ -24,6 +23,7 @@ from gsbake.materials.metal_superresolution import (
     metal_regions,
     superresolved,
 )
+from gsbake.materials.surface import Materials
 from gsbake.texturing.texels import Texels
 
 SIZE = 32

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from gsbake.materials.descent import Steps
-from gsbake.materials.materials import Materials
 from gsbake.materials.metal_trials import GROUPS, MIN_SHARE, KindTrials, LightLevel, _groups, _Tried
 from gsbake.materials.passes import Scene
 from gsbake.materials.recipe import ADAPT_AND_SEARCH
 from gsbake.materials.state import State
+from gsbake.materials.surface import Materials
 from gsbake.shading.environment import EnvironmentLight
 from tests.materials.test_fit import WEAK_PRIORS, Sphere, after, observed
 from tests.support.slow import slow

@@ -9,9 +9,9 @@ import pytest
 from numpy.typing import NDArray
 
 from gsbake.imaging.srgb import decode, encode
-from gsbake.materials.materials import Materials
 from gsbake.materials.passes import Priors
 from gsbake.materials.sparsity_prior import KERNEL_WIDTHS, METAL_THRESHOLD, common_materials, mean_shift
+from gsbake.materials.surface import Materials
 from tests.materials.test_fit import WEAK_PRIORS, Sphere, after, observed
 
 WIDTHS = (0.03, 0.05)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from gsbake.materials import starts as starts_module
-from gsbake.materials.intensity_prior import RADIANCE, IntensityPrior
+from gsbake.materials.light_intensity import RADIANCE, IntensityPrior
 from gsbake.materials.passes import Scene
 from gsbake.materials.recipe import COARSE, TRIAL
 from gsbake.materials.starts import Start, StartComparison, Trials, started
@@ -81,7 +81,7 @@ def never(level: Level, starts: Sequence[Start]) -> Trials:
 
 def test_all_starts_are_tried_without_searches_for_the_light() -> None:
     assert COMPARISON.compared(level(), False, never) == (STARTS, "")
-    assert [one.name for one in TRIAL.passes] == ["light scaling", "metal search"] and not TRIAL.sparsity and not TRIAL.normals
+    assert [one.name for one in TRIAL.passes] == ["light-scaling", "metal-search"] and not TRIAL.sparsity and not TRIAL.normals
     assert {m > 0.5 for m, _ in STARTS} == {True, False} and all(m > 0.5 for m, _ in METAL_STARTS)
 
 

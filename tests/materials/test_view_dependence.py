@@ -8,7 +8,7 @@ import trimesh
 from gsbake.capture.posed_photos import View
 from gsbake.capture.view_dependence import is_diffuse
 from gsbake.geometry.raycast import RayCaster
-from gsbake.materials.view_dependence import MeshBrightness, visible_on_mesh
+from gsbake.materials.photo import MeshBrightness, visible_on_mesh
 from tests.meshing.scenes import camera_at, cameras_around
 
 

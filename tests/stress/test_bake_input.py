@@ -19,9 +19,9 @@ from gsbake.gltf.export import ExportOptions, export_asset
 from gsbake.gltf.read import read_glb
 from gsbake.imaging.exr import read_exr, write_exr
 from gsbake.materials.bake import BakeOptions, bake_textures
-from gsbake.materials.delighting import find_irradiance, remove_shading
 from gsbake.materials.light_intensity import adjust_radiance, search_light
 from gsbake.materials.linear_shading import PhotoSamples
+from gsbake.materials.remaining_shading import find_irradiance, remove_shading
 from gsbake.shading.cubemap import solid_angles
 from gsbake.shading.environment import EnvironmentLight
 from tests.stress.captures import CAMERAS, MASKS, PHOTOS, masks, photos, write
