@@ -180,7 +180,7 @@ class PoseSolver:
             return attempt("masks")
         plain: Region = "whole photos" if background is None else "moving parts"
         first, evidence = plain, compared.evidence
-        if background is None and masks.complete and len(self.entries) >= MIN_CAPTURE:
+        if background is None and compared.suspected and masks.complete and len(self.entries) >= MIN_CAPTURE:
             first, tried = self._trial(masks)
             evidence = f"{evidence}; {tried}"
         self.monitor.decide("features", _FEATURES[first], evidence)

@@ -29,6 +29,8 @@ MIN_SAME_SHARE, MAX_SAME_SHARE = 0.15, 0.95
 MIN_BLOCKS = 5
 #: Other photos of its round that a photo needs, and share of the photos that have them where a background stands.
 MIN_PARTNERS, MIN_STANDING_PHOTOS = 4, 0.5
+#: Share of the photos that have another one of their round from which a background may stand.
+MIN_SUSPECTED_PHOTOS = 0.1
 #: Longer side in pixels of the masks of what moves, and window of the correlation there.
 MASK_SIZE, WINDOW = 480, 9
 #: Photos of its round that a photo is compared with there; the share of them in which a pixel that stands is the same.
@@ -58,6 +60,11 @@ class StandingBackground:
     def stands(self) -> bool:
         """Whether so many photos share their background that the object was turned before it."""
         return self._count >= MIN_STANDING_PHOTOS * max(len(self.files), 1)
+
+    @property
+    def suspected(self) -> bool:
+        """Whether a background may stand, which no photos of a camera that moves make believe."""
+        return sum(map(bool, self.partners.values())) >= MIN_SUSPECTED_PHOTOS * len(self.files)
 
     @property
     def pairs(self) -> list[tuple[str, str]]:

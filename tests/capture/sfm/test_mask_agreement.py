@@ -148,6 +148,7 @@ def test_a_trial_on_small_photos_decides_what_is_mapped_at_full_size(
 ) -> None:
     """One job at full size, of the features that the trial found right; no trial after a right one."""
     monkeypatch.setattr(solve, "MIN_CAPTURE", COUNT)
+    monkeypatch.setattr("gsbake.capture.sfm.standing_background.MIN_SUSPECTED_PHOTOS", 0.0)
     entries = write_capture(tmp_path / "ingest", ring(), "guess")
     jobs = answers(lambda job: ring() if (job["masks"] is not None) == (right == "masks") else ring(0.3))
     run = solver(tmp_path, entries)
@@ -157,6 +158,16 @@ def test_a_trial_on_small_photos_decides_what_is_mapped_at_full_size(
     assert [job["masks"] is not None for job in trials] == ([False, True] if right == "masks" else [False])
     assert all(Path(job["photos"]).parent.name == "trial" for job in trials) and not (tmp_path / "scratch" / "trial").exists()
     assert "16 small photos: whole photos: 16 registered" in run.monitor.line("features")  # type: ignore[attr-defined]
+
+
+def test_photos_that_share_no_background_need_no_trial(
+    tmp_path: Path, answers: Callable[..., Jobs], monkeypatch: pytest.MonkeyPatch
+) -> None:  # fmt: skip
+    monkeypatch.setattr(solve, "MIN_CAPTURE", COUNT)
+    entries = write_capture(tmp_path / "ingest", ring(), "guess")
+    jobs = answers(lambda job: ring())
+    solver(tmp_path, entries).solve()
+    assert [job["mapper"] for job in jobs] == ["incremental"]
 
 
 @pytest.mark.parametrize("setting", ["auto", False])
