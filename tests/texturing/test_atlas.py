@@ -9,7 +9,7 @@ from scipy.ndimage import distance_transform_edt
 
 from gsbake.texturing import atlas as atlas_module
 from gsbake.texturing import packing
-from gsbake.texturing.atlas import Atlas, _clusters, _detach, _islands, make_atlas
+from gsbake.texturing.atlas import Atlas, _clusters, _detach, islands, make_atlas
 from gsbake.texturing.packing import pack
 from gsbake.texturing.texels import overlapping, overlapping_faces, rasterise
 
@@ -131,8 +131,8 @@ def test_folded_charts_are_split() -> None:
     folded = overlapping_faces(uv, corner, 512)
     assert 30 < folded.sum() < 50  # half a turn of one and a half lies double
     source, apart, again = _detach(np.arange(120), uv, corner, folded, alone=False)
-    assert len(np.unique(_islands(len(apart), again))) == 2
+    assert len(np.unique(islands(len(apart), again))) == 2
     assert np.allclose(apart[again], uv[corner]) and np.array_equal(source[again], corner)
-    chart = _islands(len(apart), again)
+    chart = islands(len(apart), again)
     packed = pack(apart, again, chart, 512, 4)
     assert overlapping(packed.uv / 512, again, 512) == 0
