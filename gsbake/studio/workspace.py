@@ -169,7 +169,8 @@ class Folder:
     def _may_be_capture(self, path: Path) -> bool:
         if not path.is_dir() or not _is_inside(path, self.folder):
             return False
-        return any((path / name).is_dir() for name in PHOTO_FOLDERS) or _holds_photos(path)
+        inner = [path / name for name in PHOTO_FOLDERS if (path / name).is_dir()]
+        return all(_is_inside(photos, self.folder) for photos in inner) and (bool(inner) or _holds_photos(path))
 
 
 @dataclass(frozen=True)
