@@ -245,6 +245,21 @@ def test_masks_outside_of_the_capture_are_not_written(browser: Browser, tmp_path
     assert not list((tmp_path / "elsewhere").iterdir())
 
 
+@pytest.mark.skipif(os.name != "posix", reason="links of POSIX")
+def test_masks_behind_links_are_neither_shown_nor_written(browser: Browser, tmp_path: Path) -> None:
+    folder = write_capture(browser.folder / "a")
+    cv2.imwrite(str(tmp_path / "secret.png"), np.full((48, 64), 255, np.uint8))
+    (folder / "masks").mkdir()
+    (folder / "masks/p0.png").symlink_to(tmp_path / "secret.png")
+    (folder / "images/sub").mkdir()
+    (folder / "images/p1.jpg").rename(folder / "images/sub/p1.jpg")
+    (tmp_path / "elsewhere").mkdir()
+    (folder / "masks/sub").symlink_to(tmp_path / "elsewhere")
+    assert not decoded(browser.get("/api/captures/a/masks/p0.jpg")).any()
+    assert "link" in browser.send("PUT", "/api/captures/a/masks/sub/p1.jpg", encoded(np.zeros((48, 64), np.uint8)), 400)["error"]
+    assert not list((tmp_path / "elsewhere").iterdir())
+
+
 def test_a_smart_stroke_finds_the_border(browser: Browser) -> None:
     """A short line over the disc gives the disc, one over ground that the mask holds takes it away; what is far away stays."""
     image = photo(0, (320, 240))
