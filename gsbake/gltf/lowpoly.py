@@ -58,6 +58,9 @@ def read_lowpoly(path: Path, dense: Path, asset: Similarity | None) -> LowPoly:
     in none of the frames, or has UVs that the asset cannot have.
     """
     mesh = _read(path)
+    corner = mesh.vertices[mesh.faces]
+    if not np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]).any():
+        raise BadInputError(f"'{path}' has no triangle with an area.")
     try:
         given = given_uvs(mesh.vertices, mesh.faces, mesh.uv, mesh.materials)
     except ValueError as error:
