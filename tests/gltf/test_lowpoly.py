@@ -109,6 +109,14 @@ def test_a_mesh_elsewhere_and_a_damaged_one(folder: Path, tmp_path: Path) -> Non
         read_lowpoly(tmp_path / "far.obj", folder / "dense.ply", ASSET)
 
 
+def test_a_stray_vertex_is_refused(folder: Path, tmp_path: Path) -> None:
+    mesh = unwrapped(Similarity())
+    mesh.vertices[0] = (1e6, 0, 0)
+    mesh.export(tmp_path / "mine.ply")
+    with pytest.raises(BadInputError, match="vertices far from the object"):
+        read_lowpoly(tmp_path / "mine.ply", folder / "dense.ply", None)
+
+
 def test_uvs_of_corners_in_a_ply_are_kept(folder: Path, tmp_path: Path) -> None:
     """MeshLab's form: a list of UVs at each face, vertices shared across seams."""
     mine = unwrapped(Similarity())
