@@ -138,7 +138,9 @@ def _numbers(xmp: str) -> dict[str, Floats] | None:
             return None
         found[name] = np.broadcast_to(values, 3).astype(np.float32)
     stops, offsets = np.concatenate([found["GainMapMin"], found["GainMapMax"]]), np.concatenate([found["OffsetSDR"], found["OffsetHDR"]])
-    if np.abs(stops).max() > MAX_STOPS or (found["GainMapMin"] > found["GainMapMax"]).any() or found["Gamma"].min() < 1e-2 or np.abs(offsets).max() > MAX_OFFSET:
+    if np.abs(stops).max() > MAX_STOPS or found["Gamma"].min() < 1e-2 or np.abs(offsets).max() > MAX_OFFSET:
+        return None
+    if (found["GainMapMin"] > found["GainMapMax"]).any():
         return None
     return found
 
