@@ -26,7 +26,7 @@ from gsbake.capture.photos.sharpness import detect_oversampling
 from gsbake.capture.photos.video_process import extract_frames
 from gsbake.capture.posed_photos import REGION
 from gsbake.capture.poses.frame_masks import frame_masks, masks_by_photo
-from gsbake.capture.poses.frames import GivenPoses, PhotoSize
+from gsbake.capture.poses.frames import GivenPoses, PhotoIndex, PhotoSize
 from gsbake.capture.poses.given import read_poses
 from gsbake.capture.sources import is_video, list_photos
 from gsbake.config.schema import Ingest
@@ -349,10 +349,12 @@ class _Ingestion:
             self.monitor.warn(warning)
         if without:
             self.monitor.warn(f"{len(without)} photos have no pose in {path.name} ({missing_list(without)}) and will not be used.")
-        if given.missing:
-            self.monitor.warn(f"{len(given.missing)} frames of {path.name} have no photo ({missing_list(list(given.missing))}).")
+        left_out = PhotoIndex(photo["source"] for photo in self.skipped if photo["why"] == LEFT_OUT)
+        missing = [frame for frame in given.missing if left_out.match(frame) is None]
+        if missing:
+            self.monitor.warn(f"{len(missing)} frames of {path.name} have no photo ({missing_list(missing)}).")
         self.monitor.decide("given poses", f"{len(cameras)} of {len(self.read)} photos", path.name)
-        return {"poses": path.name, "posed": len(cameras), "frames_without_photo": len(given.missing)}
+        return {"poses": path.name, "posed": len(cameras), "frames_without_photo": len(missing)}
 
 
 def _written(entry: dict[str, Any]) -> tuple[Any, ...]:

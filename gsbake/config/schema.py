@@ -7,6 +7,7 @@ key.
 
 from __future__ import annotations
 
+import math
 from typing import Annotated, Literal
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
@@ -52,9 +53,23 @@ def _box(numbers: tuple[float, ...]) -> tuple[float, ...]:
 BoxNumbers = Annotated[tuple[float, ...], Field(max_length=15), AfterValidator(_box)]
 
 
+#: Sine of the angle between two sides of a triangle below which its points lie on one line.
+MIN_SINE = 0.02
+
+
 def _up_points(numbers: tuple[float, ...]) -> tuple[float, ...]:
-    if len(numbers) not in (0, 6, 9):
+    if not numbers:
+        return numbers
+    if len(numbers) not in (6, 9):
         raise ValueError("it takes three points or the two ends of an edge, so nine or six numbers")
+    sides = [[b - a for a, b in zip(numbers, end, strict=False)] for end in (numbers[3:6], numbers[6:9]) if end]
+    lengths = [math.hypot(*side) for side in sides]
+    distinct = all(0 < length < math.inf for length in lengths)
+    if distinct and len(sides) == 2:
+        cosine = sum(a / lengths[0] * b / lengths[1] for a, b in zip(*sides, strict=True))
+        distinct = 1 - cosine**2 >= MIN_SINE**2
+    if not distinct:
+        raise ValueError("its points coincide or lie on one line; give three that span the ground, or two ends")
     return numbers
 
 

@@ -25,11 +25,13 @@ SUFFIXES = (".ply", ".obj", ".stl")
 MEMORY_FACTOR, SPARE_MEMORY = 24, 1 << 30
 #: Seconds that a mesh may take: at least, and per byte of the file (half a megabyte a second).
 MIN_SECONDS, SECONDS_PER_BYTE = 60.0, 2e-6
+#: Largest coordinate: beyond, single precision overflows.
+MAX_COORDINATE = 1e15
 
 
 @dataclass(frozen=True)
 class ForeignMesh:
-    """`vertices` (v, 3), all finite, triangles `faces` (f, 3), texture coordinates `uv` (v, 2) with the origin bottom left.
+    """`vertices` (v, 3), none beyond MAX_COORDINATE, triangles `faces` (f, 3), texture coordinates `uv` (v, 2) with the origin bottom left.
 
     NaN where a part has no texture coordinates, None where none has; `materials` is the number of those that the file names, at least 1.
     """
@@ -69,7 +71,8 @@ def answer(request: dict[str, Any]) -> dict[str, Any]:
     try:
         options: dict[str, Any] = {"skip_materials": True} if path.suffix.lower() == ".obj" else {}
         content = path.read_bytes()  # given without a name: with an open file the reader would go on to others
-        loaded: Any = trimesh.load(io.BytesIO(content), file_type=path.suffix.lower()[1:], process=False, **options)
+        with np.errstate(all="ignore"):  # its warnings of numbers that are checked below
+            loaded: Any = trimesh.load(io.BytesIO(content), file_type=path.suffix.lower()[1:], process=False, **options)
         parts = [part for part in getattr(loaded, "geometry", {"": loaded}).values() if isinstance(part, trimesh.Trimesh)]
         start = np.cumsum([0, *(len(part.vertices) for part in parts)])
         vertices = np.concatenate([np.zeros((0, 3)), *(np.asarray(part.vertices, np.float64).reshape(-1, 3) for part in parts)])
@@ -83,8 +86,8 @@ def answer(request: dict[str, Any]) -> dict[str, Any]:
         raise
     except Exception as error:  # the readers of trimesh raise what they come across
         return {"error": f"{name} is not a readable mesh ({' '.join(repr(error).split())[:120]})."}
-    if len(faces) == 0 or not np.isfinite(vertices).all() or faces.min() < 0 or faces.max() >= len(vertices):
-        return {"error": f"{name} holds no triangles, or vertices that are not finite."}
+    if len(faces) == 0 or not (np.abs(vertices) <= MAX_COORDINATE).all() or faces.min() < 0 or faces.max() >= len(vertices):
+        return {"error": f"{name} holds no triangles, or vertices that are not finite or beyond {MAX_COORDINATE:g}."}
     np.savez(Path(request["target"]), vertices=vertices, faces=faces, uv=uv, materials=max(1, materials))
     return {}
 

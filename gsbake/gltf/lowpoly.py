@@ -29,6 +29,8 @@ SUFFIXES = (*GLTF_SUFFIXES, ".obj", ".ply")
 POINTS = 3000
 #: Largest median distance to the dense mesh, as a share of its diagonal.
 MAX_DISTANCE = 0.02
+#: Largest diagonal of its box, as a multiple of the dense mesh's: stray vertices beyond leave the texture no texels for the object.
+MAX_REACH = 10.0
 #: A frame is preferred to others up to this many times as far, and up to this share of the diagonal.
 TIE_FACTOR, TIE_DISTANCE = 2.0, 1e-3
 
@@ -58,6 +60,9 @@ def read_lowpoly(path: Path, dense: Path, asset: Similarity | None) -> LowPoly:
     in none of the frames, or has UVs that the asset cannot have.
     """
     mesh = _read(path)
+    corner = mesh.vertices[mesh.faces]
+    if not np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]).any():
+        raise BadInputError(f"'{path}' has no triangle with an area.")
     try:
         given = given_uvs(mesh.vertices, mesh.faces, mesh.uv, mesh.materials)
     except ValueError as error:
@@ -68,10 +73,14 @@ def read_lowpoly(path: Path, dense: Path, asset: Similarity | None) -> LowPoly:
         raise BadInputError(f"{error}; run the mesh stage again.") from error
     found = given or GivenUVs(mesh.vertices, mesh.faces, np.zeros((0, 3, 2)))
     frame, to_unit = _frame(found, path, surface, asset)
+    placed = to_unit.apply(found.vertices)
+    reach = float(np.linalg.norm(np.ptp(placed[found.faces].reshape(-1, 3), axis=0)) / np.linalg.norm(np.ptp(surface[0], axis=0)))
+    if reach > MAX_REACH:
+        raise BadInputError(f"'{path}' has vertices far from the object: it is {reach:.3g} times as large; remove them.")
     triangles = f"{len(found.faces)} triangles in {frame}"
     kept = "their UVs are kept" if given is not None else "they have no UVs and are unwrapped"
     notes = triangles, kept, *found.notes, *found.faults
-    return LowPoly(to_unit.apply(found.vertices), found.faces, None if given is None else found.uv, notes)
+    return LowPoly(placed, found.faces, None if given is None else found.uv, notes)
 
 
 def _read(path: Path) -> ForeignMesh:

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsbake.errors import BadInputError
+from gsbake.geometry.mesh_process import MAX_COORDINATE
 from gsbake.geometry.tangents import tangents
 from gsbake.geometry.vectors import unit
 from gsbake.gltf.document import Document, texture_infos, texture_source
@@ -32,8 +33,8 @@ MAX_TRIANGLES, MAX_PARTS = 50_000_000, 100_000
 VERTEX_BYTES, TRIANGLE_BYTES, PART_BYTES = 200, 350, 4000
 #: UV sets that the bytes of a vertex include, and bytes of each further one.
 USUAL_UV_SETS, UV_SET_BYTES = 2, 24
-#: Largest coordinate, texture coordinate, and factor of a material: beyond, single precision overflows.
-MAX_COORDINATE, MAX_UV, MAX_FACTOR = 1e15, 1e6, 1e9
+#: Largest texture coordinate and factor of a material: beyond, single precision overflows.
+MAX_UV, MAX_FACTOR = 1e6, 1e9
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,7 @@ from gsbake.scale.markers import Marker, find_markers
 MAX_MARKER_ANGLE = 15.0
 #: Markers lie in one plane when their corners do to this share of a side: the plane is then fitted to all corners.
 MAX_HEIGHT_SHARE = 0.1
-#: Sine of the angle between two sides of a triangle, or of a camera's direction and up, below which they determine nothing.
+#: Sine of the angle between a camera's direction and up below which they determine no front.
 MIN_SINE = 0.02
 #: Changes below this angle in degrees are not reported as a tilt.
 LEVEL = 0.05
@@ -34,8 +34,7 @@ def measure_rotation(ingest: Path, posed: PosedPhotos, surfels: Path, export: Ex
     """The rotation (3, 3) of the world, Z-up by the cameras, that makes the given points, markers or the ground level; the unit matrix with
     a warning where there are none, or for `export.up` = "cameras".
 
-    `ingest` and `surfels` are artifact folders of the working photos and of the surfels, `scale` names the markers' dictionary. Raises
-    BadInputError for points that determine no axis.
+    `ingest` and `surfels` are artifact folders of the working photos and of the surfels, `scale` names the markers' dictionary.
     """
     up: str = export.up
     axis: Array | None
@@ -62,13 +61,10 @@ def measure_rotation(ingest: Path, posed: PosedPhotos, surfels: Path, export: Ex
 
 def points_axis(points: Array, centres: Array) -> tuple[Array, str]:
     """The up axis (3,) by the lower and upper end of an upright edge (2, 3), or by three points of the ground (3, 3), towards the cameras'
-    `centres` (n, 3); and the evidence. Raises BadInputError for points that determine none.
+    `centres` (n, 3); and the evidence. The settings take no points that determine none.
     """
     sides = points[1:] - points[0]
-    lengths = np.linalg.norm(sides, axis=1)
     normal = sides[0] if len(sides) == 1 else np.cross(sides[0], sides[1])
-    if not lengths.all() or (len(sides) == 2 and np.linalg.norm(normal) < MIN_SINE * lengths.prod()):
-        raise BadInputError("The points of export.up_points coincide or lie on one line; give three that span the ground, or two ends.")
     if len(sides) == 1:
         return np.asarray(unit(normal)), "an upright edge"
     above = float((centres.mean(0) - points[0]) @ normal)

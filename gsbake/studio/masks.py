@@ -25,7 +25,7 @@ from gsbake.studio.grab_cut import grab_cut
 from gsbake.studio.images import LARGE, Shown
 from gsbake.studio.outputs import Output, entries, outputs
 from gsbake.studio.sessions import session_of
-from gsbake.studio.workspace import Capture
+from gsbake.studio.workspace import Capture, is_inside
 
 Bytes = NDArray[np.uint8]
 
@@ -84,6 +84,8 @@ def write(call: Call) -> dict[str, Any]:
         target = earlier if earlier.suffix.lower() == ".png" else target
         if written.get(str(earlier)) != _digest(earlier):
             set_aside(earlier, capture.folder / SET_ASIDE / MASKS / earlier.relative_to(folder))
+    if not is_inside(target.parent, capture.folder):
+        raise UsageError(f"The folder '{target.parent}' is a link to another place, where the studio writes nothing.")
     target.parent.mkdir(parents=True, exist_ok=True)
     if _inverted(capture):
         mask = np.asarray(255 - mask, np.uint8)
@@ -113,18 +115,18 @@ def _shown(call: Call, name: str) -> Shown:
 
 
 def _files(capture: Capture) -> dict[str, Path]:
-    """Mask files by photo."""
+    """Mask files by photo. Links that lead elsewhere are left out."""
     with suppress(BadInputError, OSError):
         folder = capture.sources().masks
         if folder is not None:
-            return match_masks(folder, capture.photos())
+            return {name: path for name, path in match_masks(folder, capture.photos()).items() if is_inside(path, folder)}
     return {}
 
 
 def _folder(capture: Capture) -> Path:
     """The folder of mask files. Raises UsageError for one outside of the capture, which the studio does not write into."""
     sources = capture.sources()
-    if sources.masks is not None and not sources.masks.resolve().is_relative_to(capture.folder.resolve()):
+    if sources.masks is not None and not is_inside(sources.masks, capture.folder):
         raise UsageError(f"The masks of {capture.name} lie outside of it, in '{sources.masks}', and are not edited here.")
     home = sources.photos.parent if sources.photos.name in PHOTO_FOLDERS else sources.photos
     return sources.masks or home / MASKS

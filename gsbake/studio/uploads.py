@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import os
 import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from starlette.requests import ClientDisconnect, Request
@@ -20,6 +22,9 @@ from gsbake.system.names import same_file_key, unusable_name
 
 #: Largest photo and video in bytes, most files of a capture, and bytes that stay free on the disk.
 MAX_PHOTO, MAX_VIDEO, MAX_FILES, SPARE = 1_000_000_000, 50_000_000_000, 10_000, 1_000_000_000
+
+#: Files that a request is writing to.
+_WRITTEN: set[Path] = set()
 
 
 def received(call: Call) -> dict[str, int]:
@@ -54,7 +59,7 @@ async def _append(request: Request, capture: Capture, name: str, offset: int, si
         raise UsageError(f"There is already a file '{name}' in {capture.name}; rename yours.")
     target.parent.mkdir(parents=True, exist_ok=True)
     _check_room(target.parent, name, size - offset)
-    with part.open("ab") as file:
+    with _alone(part, name), part.open("ab") as file:
         have = file.tell()
         if have != offset:
             raise UsageError(f"{have} bytes of '{name}' are there, so it goes on at {have}, not at {offset}.")
@@ -67,6 +72,20 @@ async def _append(request: Request, capture: Capture, name: str, offset: int, si
     if have == size:
         os.replace(part, target)
     return {"bytes": have, "complete": int(have == size)}
+
+
+@contextmanager
+def _alone(part: Path, name: str) -> Iterator[None]:
+    """While one request writes to a file, no other does. Raises UsageError for a second one, and for what is no ordinary file."""
+    if part in _WRITTEN:
+        raise UsageError(f"'{name}' is being uploaded by another page.")
+    if part.is_symlink() or (part.exists() and not part.is_file()):
+        raise UsageError(f"'{part.name}' is in the way of '{name}' and no file of the studio; remove it.")
+    _WRITTEN.add(part)
+    try:
+        yield
+    finally:
+        _WRITTEN.discard(part)
 
 
 def _places(capture: Capture, name: str) -> tuple[Path, Path]:

@@ -75,7 +75,7 @@ class Capture:
             found = self.sources().photos
             if found.is_dir():
                 inside = {path.relative_to(found).as_posix(): path for path in list_photos(found)}
-                return {name: path for name, path in inside.items() if _is_inside(path, found)}
+                return {name: path for name, path in inside.items() if is_inside(path, found)}
         return {}
 
     def photo(self, name: str) -> Path:
@@ -88,7 +88,7 @@ class Capture:
     def output(self, name: str) -> Path:
         """A file in the output folder. Raises NotFoundError for what is none, or lies elsewhere."""
         path = self.out / name
-        if unusable_name([name]) is not None or not _is_inside(path, self.out) or not path.is_file():
+        if unusable_name([name]) is not None or not is_inside(path, self.out) or not path.is_file():
             raise NotFoundError(f"The run of {self.name} has no file '{name[:80]}'.")
         return path
 
@@ -167,9 +167,10 @@ class Folder:
         return Capture(name, folder, self.folder / OUT / out, self.folder / CACHE / out, self.folder)
 
     def _may_be_capture(self, path: Path) -> bool:
-        if not path.is_dir() or not _is_inside(path, self.folder):
+        if not path.is_dir() or not is_inside(path, self.folder):
             return False
-        return any((path / name).is_dir() for name in PHOTO_FOLDERS) or _holds_photos(path)
+        inner = [path / name for name in PHOTO_FOLDERS if (path / name).is_dir()]
+        return all(is_inside(photos, self.folder) for photos in inner) and (bool(inner) or _holds_photos(path))
 
 
 @dataclass(frozen=True)
@@ -206,7 +207,7 @@ class OneRun:
         raise UsageError("This page shows one run; `gsbake studio FOLDER` makes new captures.")
 
 
-def _is_inside(path: Path, folder: Path) -> bool:
+def is_inside(path: Path, folder: Path) -> bool:
     """Whether a path leads to something in the folder, links followed."""
     with suppress(OSError, ValueError, RuntimeError):
         return path.resolve().is_relative_to(folder.resolve())

@@ -17,6 +17,8 @@ from gsbake.texturing.texels import overlapping
 
 #: How far outside the square UVs may lie, by rounding.
 TOLERANCE = 1e-3
+#: Largest UV: what lies beyond is none.
+MAX_UV = 1e6
 #: Largest share of the surface without area in the UVs: it has no texels.
 MAX_FLAT = 0.01
 #: Largest share of the texture's used area that several triangles may share.
@@ -48,8 +50,9 @@ def given_uvs(vertices: NDArray[Any], faces: NDArray[Any], uv: NDArray[Any] | No
     if uv is None or np.isnan(uv).all():
         return None
     corner = np.asarray(uv, np.float64)[faces] * (1, -1) + (0, 1)
-    if not np.isfinite(corner).all():
-        share = 1 - np.isfinite(corner).all((1, 2)).mean()
+    usable = (np.abs(corner) <= MAX_UV).all((1, 2))
+    if not usable.all():
+        share = 1 - usable.mean()
         raise ValueError(f"has no UVs on {share:.0%} of its triangles; unwrap all of it, or none")
     points, joined = np.unique(np.asarray(vertices, np.float32), axis=0, return_inverse=True)
     triangles = joined.ravel()[faces]

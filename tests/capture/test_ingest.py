@@ -162,6 +162,14 @@ def transforms(path: Path, count: int, **extra: Any) -> dict[str, Any]:
     return body
 
 
+def test_a_frame_of_a_photo_that_is_left_out_lacks_none(tmp_path: Path, runner: Runner) -> None:
+    photos(tmp_path / "images")
+    transforms(tmp_path / "transforms.json", 4)
+    results, done = runner.ingest(tmp_path, settings={"leave_out": ("p1.png",)})
+    assert results["posed"] == 3 and results["frames_without_photo"] == 0
+    assert not [w for w in done.warnings if "have no photo" in w]
+
+
 def test_poses_at_the_working_size(tmp_path: Path, runner: Runner) -> None:
     photos(tmp_path / "images")
     transforms(tmp_path / "transforms.json", 5)

@@ -374,6 +374,9 @@ def test_settings_are_stored_for_the_next_run(run: Run, capture: Path) -> None:
         (("--up", "sideways"), "'sideways' is neither cameras, markers or ground nor two or three points"),
         (("--up", "0,0,0 1,0"), "nor two or three points"),
         (("--set", "export.up_points=[1, 2]"), "so nine or six numbers"),
+        (("--up", "0,0,0 1,1,1 2,2,2"), "coincide or lie on one line"),
+        (("--up", "0,0,0 1,0,0 0,0,0"), "coincide or lie on one line"),
+        (("--up", "-1e308,0,0 1e308,0,0"), "coincide or lie on one line"),
     ],
 )
 def test_settings_that_are_none(words: tuple[str, ...], sentence: str, run: Run, capture: Path) -> None:

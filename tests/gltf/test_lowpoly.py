@@ -101,6 +101,20 @@ def test_a_mesh_elsewhere_and_a_damaged_one(folder: Path, tmp_path: Path) -> Non
     (tmp_path / "bad.obj").write_text("v 0 0\nf 1 2 3\n")
     with pytest.raises(BadInputError, match="bad.obj"):
         read_lowpoly(tmp_path / "bad.obj", folder / "dense.ply", ASSET)
+    (tmp_path / "flat.obj").write_text("v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\nf 1 1 2\n")
+    with pytest.raises(BadInputError, match="no triangle with an area"):
+        read_lowpoly(tmp_path / "flat.obj", folder / "dense.ply", ASSET)
+    (tmp_path / "far.obj").write_text("v 0 0 0\nv 1e39 0 0\nv 0 1 0\nf 1 2 3\n")
+    with pytest.raises(BadInputError, match="not finite or beyond"):
+        read_lowpoly(tmp_path / "far.obj", folder / "dense.ply", ASSET)
+
+
+def test_a_stray_vertex_is_refused(folder: Path, tmp_path: Path) -> None:
+    mesh = unwrapped(Similarity())
+    mesh.vertices[0] = (1e6, 0, 0)
+    mesh.export(tmp_path / "mine.ply")
+    with pytest.raises(BadInputError, match="vertices far from the object"):
+        read_lowpoly(tmp_path / "mine.ply", folder / "dense.ply", None)
 
 
 def test_uvs_of_corners_in_a_ply_are_kept(folder: Path, tmp_path: Path) -> None:

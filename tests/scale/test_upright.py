@@ -98,8 +98,8 @@ def test_up_by_points() -> None:
         assert np.allclose(axis, TILT[:, 2]) and evidence == "three points of the ground"
     assert np.allclose(points_axis(np.array([(1, 1, 3.0), (1, 1, 1)]), above)[0], (0, 0, -1))
     for points in (ground[[0, 0, 1]], np.array([(0, 0, 0), (1, 1, 1), (2, 2, 2.001)]), ground[[1, 1]]):
-        with pytest.raises(BadInputError, match="coincide or lie on one line"):
-            points_axis(points, above)
+        with pytest.raises(ValueError, match="coincide or lie on one line"):
+            Export(up_points=tuple(points.ravel()))
 
 
 def test_up_by_points_comes_before_what_is_level(tmp_path: Path) -> None:

@@ -63,6 +63,8 @@ def test_paths_do_not_lead_out_of_a_capture(browser: Browser) -> None:
     write_capture(browser.folder / "a")
     (browser.folder / "a/images/link.jpg").symlink_to(browser.folder.parent / "secret.jpg")
     (browser.folder / "linked").symlink_to(browser.folder.parent / "other/outside")
+    (browser.folder / "half").mkdir()
+    (browser.folder / "half/images").symlink_to(browser.folder.parent / "other/outside/images")
     (browser.folder / "out/a").mkdir(parents=True)
     (browser.folder / "out/a/asset.glb").symlink_to(browser.folder.parent / "secret.jpg")
     (browser.folder / "out/a/notes.txt").write_text("mine")
@@ -74,7 +76,7 @@ def test_paths_do_not_lead_out_of_a_capture(browser: Browser) -> None:
             assert browser.ask("GET", f"/api/captures/a/{base}/{name}").code in (404, 405, 422), (base, name)
     for name in ("asset.glb", "notes.txt", "project.json", "live.json"):
         assert browser.ask("GET", f"/api/captures/a/files/{name}").code == 404, name
-    for name in ("linked", "..", "%2e%2e", "..%2Fother%2Foutside", "out", ".", ".gsbake-studio", "a%2Fimages"):
+    for name in ("linked", "half", "..", "%2e%2e", "..%2Fother%2Foutside", "out", ".", ".gsbake-studio", "a%2Fimages"):
         assert browser.ask("GET", f"/api/captures/{name}/photos").code == 404, name
 
 

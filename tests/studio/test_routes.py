@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import http.client
 import json
+import os
 import time
 from pathlib import Path
 
@@ -99,6 +101,38 @@ def test_uploads_are_limited(name: str, query: str, sentence: str, browser: Brow
     found = browser.ask("PUT", f"/api/captures/mug/upload/{name}?{query}", b"abc")
     assert found.code in (400, 404) and sentence in found.content.decode()
     assert sorted(path.name for path in browser.folder.rglob("*.jpg")) == before and not list(browser.folder.rglob("*.exe"))
+
+
+@pytest.mark.skipif(os.name != "posix", reason="links and pipes of POSIX")
+def test_an_upload_writes_to_no_link_and_waits_for_no_pipe(browser: Browser, tmp_path: Path) -> None:
+    images = write_capture(browser.folder / "a") / "images"
+    (tmp_path / "mine.txt").write_bytes(b"mine")
+    (images / ".link.jpg.part").symlink_to(tmp_path / "mine.txt")
+    os.mkfifo(images / ".pipe.jpg.part")
+    for name, offset in (("link", 4), ("pipe", 0)):
+        error = browser.send("PUT", f"/api/captures/a/upload/{name}.jpg?offset={offset}&size={offset + 3}", b"abc", 400)["error"]
+        assert "in the way" in error
+    assert (tmp_path / "mine.txt").read_bytes() == b"mine"
+
+
+def test_two_pages_that_upload_one_file_do_not_mix_it(browser: Browser) -> None:
+    write_capture(browser.folder / "a")
+    path = "/api/captures/a/upload/two.jpg?offset=0&size=6"
+    first = http.client.HTTPConnection("127.0.0.1", browser.studio.port, timeout=30)
+    first.putrequest("PUT", path)
+    for name, value in (("Cookie", browser.cookie), ("Origin", browser.origin), ("Content-Length", "6")):
+        first.putheader(name, value)
+    first.endheaders()  # its body comes later
+    part = browser.folder / "a/images/.two.jpg.part"
+    for _ in range(500):
+        if part.exists():
+            break
+        time.sleep(0.01)
+    assert "another page" in browser.send("PUT", path, b"second", 400)["error"]
+    first.send(b"first.")
+    assert json.loads(first.getresponse().read()) == {"bytes": 6, "complete": 1}
+    first.close()
+    assert (browser.folder / "a/images/two.jpg").read_bytes() == b"first."
 
 
 def test_photos_are_shown_small_and_made_once(browser: Browser) -> None:
@@ -208,6 +242,21 @@ def test_masks_outside_of_the_capture_are_not_written(browser: Browser, tmp_path
     (tmp_path / "elsewhere").mkdir()
     (browser.folder / "a/masks").symlink_to(tmp_path / "elsewhere")
     browser.ask("PUT", "/api/captures/a/masks/p1.jpg", encoded(np.zeros((48, 64), np.uint8)))
+    assert not list((tmp_path / "elsewhere").iterdir())
+
+
+@pytest.mark.skipif(os.name != "posix", reason="links of POSIX")
+def test_masks_behind_links_are_neither_shown_nor_written(browser: Browser, tmp_path: Path) -> None:
+    folder = write_capture(browser.folder / "a")
+    cv2.imwrite(str(tmp_path / "secret.png"), np.full((48, 64), 255, np.uint8))
+    (folder / "masks").mkdir()
+    (folder / "masks/p0.png").symlink_to(tmp_path / "secret.png")
+    (folder / "images/sub").mkdir()
+    (folder / "images/p1.jpg").rename(folder / "images/sub/p1.jpg")
+    (tmp_path / "elsewhere").mkdir()
+    (folder / "masks/sub").symlink_to(tmp_path / "elsewhere")
+    assert not decoded(browser.get("/api/captures/a/masks/p0.jpg")).any()
+    assert "link" in browser.send("PUT", "/api/captures/a/masks/sub/p1.jpg", encoded(np.zeros((48, 64), np.uint8)), 400)["error"]
     assert not list((tmp_path / "elsewhere").iterdir())
 
 

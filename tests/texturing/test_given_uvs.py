@@ -60,6 +60,7 @@ def half(uv: np.ndarray, change: Callable[[np.ndarray], Any]) -> np.ndarray:
     ("change", "materials", "words"),
     [
         (lambda uv: np.where(uv[:, :1] > 0.5, np.nan, uv), 1, "has no UVs on"),
+        (lambda uv: np.where(uv[:, :1] > 0.5, 1e300, uv), 1, "has no UVs on"),
         (lambda uv: 0.5 * uv + np.where(np.arange(len(uv)) % 2, 0.2, 0.0)[:, None], 1, "more than once"),
         (lambda uv: 0.5 * np.abs(uv - 0.4), 3, "its 3 materials share one square"),
         (lambda uv: 3.5 * uv - 1.2, 1, "for a tiled texture"),

@@ -29,6 +29,8 @@ _BARE = {0x01, *range(0xD0, 0xD9), 0xFF}
 _END, _SCAN = 0xD9, 0xDA
 #: Largest gain in stops, and largest offset: those of no screen.
 MAX_STOPS, MAX_OFFSET = 16.0, 1.0
+#: Largest number of any kind.
+MAX_NUMBER = 1e6
 #: Images behind the photo that are looked at.
 MAX_IMAGES = 8
 #: Rows that are converted at once.
@@ -129,14 +131,16 @@ def _numbers(xmp: str) -> dict[str, Floats] | None:
         several = re.search(rf"<hdrgm:{name}>(.{{1,600}}?)</hdrgm:{name}>", xmp, re.DOTALL)
         texts = [single[1]] if single else re.findall(r"<rdf:li>([^<]{1,60})</rdf:li>", several[1]) if several else [str(default)]
         try:
-            values = np.array([float(text) for text in texts], np.float32)
+            values = np.array([float(text) for text in texts])
         except ValueError:
             return None
-        if len(values) not in (1, 3) or not np.isfinite(values).all():
+        if len(values) not in (1, 3) or not (np.abs(values) <= MAX_NUMBER).all():
             return None
-        found[name] = np.broadcast_to(values, 3).copy()
+        found[name] = np.broadcast_to(values, 3).astype(np.float32)
     stops, offsets = np.concatenate([found["GainMapMin"], found["GainMapMax"]]), np.concatenate([found["OffsetSDR"], found["OffsetHDR"]])
     if np.abs(stops).max() > MAX_STOPS or found["Gamma"].min() < 1e-2 or np.abs(offsets).max() > MAX_OFFSET:
+        return None
+    if (found["GainMapMin"] > found["GainMapMax"]).any():
         return None
     return found
 

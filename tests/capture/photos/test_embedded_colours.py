@@ -205,6 +205,8 @@ def test_gain_maps_of_jpeg_are_applied_in_linear_light(tmp_path: Path, runner: R
         ('hdrgm:GainMapMax="2.5" hdrgm:BaseRenditionIsHDR="True"', bytes),
         ('hdrgm:GainMapMax="nan"', bytes),
         ('hdrgm:GainMapMax="99"', bytes),
+        ('hdrgm:GainMapMax="1e39"', bytes),
+        ('hdrgm:GainMapMax="1" hdrgm:GainMapMin="2"', bytes),
         ('hdrgm:GainMapMax="2,5"', bytes),
         ("", lambda data: data[:-300]),
         ("", lambda data: data.replace(b"GainMapMax", b"GainMapMix")),
