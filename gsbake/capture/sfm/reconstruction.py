@@ -327,7 +327,7 @@ class SfmPipeline:
                 )
                 models = list(found.values())
             except InterruptedError:  # by the token; the models are written, the present one too
-                models = [pycolmap.Reconstruction(str(path)) for path in sorted(out.iterdir(), key=lambda path: int(path.name))]
+                models = [pycolmap.Reconstruction(str(path)) for path in written_models(out)]
         self._models += models
         return largest(models)
 
@@ -420,6 +420,12 @@ def registered_names(model: Any | None) -> set[str]:
     if model is None:
         return set()
     return {image.name.rsplit(".", 1)[0] for image in model.images.values() if image.has_pose}
+
+
+def written_models(folder: Path) -> list[Path]:
+    """Folders of the models that mapping wrote into `folder`: its numbered ones, in order, or itself where mapping continued a model."""
+    found = (path.parent for path in folder.rglob("images.bin"))
+    return sorted(found, key=lambda path: (len(path.name), path.name))
 
 
 def largest(models: Sequence[Any]) -> Any | None:

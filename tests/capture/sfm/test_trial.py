@@ -11,6 +11,7 @@ import pytest
 from gsbake.capture.sfm.coincidence import coinciding
 from gsbake.capture.sfm.feature_masks import FeatureMasks
 from gsbake.capture.sfm.mapping_gain import MappingGain
+from gsbake.capture.sfm.reconstruction import written_models
 from gsbake.capture.sfm.trial import PHOTOS, Trial, best_region, write_small_photos
 from tests.support.cameras import look_at
 
@@ -98,3 +99,15 @@ def test_mapping_ends_after_models_that_gain_nothing(models: list[int], ends: bo
 def test_mapping_ends_where_photos_are_registered_again_and_again() -> None:
     gain = MappingGain(10)
     assert [gain.photo_registered() for _ in range(20)] == [False] * 18 + [True] * 2
+
+
+def test_models_of_a_mapping_that_was_ended(tmp_path: Path) -> None:
+    """COLMAP numbers the folders of new models, and writes a continued one into the folder itself."""
+    assert written_models(tmp_path) == []
+    new, continued = tmp_path / "strict", tmp_path / "relaxed"
+    for folder in (new / "0", new / "2", new / "10", continued):
+        folder.mkdir(parents=True)
+        (folder / "images.bin").touch()
+    (new / "3").mkdir()  # ended before it was written
+    assert written_models(new) == [new / "0", new / "2", new / "10"]
+    assert written_models(continued) == [continued]
