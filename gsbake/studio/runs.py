@@ -12,16 +12,13 @@ from gsbake.pipeline.machine import default_threads
 from gsbake.stages import REGISTRY
 from gsbake.studio.answers import Call
 from gsbake.studio.sessions import session_of
+from gsbake.studio.settings import asked
 from gsbake.timing.expectations import Expectations
 
 
 def plan(call: Call) -> dict[str, Any]:
     """The stages of the next run, with settings as `settings.change` takes them: state, reasons, seconds, memory."""
-    body = call.body if isinstance(call.body, dict) else {}
-    given, unset, profile = body.get("set") or {}, body.get("unset") or [], body.get("profile")
-    if not isinstance(given, dict) or not isinstance(unset, list) or not isinstance(profile, str | None):
-        raise UsageError("Settings are changed by 'set' and 'unset'.")
-    session = session_of(call.capture, given, frozenset(map(str, unset)), profile)
+    session = session_of(call.capture, *asked(call))
     states = states_of(session)
     expected = Expectations(session.engine.request, session.engine.registry.names)
     stages, seconds, memory = [], 0.0, 0

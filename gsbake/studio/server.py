@@ -15,7 +15,6 @@ from gsbake.studio.workspace import Workspace
 
 #: Modules that the extra `studio` brings.
 MODULES = ("starlette", "uvicorn")
-HOST = "127.0.0.1"
 #: Seconds of an idle connection, open connections, and seconds that requests have when the server ends.
 KEEP_ALIVE, MAX_CONNECTIONS, LAST_SECONDS = 15, 64, 2
 
@@ -36,6 +35,7 @@ class Studio:
         import uvicorn
 
         from gsbake.studio.app import guarded_app
+        from gsbake.studio.security import HOST
         from gsbake.studio.services import Services
 
         self.token = secrets.token_urlsafe(16)
@@ -48,7 +48,7 @@ class Studio:
         except OSError as error:
             self._socket.close()
             raise UsageError(f"Port {port} cannot be used ({error.strerror}); name another with --port.") from error
-        self.port: int = self._socket.getsockname()[1]
+        self.host, self.port = self._socket.getsockname()
         self._services = Services()
         config = uvicorn.Config(
             guarded_app(workspace, self._services, self.token, self.port), http="h11", ws="none", lifespan="off",
@@ -70,7 +70,7 @@ class Studio:
     @property
     def address(self) -> str:
         """The page's address, with the token."""
-        return f"http://{HOST}:{self.port}/?token={self.token}{self._place}"
+        return f"http://{self.host}:{self.port}/?token={self.token}{self._place}"
 
     def wait(self) -> None:
         """Serve until the thread ends, or an exception such as that of Ctrl-C."""

@@ -34,8 +34,8 @@ class Views:
 
     def view(self, capture: Capture, folders: Mapping[str, Path], name: str) -> tuple[str, dict[str, Any]]:
         """Key and figures of the pictures from a photo's camera. Raises BadInputError for an asset that cannot be drawn."""
-        key = blake3(repr((sorted((k, str(v)) for k, v in folders.items()), name)).encode(errors="backslashreplace")).hexdigest(16)
-        return key, self._drawn(capture, key, {"task": "view", "name": name, "folders": {k: str(v) for k, v in folders.items()}})
+        key, request = _asset_request("view", folders, name)
+        return key, self._drawn(capture, key, request)
 
     def lights(self, capture: Capture) -> str:
         """Key of the environment maps."""
@@ -44,9 +44,7 @@ class Views:
 
     def places(self, capture: Capture, folders: Mapping[str, Path]) -> list[dict[str, Any]]:
         """Directions for further photos."""
-        key = blake3(repr(sorted((k, str(v)) for k, v in folders.items())).encode(errors="backslashreplace")).hexdigest(16)
-        found = self._drawn(capture, f"places-{key}", {"task": "places", "folders": {k: str(v) for k, v in folders.items()}})
-        places: list[dict[str, Any]] = found["places"]
+        places: list[dict[str, Any]] = self._drawn(capture, *_asset_request("places", folders))["places"]
         return places
 
     def file(self, capture: Capture, key: str, name: str) -> Path:
@@ -88,6 +86,12 @@ class Views:
                 self._timer.start()
             answer: dict[str, Any] = json.loads((place / "answer.json").read_bytes())
             return answer
+
+
+def _asset_request(task: str, folders: Mapping[str, Path], name: str = "") -> tuple[str, dict[str, Any]]:
+    """Key and request of what is drawn of the outputs in these folders."""
+    request = {"task": task, "name": name, "folders": {stage: str(folder) for stage, folder in sorted(folders.items())}}
+    return blake3(repr(request).encode(errors="backslashreplace")).hexdigest(16), request
 
 
 class Services:

@@ -29,17 +29,24 @@ def stored(call: Call) -> dict[str, Any]:
     return {"profile": session.profile.name, "settings": values(session), "stored": capture.project is not None}
 
 
-def change(call: Call) -> dict[str, Any]:
-    """Store settings: {"profile": name, "set": {key: value}, "unset": [key]}, each of which may be missing."""
+def asked(call: Call) -> tuple[dict[str, Any], frozenset[str], str | None]:
+    """The settings that a request gives and unsets, and its profile: {"profile": name, "set": {key: value}, "unset": [key]}, each of
+    which may be missing. Raises UsageError, also for a profile that is not one of gsbake's own."""
     body = call.body if isinstance(call.body, dict) else {}
     given, unset, profile = body.get("set", {}), body.get("unset", []), body.get("profile")
     if not isinstance(given, dict) or not isinstance(unset, list) or not isinstance(profile, str | None):
         raise UsageError("Settings are changed by 'set' and 'unset'.")
-    if not given and not unset and profile is None:
-        return stored(call)
     if profile is not None and profile not in shipped():
         raise UsageError(f"There is no profile '{profile[:80]}'.")
-    session = session_of(call.capture, {str(key): value for key, value in given.items()}, frozenset(map(str, unset)), profile)
+    return {str(key): value for key, value in given.items()}, frozenset(map(str, unset)), profile
+
+
+def change(call: Call) -> dict[str, Any]:
+    """Store the settings that are asked for."""
+    given, unset, profile = asked(call)
+    if not given and not unset and profile is None:
+        return stored(call)
+    session = session_of(call.capture, given, unset, profile)
     session.store_settings()
     return {"profile": session.profile.name, "settings": values(session), "stored": True}
 

@@ -189,6 +189,9 @@ def test_the_plan_estimates_time_and_memory(browser: Browser) -> None:
     quick, long = (browser.send("POST", "/api/captures/a/plan", {"profile": name}) for name in ("smoke", "quality"))
     assert [stage["name"] for stage in quick["stages"]][:2] == ["ingest", "poses"] and quick["stages"][0]["status"] == "run"
     assert 0 < quick["seconds"] < long["seconds"] and quick["memory"] > 1e8
+    other = browser.folder.parent / "other.toml"  # a profile of one's own lies anywhere
+    other.write_text('extends = "smoke"', encoding="utf-8")
+    assert "no profile" in browser.send("POST", "/api/captures/a/plan", {"profile": str(other)}, 400)["error"]
     assert not (browser.folder / "out").exists()
     details = browser.get("/api/captures/a")
     assert (details["state"], details["done"], details["count"]) == ("new", 0, 4)
