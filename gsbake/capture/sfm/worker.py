@@ -94,13 +94,15 @@ def solve(job: Mapping[str, Any]) -> dict[str, Any]:
     if model is None or model.num_reg_images() == 0:
         return {"registered": 0, "points": 0, "reprojection_px": None, "missing": pipeline.names, "seconds": pipeline.seconds}
     out = Path(job["out"])
-    _report_progress("refinement", 0, 1)
-    adjusted = adjust_refined(model, pipeline.folder, pipeline.options.max_size, partial(_report_progress, "refinement"))
-    pipeline.seconds["refinement"] = adjusted.figures.pop("seconds")
-    model = adjusted.model
+    refinement: dict[str, Any] = {}
+    if job["mapper"] != "trial":  # a trial's cameras only tell which features are tried first
+        _report_progress("refinement", 0, 1)
+        adjusted = adjust_refined(model, pipeline.folder, pipeline.options.max_size, partial(_report_progress, "refinement"))
+        model, refinement = adjusted.model, adjusted.figures
+        pipeline.seconds["refinement"] = refinement.pop("seconds")
     model.extract_colors_for_all_images(str(pipeline.folder))
     counts = {"detected": len(pipeline.detected), "matched": pipeline.matched, "verified": pipeline.verified}
-    figures = counts | {"steps": pipeline.steps, "seconds": pipeline.seconds, "refinement": adjusted.figures}
+    figures = counts | {"steps": pipeline.steps, "seconds": pipeline.seconds, "refinement": refinement}
     return _write(model, out, pipeline, True) | figures
 
 
