@@ -1,4 +1,5 @@
-"""Command line of a benchmark that measures captures one by one: `python -m benchmarks.NAME [CAPTURE …] [--profile] [--out] [--csv]`."""
+"""Command lines of benchmarks: `python -m benchmarks.NAME [CAPTURE …] [--profile] [--out] [--csv]` of those that measure captures one by
+one, and `python -m benchmarks.NAME RUN CAPTURE …` of those that print what they find in finished runs."""
 
 from __future__ import annotations
 
@@ -9,7 +10,7 @@ from pathlib import Path
 
 from benchmarks.csv_rows import AnyRow, read_rows, write_rows
 from benchmarks.timeline import ROOT
-from gsbake.errors import GsbakeError
+from gsbake.errors import GsbakeError, UsageError
 
 
 def measure_captures(
@@ -33,3 +34,20 @@ def measure_captures(
             parser.error(f"{name}: {error}")
         write_rows(options.csv, [*read_rows(options.csv, kind), row])
         sys.stdout.write(f"{row}\n")
+
+
+def report_runs(
+    name: str, description: str | None, report: Callable[[Sequence[tuple[Path, Path]]], str], arguments: Sequence[str] | None = None
+) -> int:
+    """Print the report on pairs of a finished run and its capture; the exit status."""
+    parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("pairs", type=Path, nargs="+", metavar="RUN CAPTURE")
+    pairs = parser.parse_args(arguments).pairs
+    try:
+        if len(pairs) % 2:
+            raise UsageError("Give a run and its capture each.")
+        print(report(list(zip(pairs[::2], pairs[1::2], strict=True))))
+    except GsbakeError as error:
+        print(f"{name}: {error}", file=sys.stderr)
+        return error.exit_code
+    return 0

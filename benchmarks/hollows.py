@@ -9,7 +9,6 @@ two pixels. Of a shape, a point is open where two cameras see past it: `open` is
 
 from __future__ import annotations
 
-import argparse
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -17,11 +16,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.captures import report_runs
 from benchmarks.hull import finished_stages
 from benchmarks.truth import Surface, align, read_centres, read_truth
 from gsbake.capture.hull.visual_hull import Hull, read_masks, unit_hull
 from gsbake.capture.posed_photos import PosedPhotos
-from gsbake.errors import GsbakeError, UsageError
+from gsbake.errors import UsageError
 from gsbake.geometry.cameras import Camera
 from gsbake.geometry.ply import read_mesh
 from gsbake.geometry.raycast import RayCaster
@@ -84,22 +84,16 @@ def measure_run(run: Path, capture: Path) -> list[tuple[str, float, float]]:
     return [(name, *pair) for name, pair in zip(found, values, strict=True)]
 
 
+def table(pairs: Sequence[tuple[Path, Path]]) -> str:
+    """The table of all runs and their captures."""
+    rows = [(capture.name, *row) for run, capture in pairs for row in measure_run(run, capture)]
+    lines = [f"| {capture} | {name} | {opened:.3f} | {wrong:.4f} |" for capture, name, opened, wrong in rows]
+    return "\n".join(["| capture | shape | open | wrong |", "|---|---|---|---|", *lines])
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Command line; returns the exit status."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("pairs", type=Path, nargs="+", metavar="RUN CAPTURE")
-    pairs = parser.parse_args(arguments).pairs
-    try:
-        if len(pairs) % 2:
-            raise UsageError("Give a run and its capture each.")
-        print("| capture | shape | open | wrong |\n|---|---|---|---|")
-        for run, capture in zip(pairs[::2], pairs[1::2], strict=True):
-            for name, opened, wrong in measure_run(run, capture):
-                print(f"| {capture.name} | {name} | {opened:.3f} | {wrong:.4f} |")
-    except GsbakeError as error:
-        print(f"hollows: {error}", file=sys.stderr)
-        return error.exit_code
-    return 0
+    return report_runs("hollows", __doc__, table, arguments)
 
 
 if __name__ == "__main__":

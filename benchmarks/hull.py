@@ -10,7 +10,6 @@ them lie more than two voxels off the true surface, where there is air behind th
 
 from __future__ import annotations
 
-import argparse
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -20,11 +19,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from benchmarks.captures import report_runs
 from benchmarks.truth import Figures, Surface, align, measure, nearest, read_centres, read_truth
 from gsbake.capture.hull.softness import SOFT, surface_softness
 from gsbake.capture.hull.visual_hull import Hull, read_masks, unit_hull
 from gsbake.capture.posed_photos import PosedPhotos
-from gsbake.errors import GsbakeError, UsageError
+from gsbake.errors import UsageError
 from gsbake.pipeline.store import Store
 
 #: Limits of the softness in the second table, and voxels from the truth that count as off.
@@ -94,17 +94,11 @@ def tables(found: dict[str, HullFigures]) -> str:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Command line; returns the exit status."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("pairs", type=Path, nargs="+", metavar="RUN CAPTURE")
-    pairs = parser.parse_args(arguments).pairs
-    try:
-        if len(pairs) % 2:
-            raise UsageError("Give a run and its capture each.")
-        print(tables({capture.name: measure_hulls(run, capture) for run, capture in zip(pairs[::2], pairs[1::2], strict=True)}))
-    except GsbakeError as error:
-        print(f"hull: {error}", file=sys.stderr)
-        return error.exit_code
-    return 0
+
+    def report(pairs: Sequence[tuple[Path, Path]]) -> str:
+        return tables({capture.name: measure_hulls(run, capture) for run, capture in pairs})
+
+    return report_runs("hull", __doc__, report, arguments)
 
 
 if __name__ == "__main__":

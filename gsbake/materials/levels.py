@@ -19,6 +19,10 @@ from gsbake.materials.state import LIMITS, State
 from gsbake.materials.surface import Materials
 from gsbake.texturing.resampling import DETAIL_OFFSET, MAX_DETAIL_RATIO
 
+Floats = NDArray[np.float32]
+#: PSNR in dB of validation views with some materials; None without views.
+Psnr = Callable[[Materials], float | None]
+
 
 @dataclass(frozen=True)
 class PureMetals:
@@ -93,12 +97,6 @@ class FullTexture:
         emission = up(state.transport["emission"]) * detail if state.emissive_regions else None
         full = replace(maps, base_color=values[:, :3] * detail, roughness=values[:, 3], metallic=values[:, 4], emission=emission)
         return replace(state, maps=replace(full, normal_offset=up(state.values[:, 5:])))
-
-
-Floats = NDArray[np.float32]
-
-#: PSNR in dB of validation views with some materials; None without views.
-Psnr = Callable[[Materials], float | None]
 
 
 @dataclass(frozen=True)
