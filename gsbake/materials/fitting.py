@@ -13,6 +13,7 @@ from gsbake.capture.posed_photos import PosedPhotos
 from gsbake.capture.view_dependence import is_diffuse
 from gsbake.config.schema import Bake
 from gsbake.geometry.cameras import Camera
+from gsbake.geometry.turntable import turntable_share
 from gsbake.materials.passes import Finer, Priors, Scene, Target, run_passes
 from gsbake.materials.photo import SURFACE_POINTS, MeshBrightness, Photo, PhotoReader, texel_weight
 from gsbake.materials.recipe import FIT, MAPS
@@ -40,6 +41,8 @@ SMOOTHING_RADIUS = 3.0
 MAX_PIXELS = 60_000
 #: Least weight of a texel, in frontal views at a texel's size, for its normal to be refined and for it to count as observed.
 MIN_OBSERVATIONS = 0.3
+#: Share of the cameras that must stand on exact circles for the light to turn (.59 on a turntable, 0 on captures from hand).
+MIN_TURNTABLE_SHARE = 0.5
 
 
 @dataclass(frozen=True)
@@ -210,6 +213,10 @@ def _light_motions(cameras: list[Camera], asked: str, monitor: Monitor) -> tuple
     motions: tuple[Motion, ...] = ("turntable", "camera")
     under = {motion: rotations for motion in motions if (rotations := light_rotations(cameras, motion)) is not None}
     if asked == "auto":
+        share = turntable_share(cameras) if "turntable" in under else 1.0
+        if share < MIN_TURNTABLE_SHARE:  # photos of a plain round object fit a light that turns too, by their noise
+            del under["turntable"]
+            monitor.decide("turntable", "none", f"{share:.0%} of the cameras stand on exact circles; {MIN_TURNTABLE_SHARE:.0%} are needed")
         return LightMotion(), {"static": None, **under}
     found = next((motion for motion in under if motion == asked), None)
     if asked != "static" and found is None:
