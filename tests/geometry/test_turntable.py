@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from gsbake.geometry.cameras import Camera
+from gsbake.geometry.cameras import Camera, Similarity
 from gsbake.geometry.turntable import turntable_share
+from tests.support.cameras import look_at
 
 
 def camera(centre: np.ndarray, noise: float = 0.0, seed: int = 0) -> Camera:
     """A level camera at `centre` that looks at the origin, turned by a `noise` in radians."""
-    forward = -centre / np.linalg.norm(centre)
-    right = np.cross(forward, [0.0, 0.0, 1.0])
-    right /= np.linalg.norm(right)
+    level = look_at(centre)
     turned = Rotation.from_rotvec(np.random.default_rng(seed).normal(0, noise, 3)).as_matrix()
-    rotation = turned @ np.stack([right, np.cross(forward, right), forward])
-    return Camera(str(seed), 400, 400, 500, 500, 200, 200, rotation, -rotation @ centre)
+    return replace(level, R=turned @ level.R, t=turned @ level.t)
 
 
 def around(azimuth: float, elevation: float, distance: float) -> np.ndarray:
@@ -29,8 +29,8 @@ def test_rounds_of_a_camera_that_was_moved_between_them_are_found() -> None:
     cameras = [camera(p + rng.normal(0, 0.002, 3), 0.001, k) for k, p in enumerate(places)]
     assert turntable_share(cameras) == 1
     tilted = Rotation.from_rotvec([0.4, -0.7, 0.2]).as_matrix()  # the frame is free
-    moved = [Camera(c.name, 400, 400, 500, 500, 200, 200, c.R @ tilted, c.t + c.R @ [2.0, -1.0, 5.0]) for c in cameras]
-    assert turntable_share(moved) == 1
+    frame = Similarity(0.4, tilted, np.array([2.0, -1.0, 5.0]))
+    assert turntable_share([c.moved(frame) for c in cameras]) == 1
 
 
 def test_cameras_from_hand_on_a_spiral_or_anywhere_are_on_no_circles() -> None:

@@ -71,6 +71,17 @@ def test_a_turn_that_is_asked_for_and_not_there_is_said() -> None:
     assert any("do not turn about one axis" in text for text in recorder.warnings)
 
 
+def test_a_turn_is_tried_only_where_cameras_stand_on_circles() -> None:
+    """Level cameras have a common axis on a turntable and from hand."""
+    rng, angles = np.random.default_rng(0), np.linspace(0, 2 * np.pi, 24, endpoint=False)
+    for spread, turns in ((0.0, True), (0.5, False)):
+        eyes = [np.array([3 * np.cos(a), 3 * np.sin(a), 1.5]) * (1 + rng.uniform(-spread, spread)) for a in angles]
+        recorder = Recorder()
+        motion, choices = _light_motions([look_at(eye, (0, 0, rng.uniform(-spread, spread))) for eye in eyes], "auto", recorder)
+        assert motion.motion == "static" and ("turntable" in choices) == turns and "camera" in choices
+        assert ("turntable" in recorder.decisions) != turns
+
+
 def best_motion(scene: Sphere) -> Motion:
     motions: tuple[Motion, ...] = ("static", "turntable", "camera")
     comparison = MotionComparison(MOTION_TRIAL)
