@@ -82,7 +82,7 @@ def bake_without(rule: str, run: Path, out: Path, seed: int) -> float:
     baked.mkdir(parents=True)
     begun = time.perf_counter()
     options = replace(BakeOptions.of(profile), without=frozenset({rule} & set(OPTIONAL)))
-    bake_textures(folder["poses"], folder["refine"], folder["mesh"], baked, options, seed=seed)
+    bake_textures(folder["ingest"], folder["poses"], folder["refine"], folder["mesh"], baked, options, seed=seed)
     seconds = time.perf_counter() - begun
     export_asset(folder["ingest"], folder["poses"], folder["refine"], baked, out, ExportOptions(materials="fit"))
     return seconds

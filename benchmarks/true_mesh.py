@@ -52,7 +52,7 @@ def bake_on_true_mesh(run: Path, capture: Path, out: Path, profile: str = "relig
     vertices = cameras.to_world.inverse().apply(corners)
     for name in ("mesh.ply", "dense.ply"):
         write_mesh(mesh / name, vertices, np.asarray(faces).reshape(-1)[truth.faces])
-    figures = bake_textures(poses, surfels, mesh, baked, BakeOptions.of(settings), monitor=_Printed())
+    figures = bake_textures(ingest, poses, surfels, mesh, baked, BakeOptions.of(settings), monitor=_Printed())
     export = ExportOptions(settings.export, settings.bake.materials, settings.bake.size, settings.scale)
     export_asset(ingest, poses, surfels, baked, out, export)
     return figures

@@ -12,8 +12,8 @@ def run(ctx: Context) -> dict[str, Any]:
     from gsbake.materials.bake import BakeOptions, bake_textures
 
     options = BakeOptions.of(ctx.settings)
-    poses, surfels, mesh = ctx.inputs["poses"], ctx.inputs["refine"], ctx.inputs["mesh"]
-    return bake_textures(poses, surfels, mesh, ctx.out, options, seed=ctx.seed, threads=ctx.threads, monitor=ctx)
+    ingest, poses, surfels, mesh = (ctx.inputs[name] for name in ("ingest", "poses", "refine", "mesh"))
+    return bake_textures(ingest, poses, surfels, mesh, ctx.out, options, seed=ctx.seed, threads=ctx.threads, monitor=ctx)
 
 
 #: Modules with the kernels of this stage, and with those of the material fit.
@@ -28,11 +28,11 @@ FIT_KERNELS = (
 
 STAGE = Stage(
     name="bake",
-    version=49,
+    version=50,
     title="Textures",
     run=run,
     summary="{charts} charts, {texels} texels, {fit_psnr:dB} on test photos",
-    needs=("poses", "refine", "mesh"),
+    needs=("ingest", "poses", "refine", "mesh"),
     settings=(
         "bake.*", "light.size", "train.max_size", "train.holdout", "export.max_triangles", "skip.exposure_equalisation", "skip.normal_map",
         "skip.specular", "skip.metallic_map", "skip.roughness_map",

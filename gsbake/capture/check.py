@@ -65,7 +65,7 @@ def check_photos(
     """
     (work / "ingest").mkdir()
     (work / "poses").mkdir()
-    options = IngestOptions(Ingest(max_size=CHECK_SIZE))
+    options = IngestOptions(Ingest(max_size=CHECK_SIZE), originals=False)
     ingest(photos, work / "ingest", options, masks=masks, poses=poses, threads=threads, monitor=monitor)
     listing = json.loads((work / "ingest/photos.json").read_text(encoding="utf-8"))
     entries: list[dict[str, Any]] = listing["photos"]

@@ -21,9 +21,10 @@ from gsbake.capture.masks.completion import complete_masks
 from gsbake.capture.masks.consensus import MIN_CERTAIN_OVERLAP, MIN_OVERLAP, MIN_USED_AGREEMENT, correct_mask, distorted, find_consensus
 from gsbake.capture.masks.hull_correction import apply_correction, correct_by_hull
 from gsbake.capture.masks.support_plane import plane_masks
+from gsbake.capture.photos.originals import file_digest
 from gsbake.capture.photos.redundancy import find_redundant_photos
 from gsbake.capture.photos.undistortion import intrinsics_key, pinhole_camera, remap_tables, resample
-from gsbake.capture.posed_photos import REGION, PosedPhotos
+from gsbake.capture.posed_photos import DIGESTS, REGION, PosedPhotos
 from gsbake.capture.poses.normalisation import BoundingSphere, bounding_sphere_from_masks, bounding_sphere_from_views
 from gsbake.capture.sfm.feature_masks import FeatureMasks
 from gsbake.capture.sfm.solve import PoseSolver
@@ -71,7 +72,8 @@ def estimate_poses(
 
     Written: `cameras.json` (`CameraSet`, unit frame), `photos/`, `masks/` (pinhole), `points.ply` (tie points, unit frame; may be absent),
     `region.json` (the box outside of which nothing is baked, where there is one), `photo_masks/` (masks that were guessed, as the photos
-    show them), `photo_cameras.json` (cameras of the photos before undistortion, world frame), `sparse/` (COLMAP binary model, input frame).
+    show them), `photo_cameras.json` (cameras of the photos before undistortion, world frame), `photo_digests.json` (of the pinhole photos:
+    one replaced by hand is known by it), `sparse/` (COLMAP binary model, input frame).
     `scratch` holds the database of COLMAP, from which an interrupted run resumes; `cache` keeps features and matches, which a run with more
     photos uses again. Raises BadInputError when too few photos register, required poses are missing, or the region lies in no photo.
     """
@@ -255,6 +257,7 @@ class _Estimation:
         cv2.setNumThreads(1)
         done = 0
         pinholes: dict[str, Camera] = {}
+        digests: dict[str, str] = {}
         with ThreadPoolExecutor(max(1, min(self.threads, 8))) as pool:
             for members in groups.values():
                 target = pinhole_camera(members[0])
@@ -263,12 +266,14 @@ class _Estimation:
                 def undistort(camera: Camera, tables: Any = tables, target: Camera = target) -> Camera:
                     for sub in ("photos", "masks"):
                         self._resample(sub, camera.name, tables)
+                    digests[camera.name] = file_digest(self.out / "photos" / f"{camera.name}.png")
                     return replace(target, name=camera.name, R=camera.R, t=camera.t)
 
                 for result in pool.map(undistort, members):
                     pinholes[result.name] = result
                     done += 1
                     self.monitor.progress(done, len(cameras), "undistortion")
+        (self.out / DIGESTS).write_bytes(json.dumps(digests, indent=1, sort_keys=True).encode())
         return [pinholes[c.name] for c in cameras]
 
     def _resample(self, sub: str, name: str, tables: Any) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -17,11 +16,11 @@ from blake3 import blake3
 from gsbake.capture.masks.matching import match_masks
 from gsbake.capture.masks.saliency import SaliencyNetwork
 from gsbake.capture.masks.weights import INSTALL, WEIGHTS, resolve_network
-from gsbake.capture.photos.conversion import Conversion, ConvertedPhoto
-from gsbake.capture.photos.decode import RawPhoto, UnreadablePhotoError, to_working_size
+from gsbake.capture.photos.conversion import FULL_MASKS, ORIGINALS, Conversion, ConvertedPhoto, halve
+from gsbake.capture.photos.decode import UnreadablePhotoError
 from gsbake.capture.photos.exif import is_recropped
 from gsbake.capture.photos.quality import find_blurred, find_near_duplicates
-from gsbake.capture.photos.reader_pool import ReaderPool
+from gsbake.capture.photos.reader_pool import ReaderPool, submit_bounded
 from gsbake.capture.photos.sharpness import detect_oversampling
 from gsbake.capture.photos.video_process import extract_frames
 from gsbake.capture.posed_photos import REGION
@@ -40,6 +39,8 @@ from gsbake.text import missing_list, shortlist
 
 #: Why a photo is skipped that the settings leave out.
 LEFT_OUT = "left out by the settings"
+#: Folders of what is written for each photo; empty ones are removed.
+SUBFOLDERS = ("photos", "masks", ORIGINALS, FULL_MASKS)
 #: Folder of the frames of a video, while they are read.
 FRAMES = "frames"
 #: Share of the pixels of the largest photo of a camera below which another is taken for a crop.
@@ -50,10 +51,12 @@ MAX_READERS = 8
 
 @dataclass(frozen=True)
 class IngestOptions:
-    """Settings of ingestion; `resolution` is the rule for skipping redundant resolution."""
+    """Settings of ingestion; `resolution` is the rule for skipping redundant resolution, `originals` keeps what is larger than the working
+    photos."""
 
     ingest: Ingest = Ingest()
     resolution: Rule = "auto"
+    originals: bool = True
 
 
 def ingest(
@@ -69,7 +72,8 @@ def ingest(
     """Decode, check and downsample all photos of the folder or video `photos`; write the working files into the folder `out`; the figures.
 
     Written: `photos/<name>.png` and `masks/<name>.png` (8-bit), `guesses/<name>.png` where masks are guessed, `photos.json` (metadata of
-    each photo, and the skipped files), and with known `poses` (a file or folder that `read_poses` reads) `poses/cameras.json` and
+    each photo, and the skipped files), `originals/` (photos that are larger than the working size, as they are) and `full_masks/<name>.png`
+    (their masks at their size), and with known `poses` (a file or folder that `read_poses` reads) `poses/cameras.json` and
     `poses/points.ply`, `poses/region.json` where the file has one. Raises BadInputError when too few photos are usable, or required masks
     are missing.
     """
@@ -193,7 +197,7 @@ class _Ingestion:
 
     def _read_all(self, paths: dict[str, Path], names: dict[str, str], masks: dict[str, Path]) -> None:
         """Decode, downsample, measure and write all photos in a pool of processes; unreadable ones are skipped with a warning."""
-        for sub in ("photos", "masks"):
+        for sub in SUBFOLDERS:
             (self.out / sub).mkdir(exist_ok=True)
         settings, count = self.options.ingest, max(1, min(self.threads, MAX_READERS, len(paths)))
         with ReaderPool(count) as readers, ThreadPoolExecutor(count) as pool:
@@ -201,12 +205,12 @@ class _Ingestion:
             def submit(relative: str) -> Future[ConvertedPhoto]:
                 what = Conversion(
                     paths[relative], relative, names[relative], self.out, settings.masks != "ignore", masks.get(relative),
-                    settings.invert_masks, settings.max_size, settings.max_megapixels,
+                    settings.invert_masks, settings.max_size, settings.max_megapixels, self.options.originals,
                 )  # fmt: skip
                 return pool.submit(readers.convert, what)
 
             try:
-                for done, (relative, future) in enumerate(_submit_bounded(submit, list(paths), 2 * max(1, self.threads))):
+                for done, (relative, future) in enumerate(submit_bounded(submit, list(paths), 2 * max(1, self.threads))):
                     self.monitor.progress(done, len(paths), relative)
                     try:
                         self.read[relative] = future.result()
@@ -217,8 +221,13 @@ class _Ingestion:
                 pool.shutdown(wait=True, cancel_futures=True)
                 raise
         self.monitor.progress(len(paths), len(paths))
-        if not any(entry["mask"] for entry in self._entries):
-            (self.out / "masks").rmdir()
+        self._remove_empty_folders()
+
+    def _remove_empty_folders(self) -> None:
+        for sub in SUBFOLDERS:
+            folder = self.out / sub
+            if folder.exists() and not any(folder.iterdir()):
+                folder.rmdir()
 
     def _report_quality(self) -> None:
         """Mark near-duplicates; warn about them and about blurred photos."""
@@ -324,7 +333,8 @@ class _Ingestion:
         rule, half, full = self.options.resolution, f"photos kept at {longer // 2} pixels", f"photos kept at {longer} pixels"
         if decide_skip(self.monitor, "resolution", rule, oversampled, evidence, half, full):
             for entry in entries:
-                _halve(self.out, entry)
+                halve(self.out, entry)
+            self._remove_empty_folders()
 
     def _read_poses(self, path: Path, listing: list[str]) -> dict[str, Any]:
         """Read the given poses, scale them to the working photos and write them."""
@@ -381,30 +391,3 @@ def photo_names(paths: dict[str, Path]) -> dict[str, str]:
             raise BadInputError(f"The photos {other} and {relative} would both be called {name}; rename or remove one.")
         names[relative] = name
     return names
-
-
-def _submit_bounded(
-    submit: Callable[[str], Future[ConvertedPhoto]], items: list[str], limit: int
-) -> Iterator[tuple[str, Future[ConvertedPhoto]]]:
-    """Submit items in order with at most `limit` pending, which bounds memory; yields them in order."""
-    pending: list[tuple[str, Future[ConvertedPhoto]]] = []
-    for item in items:
-        pending.append((item, submit(item)))
-        if len(pending) >= limit:
-            yield pending.pop(0)
-    yield from pending
-
-
-def _halve(out: Path, entry: dict[str, Any]) -> None:
-    """Rewrite a working photo and its mask at half the size, and update `entry`."""
-    bgr: Any = cv2.imread(str(out / entry["file"]), cv2.IMREAD_COLOR)
-    full = np.ascontiguousarray(bgr[..., ::-1])
-    mask: Any = None if entry["mask"] is None else cv2.imread(str(out / entry["mask"]), cv2.IMREAD_GRAYSCALE)
-    before = max(entry["width"], entry["height"])
-    rgb, mask = to_working_size(RawPhoto(full, None, 1, {}), mask, before // 2)
-    write_png(out / entry["file"], rgb)
-    if mask is not None:
-        write_png(out / entry["mask"], mask)
-    entry["height"], entry["width"] = rgb.shape[:2]
-    if entry["focal_px"] is not None:
-        entry["focal_px"] *= max(rgb.shape[:2]) / before

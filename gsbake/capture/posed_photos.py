@@ -18,6 +18,8 @@ Bytes = NDArray[np.uint8]
 
 #: File of the box outside of which nothing is baked, in the cameras' frame.
 REGION = "region.json"
+#: File of the digests of the photos, by name.
+DIGESTS = "photo_digests.json"
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from safetensors.numpy import save_file
 
-from gsbake.capture.posed_photos import PosedPhotos
+from gsbake.capture.full_photos import FullPhotos
 from gsbake.config.schema import Bake
 from gsbake.errors import BadInputError
 from gsbake.geometry.ply import read_textured_mesh
@@ -76,6 +76,7 @@ class BakeOptions:
 
 
 def bake_textures(
+    ingest: Path,
     poses: Path,
     surfels: Path,
     mesh: Path,
@@ -88,11 +89,13 @@ def bake_textures(
 ) -> dict[str, Any]:
     """Unwrap the mesh of the folder `mesh` and bake its textures from the photos into the folder `out`; return the figures.
 
+    `ingest` holds the photos at full size (`FullPhotos`), `poses` their cameras, `surfels` those that training refined, if it did.
     Written: `mesh.safetensors` (the unwrapped mesh with its tangent frames), `base_color.exr`, `orm.exr`, `coverage.exr`, where needed
     `normal.exr` and `emissive.exr`, with materials `light.safetensors`, where the light moves `light_motion.json`. Raises BadInputError
     when the mesh is damaged, has too many triangles, does not fit the atlas, or is visible in no photo.
     """
-    return _Baking(PosedPhotos.open(poses, surfels), surfels, mesh, out, options or BakeOptions(), seed, threads, monitor).run()
+    with FullPhotos(ingest, poses, surfels) as photos:
+        return _Baking(photos, surfels, mesh, out, options or BakeOptions(), seed, threads, monitor).run()
 
 
 @dataclass(frozen=True)
@@ -109,7 +112,7 @@ class Textures:
 class _Baking:
     """One run."""
 
-    posed: PosedPhotos
+    photos: FullPhotos
     surfels: Path
     mesh: Path
     out: Path
@@ -224,18 +227,18 @@ class _Baking:
         light = self.out / "light.safetensors"
         if options.bake.materials == "surfels":
             with monitor.part("projection"):
-                projected = project_surfel_materials(surface, self.posed, self.surfels, options.train_size, monitor)
+                projected = project_surfel_materials(surface, self.photos.posed, self.surfels, options.train_size, monitor)
             shutil.copyfile(self.surfels / "light.safetensors", light)
             return Textures(projected, detail, {})
         with monitor.part("projection"):
-            projected = project_photos(surface, self.posed, options.holdout, options.exposure_equalisation, monitor)
+            projected = project_photos(surface, self.photos, options.holdout, options.exposure_equalisation, monitor)
         if options.bake.materials == "delight":
             with monitor.part("delighting"):
                 return Textures(self._delight(surface, projected, detail, occlusion), detail, {})
         if options.bake.materials == "fit":
             rules = options.specular, options.metallic_map, options.roughness_map
             fit = FitSettings(options.bake, options.light_size, options.holdout, *rules, options.without)
-            fitted = fit_materials(surface, self.posed, projected, detail, occlusion, fit, self.seed, monitor)
+            fitted = fit_materials(surface, self.photos.posed, projected, detail, occlusion, fit, self.seed, monitor)
             fitted.state.light.save(light)
             if fitted.state.light_motion.rotations is not None:
                 fitted.state.light_motion.save(self.out / "light_motion.json")

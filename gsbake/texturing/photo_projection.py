@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from gsbake.capture.exposure import TiePointExposure
+from gsbake.capture.full_photos import FullPhotos
 from gsbake.capture.photos.roles import held_out
 from gsbake.capture.posed_photos import PosedPhotos
 from gsbake.imaging.srgb import decode_bytes
@@ -25,18 +26,21 @@ MASK_MARGIN = 0.008
 MIN_ALPHA = 0.8
 
 
-def project_photos(surface: UnwrappedMesh, posed: PosedPhotos, holdout: int, equalisation: Rule, monitor: Monitor) -> ProjectedTexture:
-    """Linear colours (n, 3) of the texels, fused from the photos at their stored size.
+def project_photos(surface: UnwrappedMesh, photos: FullPhotos, holdout: int, equalisation: Rule, monitor: Monitor) -> ProjectedTexture:
+    """Linear colours (n, 3) of the texels, fused from the photos, each at a size at which its pixels are as fine as texels.
 
     `holdout` is that of training. `equalisation` is the rule of [skip] for dividing out exposure gains.
     """
+    posed = photos.posed
     held_out_views = set(held_out(len(posed), holdout))
     blender = ProjectionBlender(surface.texel_position, surface.texel_normal, surface.caster, 3, surface.texel_size)
     usable, measured = UsablePixels(posed), equalisation != "skip"
     tie_points = TiePointExposure.from_model(posed.folder / "sparse", posed.cameras.to_world.inverse()) if measured else None
     for index in range(len(posed)):
         monitor.check_stop()
-        view = posed.view(index)
+        working = posed.cameras.cameras[index]
+        size = blender.useful_size(photos.camera(index))
+        view = photos.view(index, max(size, working.width, working.height))
         linear = decode_bytes(view.rgb)
         if tie_points is not None:
             tie_points.add(view.camera, linear)

@@ -106,14 +106,20 @@ class ProjectionBlender:
         values, views, confidence = fuse(self._values, self._weights, self._view, gains)
         return ProjectedTexture(values, views, confidence, gains, explained)
 
-    def _filtered(self, camera: Camera, pixels: Floats, mask: Floats) -> tuple[Camera, Floats, Floats]:
-        """The view reduced by an area filter when its pixels are much finer than texels, against aliasing."""
+    def useful_size(self, camera: Camera) -> int:
+        """Longer side in pixels, at most that of `camera`, at which the view's pixels are as fine as texels; rounded up."""
+        return int(np.ceil(max(camera.width, camera.height) / max(1.0, self._texel_width(camera))))
+
+    def _texel_width(self, camera: Camera) -> float:
+        """Width in pixels of a texel at the median depth; 0 when all lie behind the camera."""
         offset = self._position - camera.centre.astype(np.float32)
         depth = offset[:: max(1, len(offset) // 2000)] @ camera.R[2].astype(np.float32)
         depth = depth[depth > 0]
-        if len(depth) == 0:
-            return camera, pixels, mask
-        texel_width = self._texel_size * camera.fx / float(np.median(depth))
+        return self._texel_size * camera.fx / float(np.median(depth)) if len(depth) else 0.0
+
+    def _filtered(self, camera: Camera, pixels: Floats, mask: Floats) -> tuple[Camera, Floats, Floats]:
+        """The view reduced by an area filter when its pixels are much finer than texels, against aliasing."""
+        texel_width = self._texel_width(camera)
         if texel_width < 1.5:
             return camera, pixels, mask
         size = (max(2, round(camera.width / texel_width)), max(2, round(camera.height / texel_width)))

@@ -42,7 +42,7 @@ def bake(folder: Path, out: Path, mesh: Path | None = None, **settings: Any) -> 
     """Bake the run in `folder` into the new folder `out`."""
     out.mkdir()
     options = BakeOptions(Bake(size=SIZE, occlusion_rays=8, **settings), holdout=0)
-    return bake_textures(folder / "poses", folder / "refine", mesh or folder / "mesh", out, options)
+    return bake_textures(folder / "ingest", folder / "poses", folder / "refine", mesh or folder / "mesh", out, options)
 
 
 def export(folder: Path, out: Path, monitor: Monitor = SILENT, materials: str = "none", **settings: Any) -> dict[str, Any]:
@@ -314,7 +314,7 @@ def test_a_rough_mesh_is_repaired_and_said_to_be(run: Path, tmp_path: Path) -> N
     monitor = Recorder()
     (tmp_path / "bake").mkdir()
     options = BakeOptions(Bake(size=SIZE, occlusion_rays=0), holdout=0, max_triangles=len(faces))
-    result = bake_textures(run / "poses", run / "refine", tmp_path / "mesh", tmp_path / "bake", options, monitor=monitor)
+    result = bake_textures(run / "ingest", run / "poses", run / "refine", tmp_path / "mesh", tmp_path / "bake", options, monitor=monitor)
     assert result["faces"] == len(faces) and result["detail_share"] > 0.99 and result["fill"] > 0.45
     assert monitor.warnings == ["bake: the mesh was repaired; left out were 5 double faces."]
     assert monitor.line("mesh") == f"vertices joined ({3 * len(again) - len(vertices)} of {3 * len(again)} lay at the place of another)"
@@ -324,7 +324,7 @@ def test_a_mesh_over_the_triangle_limit_is_refused_before_anything_is_baked(run:
     options = BakeOptions(Bake(size=SIZE), max_triangles=1279)
     monitor = Recorder()
     with pytest.raises(BadInputError, match="the mesh has 1 280 triangles, but export.max_triangles allows 1 279; decimate it"):
-        bake_textures(run / "poses", run / "refine", run / "mesh", tmp_path, options, monitor=monitor)
+        bake_textures(run / "ingest", run / "poses", run / "refine", run / "mesh", tmp_path, options, monitor=monitor)
     assert list(monitor.parts) == ["repair"]
 
 

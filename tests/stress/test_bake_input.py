@@ -43,7 +43,8 @@ def bake(folder: Path, mesh: str, cameras: str, pictures: str, outlines: str, to
     (folder / "ingest/photos.json").write_text(json.dumps({"photos": [{"name": v.name, "source": f"{v.name}.jpg"} for v in views]}))
     options = BakeOptions(Bake(**{"size": SIZE, "occlusion_rays": 4, "fit_iterations": 8, "fit_size": 64} | settings), light_size=8)
     try:
-        results = bake_textures(folder / "poses", folder / "refine", folder / "mesh", folder / "bake", options, monitor=Recorder())
+        ingest, poses, surfels, meshes = (folder / stage for stage in ("ingest", "poses", "refine", "mesh"))
+        results = bake_textures(ingest, poses, surfels, meshes, folder / "bake", options, monitor=Recorder())
     except GsbakeError as error:
         assert str(error).startswith("bake: ") or "mesh" in str(error)
         return False

@@ -1,13 +1,19 @@
-"""Conversion of one photo and its mask to working files, with quality measures. Imports little: it runs in the reader processes."""
+"""Conversion of one photo and its mask to working files, with quality measures. Imports little: it runs in the reader processes.
+
+A photo that is larger than the working size is kept too, as it is, and its mask at its size: `originals` reads them.
+"""
 
 from __future__ import annotations
 
+import shutil
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
+from blake3 import blake3
 
 from gsbake.capture.photos.decode import (
     MAX_MEGAPIXELS,
@@ -22,15 +28,20 @@ from gsbake.capture.photos.decode import (
 )
 from gsbake.capture.photos.exif import camera_body, camera_key, focal_pixels, gps_position, written_size
 from gsbake.capture.photos.hdr import has_gain_map
+from gsbake.capture.photos.heic_and_raw import HEIC_SUFFIXES
 from gsbake.capture.photos.quality import Quality, measure_quality
 from gsbake.errors import BadInputError
-from gsbake.imaging.png import write_png
+from gsbake.imaging.png import FAST_COMPRESSION, encode_png, write_png
+
+#: Folders of the photos that are larger than the working size, and of their masks; largest longer side that is read of them.
+ORIGINALS, FULL_MASKS = "originals", "full_masks"
+FULL_SIZE = 16_384
 
 
 @dataclass(frozen=True)
 class Conversion:
     """What to convert: the photo's file, its path `relative` to the photo folder and its `name`; its mask file (`use_mask` without one: its
-    alpha channel); the folder `out` of the working files."""
+    alpha channel); the folder `out` of the working files; whether to `keep` what is larger than them."""
 
     path: Path
     relative: str
@@ -41,6 +52,7 @@ class Conversion:
     invert_mask: bool
     max_size: int
     max_megapixels: float
+    keep: bool = True
 
     def to_json(self) -> dict[str, Any]:
         """The fields in JSON types."""
@@ -64,10 +76,10 @@ class ConvertedPhoto:
 
 def needed_bytes(what: Conversion) -> int:
     """Bytes that converting the photo and its mask needs, from headers. Raises UnreadablePhotoError for the photo; the mask comes later."""
-    size = read_header(what.path, what.max_megapixels).needed_bytes
+    size = read_header(what.path, what.max_megapixels).needed_bytes(what.max_size)
     if what.mask is not None:
         with suppress(UnreadablePhotoError):
-            size += read_header(what.mask, what.max_megapixels).needed_bytes
+            size += read_header(what.mask, what.max_megapixels).needed_bytes(what.max_size)
     return size
 
 
@@ -100,10 +112,13 @@ def convert(what: Conversion) -> ConvertedPhoto:
     """Write the working files. Raises UnreadablePhotoError for the photo, BadInputError for its mask."""
     photo = read_photo(what.path, what.max_megapixels)
     mask = read_photo_mask(photo, what.relative, what.mask, what.invert_mask, what.max_megapixels) if what.use_mask else None
+    full_mask = mask
     rgb, mask = to_working_size(photo, mask, what.max_size)
     height, width = rgb.shape[:2]
     quality = measure_quality(rgb, mask)
-    write_png(what.out / "photos" / f"{what.name}.png", rgb)
+    content = encode_png(rgb, FAST_COMPRESSION)
+    (what.out / "photos" / f"{what.name}.png").write_bytes(content)
+    larger = what.keep and (width, height) != (photo.width, photo.height)
     if mask is not None:
         write_png(what.out / "masks" / f"{what.name}.png", mask)
     focal = focal_pixels(photo.tags, photo.width, photo.height)
@@ -113,6 +128,9 @@ def convert(what: Conversion) -> ConvertedPhoto:
         "mask": None if mask is None else f"masks/{what.name}.png",
         "width": width,
         "height": height,
+        "digest": blake3(content).hexdigest(),
+        "original": keep_original(what, photo) if larger else None,
+        "full_mask": keep_full_mask(what, full_mask) if larger and full_mask is not None else None,
         "source": what.relative,
         "source_width": photo.width,
         "source_height": photo.height,
@@ -127,3 +145,46 @@ def convert(what: Conversion) -> ConvertedPhoto:
         "duplicate_of": None,
     }
     return ConvertedPhoto(entry, photo.orientation, quality)
+
+
+def keep_original(what: Conversion, photo: RawPhoto) -> str:
+    """Keep a photo that is larger than its working photo; the name of its file.
+
+    It is a copy of the user's file. Linear colours (RAW, EXR, 16 bits) are kept in 8-bit sRGB, since such files are larger, and slow to
+    develop; those of telephones (HEIC, gain maps) are not, since they are much smaller.
+    """
+    suffix = what.path.suffix.lower()
+    if photo.pixels.dtype == np.uint8 or photo.gain_map or suffix in HEIC_SUFFIXES:
+        name = f"{ORIGINALS}/{what.name}{suffix}"
+        shutil.copyfile(what.path, what.out / name)
+    else:
+        name = f"{ORIGINALS}/{what.name}.png"
+        write_png(what.out / name, to_working_size(photo, None, FULL_SIZE)[0])
+    return name
+
+
+def keep_full_mask(what: Conversion, mask: Bytes) -> str:
+    """Write a mask (h, w) at the size of the photo; the name of its file."""
+    name = f"{FULL_MASKS}/{what.name}.png"
+    write_png(what.out / name, mask)
+    return name
+
+
+def halve(out: Path, entry: dict[str, Any]) -> None:
+    """Rewrite a working photo and its mask at half the size, remove what is larger, and update `entry`."""
+    bgr: Any = cv2.imread(str(out / entry["file"]), cv2.IMREAD_COLOR)
+    full = np.ascontiguousarray(bgr[..., ::-1])
+    mask: Any = None if entry["mask"] is None else cv2.imread(str(out / entry["mask"]), cv2.IMREAD_GRAYSCALE)
+    before = max(entry["width"], entry["height"])
+    rgb, mask = to_working_size(RawPhoto(full, None, 1, {}), mask, before // 2)
+    write_png(out / entry["file"], rgb)
+    entry["digest"] = blake3((out / entry["file"]).read_bytes()).hexdigest()
+    for larger in ("original", "full_mask"):
+        if entry[larger] is not None:
+            (out / entry[larger]).unlink()
+            entry[larger] = None
+    if mask is not None:
+        write_png(out / entry["mask"], mask)
+    entry["height"], entry["width"] = rgb.shape[:2]
+    if entry["focal_px"] is not None:
+        entry["focal_px"] *= max(rgb.shape[:2]) / before

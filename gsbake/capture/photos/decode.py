@@ -10,7 +10,7 @@ cell measures.
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -33,8 +33,11 @@ Floats = NDArray[np.float32]
 
 #: Default of `ingest.max_megapixels`.
 MAX_MEGAPIXELS = 250.0
-#: Bytes per pixel of the conversion to linear colours and their filter.
-CONVERSION_BYTES = 36
+#: Bytes per pixel of the conversion of colours that are not 8-bit, of that from another profile, and of the filter per pixel of its result
+#: and of the rows between its two passes.
+CONVERSION_BYTES, PROFILE_BYTES, RESULT_BYTES, ROW_BYTES = 36, 12, 40, 16
+#: Rows that are converted to linear colours at once.
+_BLOCK_ROWS = 64
 #: Largest edge in pixels and most channels of an image that is decoded at all.
 _MAX_EDGE, _MAX_CHANNELS = 100_000, 16
 #: Alpha (of 255) below which the colour of a pixel is undefined.
@@ -94,10 +97,12 @@ class ImageHeader:
         """Pixels in millions."""
         return self.width * self.height / 1e6
 
-    @property
-    def needed_bytes(self) -> int:
-        """Bytes that decoding and conversion hold at once: the pixels and a copy, and the colours in single precision twice."""
-        return self.width * self.height * (2 * self.channels * self.sample_bytes + CONVERSION_BYTES)
+    def needed_bytes(self, max_size: int) -> int:
+        """Bytes that decoding and reduction to `max_size` hold at once: the pixels and a copy, and what converts their colours."""
+        width, height = working_size(self.width, self.height, max_size)
+        filtered = 0 if width == self.width else ROW_BYTES * width * self.height + RESULT_BYTES * width * height
+        each = 2 * self.channels * self.sample_bytes + (PROFILE_BYTES if self.sample_bytes == 1 else CONVERSION_BYTES)
+        return self.width * self.height * each + filtered
 
 
 @contextmanager
@@ -231,7 +236,8 @@ def _read_photo(path: Path, max_megapixels: float) -> RawPhoto:
         raise UnreadablePhotoError("it has no colour channels")
     if all(n in names for n in "RGB"):
         colour_at = [names.index(n) for n in "RGB"]
-    colour = pixels[..., colour_at[:3] if len(colour_at) >= 3 else [colour_at[0]] * 3]
+    colour_at = colour_at[:3] if len(colour_at) >= 3 else [colour_at[0]] * 3
+    colour = pixels[..., :3] if colour_at == [0, 1, 2] else pixels[..., colour_at]
     alpha = None if alpha_at < 0 else pixels[..., alpha_at]
     if pixels.dtype == np.float32:
         if not np.isfinite(colour).all():
@@ -285,25 +291,40 @@ def to_working_size(photo: RawPhoto, mask: Bytes | None, max_size: int) -> tuple
     """
     size = working_size(photo.width, photo.height, max_size)
     reduced = size != (photo.width, photo.height)
-    pixels = photo.pixels
+    pixels: Any = photo.pixels
     weight = photo.alpha
     if reduced:
-        linear: Any = decode_bytes(np.asarray(pixels, np.uint8)) if pixels.dtype == np.uint8 else pixels
-        if weight is not None:
-            alpha = weight.astype(np.float32)[..., None] / 255
+        alpha: Any = None if weight is None else weight.astype(np.float32)[..., None] / 255
+
+        def linear_rows(rows: slice) -> Any:
+            linear = decode_bytes(pixels[rows]) if pixels.dtype == np.uint8 else pixels[rows]
+            return linear if alpha is None else linear * alpha[rows]
+
+        linear = _area_mean(linear_rows, photo.height, size)
+        if alpha is not None:
             reduced_alpha = cv2.resize(alpha, size, interpolation=cv2.INTER_AREA)[..., None]
-            linear = cv2.resize(linear * alpha, size, interpolation=cv2.INTER_AREA) / np.maximum(reduced_alpha, 1e-4)
+            linear = linear / np.maximum(reduced_alpha, 1e-4)
             weight = np.rint(reduced_alpha[..., 0] * 255).astype(np.uint8)
-        else:
-            linear = cv2.resize(linear, size, interpolation=cv2.INTER_AREA)
         rgb = encode_bytes(linear)
+    elif pixels.dtype == np.uint8:
+        rgb = np.asarray(pixels)
     else:
-        rgb = np.asarray(pixels) if pixels.dtype == np.uint8 else encode_bytes(pixels)
+        rgb = np.concatenate([encode_bytes(pixels[rows]) for rows in _row_blocks(photo.height)])
     if weight is not None:
         rgb = fill_transparent(rgb, weight)
     if mask is not None and reduced:
         mask = np.asarray(cv2.resize(mask, size, interpolation=cv2.INTER_AREA), np.uint8)
     return np.ascontiguousarray(rgb, np.uint8), None if mask is None else np.ascontiguousarray(mask, np.uint8)
+
+
+def _area_mean(rows_of: Callable[[slice], Any], height: int, size: tuple[int, int]) -> Floats:
+    """The area filter's reduction to `size` (width, height) of an image whose rows `rows_of` gives in single precision, block by block."""
+    rows = [cv2.resize(block, (size[0], len(block)), interpolation=cv2.INTER_AREA) for block in map(rows_of, _row_blocks(height))]
+    return np.asarray(cv2.resize(np.concatenate(rows), size, interpolation=cv2.INTER_AREA), np.float32)
+
+
+def _row_blocks(height: int) -> Iterator[slice]:
+    return (slice(start, min(start + _BLOCK_ROWS, height)) for start in range(0, height, _BLOCK_ROWS))
 
 
 def fill_transparent(rgb: Bytes, alpha: Bytes) -> Bytes:

@@ -7,6 +7,8 @@ from outside or takes too long says nothing about the photo: the run is interrup
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future
 from dataclasses import replace
 from queue import SimpleQueue
 from typing import Any
@@ -25,7 +27,7 @@ READER = "gsbake.capture.photos.reader_process"
 #: Seconds that a photo may take: at least, and per byte that it needs (a hundred megabytes a second). Far above any measured time.
 MIN_SECONDS, SECONDS_PER_BYTE = 300.0, 1e-8
 #: Threads of the libraries in a child; the pool runs in parallel instead.
-_ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OPENIMAGEIO_THREADS"), "1")
+ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OPENIMAGEIO_THREADS"), "1")
 
 
 class ReaderPool:
@@ -33,7 +35,7 @@ class ReaderPool:
 
     def __init__(self, count: int, budget: MemoryBudget | None = None) -> None:
         self._budget = budget or MemoryBudget()
-        self._all = [ParserProcess(READER, _ONE_THREAD) for _ in range(count)]
+        self._all = [ParserProcess(READER, ONE_THREAD) for _ in range(count)]
         self._idle: SimpleQueue[ParserProcess] = SimpleQueue()
         for process in self._all:
             self._idle.put(process)
@@ -88,3 +90,15 @@ class ReaderPool:
         if "os_error" in found:
             raise OSError(*found["os_error"])
         return found
+
+
+def submit_bounded(
+    submit: Callable[[str], Future[ConvertedPhoto]], items: list[str], limit: int
+) -> Iterator[tuple[str, Future[ConvertedPhoto]]]:
+    """Submit items in order with at most `limit` pending, which bounds memory; yields them in order."""
+    pending: list[tuple[str, Future[ConvertedPhoto]]] = []
+    for item in items:
+        pending.append((item, submit(item)))
+        if len(pending) >= limit:
+            yield pending.pop(0)
+    yield from pending

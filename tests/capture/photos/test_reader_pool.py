@@ -14,7 +14,7 @@ import numpy as np
 import psutil
 import pytest
 
-from gsbake.capture.ingest import IngestOptions, ingest
+from gsbake.capture.ingest import SUBFOLDERS, IngestOptions, ingest
 from gsbake.capture.photos import reader_pool
 from gsbake.capture.photos.conversion import Conversion, convert
 from gsbake.capture.photos.decode import UnreadablePhotoError
@@ -33,7 +33,7 @@ def photo(path: Path, seed: int, size: tuple[int, int] = (48, 64)) -> Path:
 
 
 def conversion(path: Path, out: Path, mask: Path | None = None) -> Conversion:
-    for sub in ("photos", "masks"):
+    for sub in SUBFOLDERS:
         (out / sub).mkdir(parents=True, exist_ok=True)
     return Conversion(path, path.name, path.stem, out, True, mask, False, 40, 250.0)
 
@@ -54,7 +54,8 @@ def test_a_process_gives_what_a_call_gives(tmp_path: Path) -> None:
         assert here == there
     for file in (tmp_path / "here").rglob("*.png"):
         assert file.read_bytes() == (tmp_path / "there" / file.relative_to(tmp_path / "here")).read_bytes()
-    assert sorted(p.name for p in (tmp_path / "there").rglob("*.png")) == ["a.png", "c.png", "c.png"]
+    written = sorted(p.relative_to(tmp_path / "there").as_posix() for p in (tmp_path / "there").rglob("*.png"))
+    assert written == ["full_masks/c.png", "masks/c.png", "originals/a.png", "originals/c.png", "photos/a.png", "photos/c.png"]
 
 
 def what_happens(call: object) -> object:

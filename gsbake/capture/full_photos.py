@@ -1,0 +1,108 @@
+"""Posed photos at full size: the originals that the ingest stage kept, undistorted as the poses stage undistorted its working photos.
+
+A photo without an original (it is no larger than its working photo), and one whose working photo or camera was replaced by hand, is read as
+`PosedPhotos` reads it. So are reduced photos that are no larger than the working ones.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from gsbake.capture.photos.originals import Originals, file_digest
+from gsbake.capture.photos.undistortion import undistorted
+from gsbake.capture.posed_photos import DIGESTS, Bytes, PosedPhotos, View
+from gsbake.geometry.cameras import Camera, CameraSet
+
+#: Difference of a mask at full size, reduced, from the working mask (of 255) from which the working mask counts: it was changed there.
+_OTHER_MASK = 128
+
+
+class FullPhotos:
+    """Photos of the poses stage by index, with the cameras of `posed`, read from the originals of the ingest stage; a context manager that
+    ends the process that decodes."""
+
+    def __init__(self, ingest: Path, poses: Path, trained: Path | None = None) -> None:
+        """Open artifact folders of the ingest and the poses stage; `trained` as in `PosedPhotos.open`."""
+        self.posed = PosedPhotos.open(poses, trained)
+        self._originals = Originals(ingest)
+        self._lenses, self._pinholes = self._pairs(poses)
+
+    def __enter__(self) -> FullPhotos:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """End the process that decodes; a later call starts it again."""
+        self._originals.close()
+
+    def __len__(self) -> int:
+        return len(self.posed)
+
+    def _pairs(self, poses: Path) -> tuple[dict[str, Camera], dict[str, Camera]]:
+        """By name, the cameras of originals at full size: with their lens, and as the pinhole cameras in whose place training may have put
+        others."""
+        lens_file, digest_file = poses / "photo_cameras.json", poses / DIGESTS
+        if not (lens_file.exists() and digest_file.exists()):  # cameras that the user put in their place
+            return {}, {}
+        digests = json.loads(digest_file.read_text(encoding="utf-8"))
+        working = {camera.name: camera for camera in CameraSet.load(lens_file).cameras}
+        lenses, pinholes = {}, {}
+        for camera in CameraSet.load(poses / "cameras.json").cameras:
+            name = camera.name
+            photo = poses / "photos" / f"{name}.png"
+            if name not in working or not self._originals.has(name) or file_digest(photo) != digests.get(name):
+                continue
+            lens = working[name]
+            width, height = self._originals.size(name)
+            lenses[name] = lens.scaled(width, height)
+            pinholes[name] = camera.scaled(round(camera.width * width / lens.width), round(camera.height * height / lens.height))
+        return lenses, pinholes
+
+    def camera(self, index: int, max_size: int | None = None) -> Camera:
+        """Pinhole camera `index` of the photo at full size, or with the longer side at most `max_size` pixels."""
+        camera = self.posed.cameras.cameras[index]
+        pinhole = self._pinholes.get(camera.name)
+        full = camera if pinhole is None else camera.scaled(pinhole.width, pinhole.height)
+        return full if max_size is None else full.downscaled_to(max_size)
+
+    def view(self, index: int, max_size: int | None = None) -> View:
+        """Photo, mask and camera `index`, undistorted, the longer side at most `max_size` pixels (area filter in linear light).
+
+        Raises BadInputError when the original cannot be read, InterruptedRun when the process that decodes it is killed.
+        """
+        camera, working = self.camera(index, max_size), self.posed.cameras.cameras[index]
+        if max(camera.width, camera.height) <= max(working.width, working.height):
+            return self.posed.view(index, max_size)
+        lens, pinhole = self._lenses[camera.name], self._pinholes[camera.name]
+        share = max(camera.width / pinhole.width, camera.height / pinhole.height)
+        lens = lens.downscaled_to(round(share * max(lens.width, lens.height)))
+        pinhole = pinhole.scaled(camera.width, camera.height)
+        rgb = self._originals.read(camera.name, max(lens.width, lens.height))
+        if lens.distortion or rgb.shape[:2] != (pinhole.height, pinhole.width):
+            rgb = undistorted(rgb, lens.scaled(rgb.shape[1], rgb.shape[0]), pinhole)
+        return View(camera, rgb, self._mask(index, lens, pinhole))
+
+    def _mask(self, index: int, lens: Camera, pinhole: Camera) -> Bytes | None:
+        """The mask at the size of `pinhole`: the given one where the working mask, which poses may have changed, agrees with it."""
+        _, working = self.posed.mask(index)
+        if working is None:
+            return None
+        size = pinhole.width, pinhole.height
+        enlarged = np.asarray(cv2.resize(working, size, interpolation=cv2.INTER_LINEAR), np.uint8)
+        full = self._originals.mask(pinhole.name, (lens.width, lens.height))
+        if full is None:
+            return enlarged
+        if lens.distortion or full.shape != (pinhole.height, pinhole.width):
+            full = undistorted(full, lens, pinhole, mask=True)
+        reduced = cv2.resize(full, working.shape[::-1], interpolation=cv2.INTER_AREA)
+        other = (cv2.absdiff(reduced, working) >= _OTHER_MASK).astype(np.uint8)
+        if not other.any():
+            return full
+        other = np.asarray(cv2.dilate(other, np.ones((3, 3), np.uint8)), np.uint8)  # with the pixels that the edge of the change shares
+        return np.asarray(np.where(cv2.resize(other, size, interpolation=cv2.INTER_NEAREST) > 0, enlarged, full), np.uint8)

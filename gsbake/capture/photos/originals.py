@@ -1,0 +1,84 @@
+"""The photos of a capture at full size, as the ingest stage kept them, before undistortion.
+
+A photo that is no larger than the working size has no original: its working photo is read. So is one whose working photo was replaced by
+hand, which the original does not show. Originals come from outside: they are decoded in a process of their own (`reader_process`).
+"""
+
+from __future__ import annotations
+
+import json
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from blake3 import blake3
+
+from gsbake.capture.photos.conversion import FULL_SIZE
+from gsbake.capture.photos.decode import Bytes, working_size
+from gsbake.capture.photos.reader_pool import MIN_SECONDS, ONE_THREAD, READER, SECONDS_PER_BYTE
+from gsbake.imaging.png import read_grey
+from gsbake.limited_process import ParserProcess, read_in_child
+
+#: Bytes per pixel that the time limit of a photo is computed from.
+_BYTES = 36
+
+
+class Originals:
+    """Photos by name, from the artifact folder of the ingest stage; a context manager that ends the process that decodes."""
+
+    def __init__(self, ingest: Path) -> None:
+        self._ingest = ingest
+        entries: list[dict[str, Any]] = json.loads((ingest / "photos.json").read_text(encoding="utf-8"))["photos"]
+        self._entries = {entry["name"]: entry for entry in entries}
+        self._process = ParserProcess(READER, ONE_THREAD)
+
+    def __enter__(self) -> Originals:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """End the process that decodes; a later call starts it again."""
+        self._process.close()
+
+    def has(self, name: str) -> bool:
+        """Whether there is more of a photo than its working photo."""
+        entry = self._entries.get(name, {})
+        return bool(entry.get("original")) and file_digest(self._ingest / entry["file"]) == entry["digest"]
+
+    def size(self, name: str) -> tuple[int, int]:
+        """Width and height of a photo that has an original."""
+        entry = self._entries[name]
+        return working_size(entry["source_width"], entry["source_height"], FULL_SIZE)
+
+    def read(self, name: str, max_size: int = FULL_SIZE) -> Bytes:
+        """The photo (h, w, 3), upright, 8-bit sRGB, the longer side at most `max_size` pixels: area filter in linear light.
+
+        For one that has an original. Raises BadInputError when it cannot be read, InterruptedRun when its process is killed.
+        """
+        entry = self._entries[name]
+        pixels = entry["source_width"] * entry["source_height"]
+        with tempfile.TemporaryDirectory(prefix="gsbake-photo-") as folder:
+            out = Path(folder) / "pixels.npy"
+            request = {"task": "read", "path": str(self._ingest / entry["original"]), "name": entry["source"], "out": str(out)}
+            request |= {"max_size": max_size, "max_megapixels": pixels / 1e6}
+            seconds = MIN_SECONDS + SECONDS_PER_BYTE * _BYTES * pixels
+            read_in_child(self._process, request, seconds, f"The original of {entry['source']}")
+            return np.asarray(np.load(out), np.uint8)
+
+    def mask(self, name: str, size: tuple[int, int]) -> Bytes | None:
+        """The mask (h, w) that was given with a photo, at most of its full size, reduced to `size` (width, height) by an area filter; None
+        where there is none of more than the working size."""
+        entry = self._entries[name]
+        if entry["full_mask"] is None:
+            return None
+        mask = read_grey(self._ingest / entry["full_mask"])
+        return mask if mask.shape[::-1] == size else np.asarray(cv2.resize(mask, size, interpolation=cv2.INTER_AREA), np.uint8)
+
+
+def file_digest(path: Path) -> str:
+    """BLAKE3 digest of a working photo; none of one that is missing."""
+    return blake3(path.read_bytes()).hexdigest() if path.exists() else ""
