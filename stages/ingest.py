@@ -18,7 +18,7 @@ def run(ctx: Context) -> dict[str, Any]:
 
 STAGE = Stage(
     name="ingest",
-    version=7,
+    version=8,
     title="Photos",
     run=run,
     summary="{photos} photos, {masks} masks, {skipped} skipped",

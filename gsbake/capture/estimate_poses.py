@@ -120,7 +120,8 @@ class _Estimation:
         to_world = sphere.similarity()
         to_unit = to_world.inverse()
         origin = "given" if given else "solved"
-        cameras = [c.moved(to_unit) for c in pinholes]
+        flash = {entry["name"]: entry.get("flash") for entry in entries}
+        cameras = [replace(c.moved(to_unit), flash=flash[c.name]) for c in pinholes]
         cloud = None if points is None or len(points) < MIN_POINTS else to_unit.apply(points)
         if cloud is not None:
             write_cloud(self.out / "points.ply", cloud, colours if colours is not None else cloud * 0)

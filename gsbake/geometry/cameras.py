@@ -61,7 +61,8 @@ class Similarity:
 
 @dataclass(frozen=True)
 class Camera:
-    """Camera of one photo; `distortion` is OpenCV coefficients (k1, k2, p1, p2[, k3…]), empty for a pinhole."""
+    """Camera of one photo; `distortion` is OpenCV coefficients (k1, k2, p1, p2[, k3…]), empty for a pinhole; `flash`, whether its flash
+    fired, None where that is not known."""
 
     name: str
     width: int
@@ -73,6 +74,7 @@ class Camera:
     R: Array
     t: Array
     distortion: tuple[float, ...] = ()
+    flash: bool | None = None
 
     @property
     def centre(self) -> Array:
@@ -168,7 +170,7 @@ class CameraSet:
                 "translation": self.to_world.translation.tolist(),
             },
             "cameras": [
-                {k: getattr(c, k) for k in ("name", "width", "height", "fx", "fy", "cx", "cy")}
+                {k: getattr(c, k) for k in ("name", "width", "height", "fx", "fy", "cx", "cy", "flash")}
                 | {"R": c.R.tolist(), "t": c.t.tolist(), "distortion": list(c.distortion)}
                 for c in self.cameras
             ],
@@ -187,6 +189,7 @@ class CameraSet:
                     R=np.array(c["R"], float),
                     t=np.array(c["t"], float),
                     distortion=tuple(c["distortion"]),
+                    flash=c.get("flash"),
                 )
                 for c in body["cameras"]
             ),

@@ -131,7 +131,7 @@ def fit_materials(
         motion, motions = _light_motions(cameras, bake.light_motion, monitor)
         scene = Scene(
             Priors.of(bake), bake.fit_iterations, settings.light_size, seed, diffuse, settings.without, progress,
-            motions=motions, decide=monitor.decide, finer=Finer(level, half),
+            motions=motions, flash=all(camera.flash for camera in cameras), decide=monitor.decide, finer=Finer(level, half),
             target=Target(surface, texture, projected.values, read.cameras, skip),
         )  # fmt: skip
         started = time.perf_counter()
@@ -217,6 +217,9 @@ def _light_motions(cameras: list[Camera], asked: str, monitor: Monitor) -> tuple
         if share < MIN_TURNTABLE_SHARE:  # photos of a plain round object fit a light that turns too, by their noise
             del under["turntable"]
             monitor.decide("turntable", "none", f"{share:.0%} of the cameras stand on exact circles; {MIN_TURNTABLE_SHARE:.0%} are needed")
+        if "camera" in under and all(camera.flash is False for camera in cameras):
+            del under["camera"]
+            monitor.decide("flash", "none", f"EXIF says of all {len(cameras)} photos that it did not fire")
         return LightMotion(), {"static": None, **under}
     found = next((motion for motion in under if motion == asked), None)
     if asked != "static" and found is None:

@@ -73,8 +73,8 @@ class Scene:
 
     `iterations` of one candidate in all; `light_size`, edge of the environment map's faces in texels; `diffuse`: without specular
     reflection; `without`, names of passes that are left out; `random` decides which texels searches look at. `motions`, the ways in
-    which the light may move with its rotations (photos, 3, 3); `decide` reports a decision: what, the choice, the evidence. The fit goes on
-    from its level to the `finer` one, and from there to the `target`.
+    which the light may move with its rotations (photos, 3, 3); whether a `flash` fired in all photos; `decide` reports a decision: what,
+    the choice, the evidence. The fit goes on from its level to the `finer` one, and from there to the `target`.
     """
 
     priors: Priors
@@ -85,6 +85,7 @@ class Scene:
     without: frozenset[str] = frozenset()
     progress: Progress = _silent
     motions: Mapping[Motion, NDArray[np.float64] | None] = field(default_factory=dict)
+    flash: bool = False
     decide: Callable[[str, str, str], None] = _undecided
     finer: Finer | None = None
     target: Target | None = None

@@ -144,6 +144,18 @@ def test_mask_of_the_stored_photo_is_rotated_with_it(tmp_path: Path, runner: Run
     assert written is not None and written.shape == (64, 48) and written[:8].min() == 255 and written[8:].max() == 0
 
 
+def test_whether_a_flash_fired(tmp_path: Path, runner: Runner) -> None:
+    """Bit 0 of the tag says so; the others tell how it was set."""
+    folder = photos(tmp_path / "images", 3)
+    for name, value in (("fired", 0x19), ("off", 0x10), ("auto", 0)):
+        exif = Image.Exif()
+        exif.get_ifd(0x8769)[0x9209] = value
+        Image.fromarray(picture(value)).save(folder / f"{name}.jpg", exif=exif)
+    _, done = runner.ingest(tmp_path)
+    found = {e["name"]: e["flash"] for e in json.loads((done.out / "photos.json").read_text(encoding="utf-8"))["photos"]}
+    assert found == {"fired": True, "off": False, "auto": False, "p0": None, "p1": None, "p2": None}
+
+
 def test_photos_of_equal_names(tmp_path: Path, runner: Runner) -> None:
     folder = photos(tmp_path / "images")
     Image.fromarray(picture(7)).save(folder / "p0.jpg")

@@ -170,10 +170,14 @@ def test_only_the_region_is_kept(tmp_path: Path, runner: Runner, masked: bool) -
 def test_given_poses_keep_their_frame_and_points_are_triangulated(tmp_path: Path, runner: Runner) -> None:
     true = board_capture(tmp_path / "cap")
     transforms(tmp_path / "cap", true)
-    runner.ingest(tmp_path / "cap", max_size=160)
+    _, ingested = runner.ingest(tmp_path / "cap", max_size=160)
+    listing = json.loads((ingested.out / "photos.json").read_text(encoding="utf-8"))
+    listing["photos"][0]["flash"], listing["photos"][2]["flash"] = True, False
+    (ingested.out / "photos.json").write_text(json.dumps(listing), encoding="utf-8")
     results, done = runner.poses(max_features=2000)
     assert done.line("pose source") == "given (given for 8 of 8 photos)"
     posed = PosedPhotos.open(done.out)
+    assert [camera.flash for camera in posed.cameras.cameras] == [True, None, False] + [None] * 5
     world = posed.cameras.to_world
     for camera, wanted in zip(posed.cameras.cameras, true, strict=True):
         back = camera.moved(world)

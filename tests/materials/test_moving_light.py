@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from gsbake.imaging.srgb import encode
+from gsbake.materials import starts
 from gsbake.materials.fitting import _light_motions
 from gsbake.materials.passes import Scene
 from gsbake.materials.photo import Photo
@@ -80,6 +81,30 @@ def test_a_turn_is_tried_only_where_cameras_stand_on_circles() -> None:
         motion, choices = _light_motions([look_at(eye, (0, 0, rng.uniform(-spread, spread))) for eye in eyes], "auto", recorder)
         assert motion.motion == "static" and ("turntable" in choices) == turns and "camera" in choices
         assert ("turntable" in recorder.decisions) != turns
+
+
+@pytest.mark.parametrize(
+    ("flash", "tried"), [([False] * 9, False), ([False] * 8 + [True], True), ([False] * 8 + [None], True), ([True] * 9, True)]
+)
+def test_a_light_on_the_camera_is_not_tried_where_no_flash_fired(flash: list[bool | None], tried: bool) -> None:
+    recorder = Recorder()
+    posed = [replace(camera, flash=fired) for camera, fired in zip(cameras(9), flash, strict=True)]
+    _, choices = _light_motions(posed, "auto", recorder)
+    assert ("camera" in choices) == tried != ("flash" in recorder.decisions)
+    asked, _ = _light_motions(posed, "camera", recorder)  # a lamp beside the lens is not in EXIF
+    assert asked.motion == "camera"
+
+
+@pytest.mark.parametrize(("flash", "found"), [(False, "static"), (True, "camera")])
+def test_a_flash_that_fired_needs_less_evidence(monkeypatch: pytest.MonkeyPatch, flash: bool, found: Motion) -> None:
+    """The light on the camera explains validation photos 15 % better."""
+    start = Sphere(0.25, COUNT).start(0.5, held_out=2)
+    errors: dict[Motion, float] = {"static": 0.1, "camera": 0.085}
+    monkeypatch.setattr(
+        starts, "descend_all", lambda fits, *_: {motion: replace(fit, error=errors[motion]) for motion, fit in fits.items()}
+    )
+    scene = Scene(WEAK_PRIORS, 4, 16, motions={motion: light_rotations(cameras(COUNT), motion) for motion in errors}, flash=flash)
+    assert MotionComparison(MOTION_TRIAL).run(scene, start).light_motion.motion == found
 
 
 def best_motion(scene: Sphere) -> Motion:

@@ -1,4 +1,4 @@
-"""Focal length in pixels, and the position by satellite navigation, from EXIF (CIPA DC-008, "Exif 2.32").
+"""Focal length in pixels, the flash, and the position by satellite navigation, from EXIF (CIPA DC-008, "Exif 2.32").
 
 The focal length only initialises structure from motion: photos get cropped and resized without an update of their EXIF.
 """
@@ -82,6 +82,12 @@ def camera_body(tags: Mapping[str, Any]) -> str | None:
     """A digest of the body's serial number, which tells two of one model apart and names none; None where EXIF has no number."""
     serial = str(tags.get("Exif:BodySerialNumber", "")).strip(" \0")
     return blake3(serial.encode("utf-8", "surrogatepass")).hexdigest()[:12] if serial.strip("0") else None
+
+
+def flash_fired(tags: Mapping[str, Any]) -> bool | None:
+    """Whether the camera's flash fired (bit 0 of the tag); None where EXIF does not say."""
+    value = tags.get("Exif:Flash")
+    return bool(int(value) & 1) if isinstance(value, int | float) and 0 <= value < 1 << 16 else None
 
 
 def gps_position(tags: Mapping[str, Any]) -> tuple[float, float, float] | None:
