@@ -13,17 +13,15 @@ from gsbake.capture.posed_photos import PosedPhotos
 from gsbake.capture.view_dependence import is_diffuse
 from gsbake.config.schema import Bake
 from gsbake.geometry.cameras import Camera
-from gsbake.geometry.turntable import turntable_share
+from gsbake.materials.light_motions import light_motions
 from gsbake.materials.passes import Finer, Priors, Scene, Target, run_passes
 from gsbake.materials.photo import SURFACE_POINTS, MeshBrightness, Photo, PhotoReader, texel_weight
 from gsbake.materials.recipe import FIT, MAPS
-from gsbake.materials.starts import MOTIONS
 from gsbake.materials.state import Level, State
 from gsbake.materials.surface import InterpolatedTransport, Materials, Surface, neighbours
 from gsbake.materials.visibility import Visibility
 from gsbake.meshing.resolution import pixel_footprint
 from gsbake.monitor import Monitor, PartSequence, Rule, decide_skip, skips
-from gsbake.shading.light_motion import LightMotion, Motion, light_rotations
 from gsbake.texturing.normal_map import DenseSamples
 from gsbake.texturing.projection import ProjectedTexture
 from gsbake.texturing.resampling import MIN_SIZE, CoarseTexture
@@ -41,8 +39,6 @@ SMOOTHING_RADIUS = 3.0
 MAX_PIXELS = 60_000
 #: Least weight of a texel, in frontal views at a texel's size, for its normal to be refined and for it to count as observed.
 MIN_OBSERVATIONS = 0.3
-#: Share of the cameras that must stand on exact circles for the light to turn (.59 on a turntable, 0 on captures from hand).
-MIN_TURNTABLE_SHARE = 0.5
 
 
 @dataclass(frozen=True)
@@ -128,7 +124,7 @@ def fit_materials(
             return decide_skip(monitor, name, rule, holds, evidence, skipped, done)
 
         level = read.level(fine)
-        motion, motions = _light_motions(cameras, bake.light_motion, monitor)
+        motion, motions = light_motions(cameras, bake.light_motion, monitor)
         scene = Scene(
             Priors.of(bake), bake.fit_iterations, settings.light_size, seed, diffuse, settings.without, progress,
             motions=motions, flash=all(camera.flash for camera in cameras), decide=monitor.decide, finer=Finer(level, half),
@@ -206,27 +202,6 @@ def _coarse_level(fine: Level, surface: Surface, half: CoarseTexture, holdout: i
     added = set(held_out(len(photos), holdout)) if validation else set()
     kept = [p for i, p in enumerate(photos) if i not in added]
     return Level(surface, kept, validation + [photos[i] for i in sorted(added)])
-
-
-def _light_motions(cameras: list[Camera], asked: str, monitor: Monitor) -> tuple[LightMotion, dict[Motion, Doubles | None]]:
-    """How the light moves as `bake.light_motion` says, and where it does not, between which motions validation photos decide."""
-    motions: tuple[Motion, ...] = ("turntable", "camera")
-    under = {motion: rotations for motion in motions if (rotations := light_rotations(cameras, motion)) is not None}
-    if asked == "auto":
-        share = turntable_share(cameras) if "turntable" in under else 1.0
-        if share < MIN_TURNTABLE_SHARE:  # photos of a plain round object fit a light that turns too, by their noise
-            del under["turntable"]
-            monitor.decide("turntable", "none", f"{share:.0%} of the cameras stand on exact circles; {MIN_TURNTABLE_SHARE:.0%} are needed")
-        if "camera" in under and all(camera.flash is False for camera in cameras):
-            del under["camera"]
-            monitor.decide("flash", "none", f"EXIF says of all {len(cameras)} photos that it did not fire")
-        return LightMotion(), {"static": None, **under}
-    found = next((motion for motion in under if motion == asked), None)
-    if asked != "static" and found is None:
-        monitor.warn(f"bake.light_motion is {asked}, but the cameras do not turn about one axis; the light is taken to stand.")
-    motion = LightMotion() if found is None else LightMotion(found, under[found])
-    monitor.decide("light", MOTIONS[motion.motion], "bake.light_motion")
-    return motion, {}
 
 
 def _report(state: State, read: _Photos, specular: Rule, monitor: Monitor, saved: float) -> None:

@@ -66,6 +66,16 @@ def cameras(count: int, size: int = 48) -> list[Camera]:
     return out
 
 
+def rounds(count: int, size: int = 48) -> list[Camera]:
+    """Of a turntable: two heights of a camera that stands."""
+    out = []
+    for k in range(count):
+        turn, high = 2.4 * k, (0.5, -0.25)[k % 2]
+        centre = 4 * np.array([np.cos(turn) * np.cos(high), np.sin(turn) * np.cos(high), np.sin(high)])
+        out.append(look_at(centre, size=size, focal=1.7 * size, name=f"{k}"))
+    return out
+
+
 def room(directions: NDArray[np.float64]) -> NDArray[np.float64]:
     """Radiance of dim walls with one window and a small bright light."""
     window = np.exp(12 * (directions @ np.array([0.8, 0.0, 0.6]) - 1))
@@ -76,7 +86,8 @@ def room(directions: NDArray[np.float64]) -> NDArray[np.float64]:
 class Sphere:
     """A sphere of two base colours, or of a uniform distribution between them (`even`), with constant `roughness`, in `count` photos.
 
-    With `reference` the images are made by `tests.support.monte_carlo`; `motion` is that of the light. With `striped` only the second base
+    With `reference` the images are made by `tests.support.monte_carlo`; `motion` is that of the light, which shows before cameras that are
+    `posed` in rounds. With `striped` only the second base
     colour has the `metallic` given, the first is dielectric: `metallic` (n,) has the true values."""
 
     def __init__(
@@ -88,6 +99,7 @@ class Sphere:
         metallic: float = 0.0,
         motion: Motion = "static",
         striped: bool = False,
+        posed: Sequence[Camera] = (),
     ) -> None:
         mesh, uv = sphere()
         caster = RayCaster(mesh.vertices, mesh.faces, 1)
@@ -102,8 +114,9 @@ class Sphere:
         tables = EnvironmentLight.from_function(room, 16).prefilter()
         reader = PhotoReader(caster, uv, self.texels, self.normal, 2.0)
         self.photos: list[Photo] = []
-        turned = light_rotations(cameras(count), motion)
-        for k, camera in enumerate(cameras(count)):
+        self.posed = posed or cameras(count)
+        turned = light_rotations(self.posed, motion)
+        for k, camera in enumerate(self.posed):
             if turned is not None:
                 tables = EnvironmentLight.from_function(lambda d, turn=turned[k]: room(d @ turn.T), 16).prefilter()
             blank = reader.read(camera, np.zeros((camera.height, camera.width, 3), np.uint8), None, index=k)
