@@ -34,6 +34,7 @@ from gsbake.materials.passes import Pass, Priors, Scene, run_passes
 from gsbake.materials.photo import Photo
 from gsbake.materials.sparsity_prior import KERNEL_WIDTHS, common_materials
 from gsbake.materials.state import Level, State, copied
+from gsbake.shading.environment import EnvironmentLight
 from gsbake.shading.light_motion import rotated
 from gsbake.shading.light_tables import prefilter_cube_map
 from gsbake.shading.neutral_light import neutral_light_loss
@@ -68,8 +69,9 @@ class DescentOptions:
     light_final_rate: float = 0.03
     #: Adam's decay rates of the first and second moments; short, as a fit has a few hundred steps.
     betas: tuple[float, float] = (0.9, 0.99)
-    #: Adam's ε for texels and normals, a gradient of the loss per texel: texels that few pixels show take smaller steps.
+    #: Adam's ε for texels and normals, a gradient of the loss per texel: texels that few pixels show take smaller steps; and for the light.
     epsilon: float = 2e-3
+    light_epsilon: float = 1e-8
     #: Factor on the reconstruction error against the priors.
     residual_weight: float = 1.5
     #: Pseudo-Huber scale in sRGB values (0..1): larger errors count linearly.
@@ -118,7 +120,7 @@ def descend(scene: Scene, state: State, plan: Steps, each: Each, steps: int | No
         decay, light_decay = (plan.rate * final ** (step / total) for final in (o.final_rate, o.light_final_rate))
         work.step(photos[order.pop()], decay, light_decay, plan.normals)
         each(step + 1, total)
-    return work.finished()
+    return work.state
 
 
 class _Work:
@@ -133,28 +135,10 @@ class _Work:
         moments = (state.moments[0].copy(), state.moments[1].copy())
         self.state = replace(state, values=state.values.copy(), logits=state.logits.copy(), moments=moments)
         self._weights = _weights(state.level, priors)
-        self._start_light()
-
-    def _start_light(self) -> None:
-        """Give the present light to an optimiser of its own."""
-        light = copied(self.state.light)
-        self._adam = torch.optim.Adam([light.raw], lr=OPTIONS.light_rate, betas=OPTIONS.betas)
-        if self.state.light_moments is not None:
-            first, second, steps = (moment.clone() for moment in self.state.light_moments)
-            self._adam.state[light.raw] = {"step": steps, "exp_avg": first, "exp_avg_sq": second}
-        self.state = replace(self.state, light=light)
 
     def resume(self, state: State) -> None:
         """Go on from a `state` that a search has made of the present one."""
-        light, self.state = self.state.light, state
-        if state.light is not light:
-            self._start_light()
-
-    def finished(self) -> State:
-        """The state after the last step."""
-        found = self._adam.state.get(self.state.light.raw)
-        moments = (found["exp_avg"], found["exp_avg_sq"], found["step"]) if found else None
-        return replace(self.state, light_moments=moments)
+        self.state = state
 
     def update_transport(self) -> None:
         """Visibility, indirect light and reflections of the present state; the residual of older ones counts less."""
@@ -170,17 +154,27 @@ class _Work:
         if self._given is not None:
             self._differentiate(photo, self._given.tables(photo.to_light))
         else:
-            radiance = self.state.light.radiance()
+            light = copied(self.state.light)
+            radiance = light.radiance()
             tables = prefilter_cube_map(rotated(radiance, photo.to_light))
             self._differentiate(photo, KernelTables.of(tables))
             loss = (tables.table * torch.from_numpy(self._shade.table.sum(0))).sum()
             if self._priors.neutral_light:
                 loss = loss + len(self.state.values) * self._priors.neutral_light * neutral_light_loss(radiance)
-            self._adam.zero_grad()
-            loss.backward()
-            self._adam.param_groups[0]["lr"] = OPTIONS.light_rate * light_decay
-            self._adam.step()
+            self._step_light(light, loss, light_decay)
         self._step_texels(decay, normals)
+
+    def _step_light(self, light: EnvironmentLight, loss: torch.Tensor, decay: float) -> None:
+        """One step of Adam on the `light`, a copy of the present one. PyTorch's own takes a second to import."""
+        o, (beta1, beta2) = OPTIONS, OPTIONS.betas
+        (gradient,) = torch.autograd.grad(loss, light.raw)
+        zero = torch.zeros_like(gradient)
+        first, second, count = self.state.light_moments or (zero, zero, 0)
+        first, second, count = first.lerp(gradient, 1 - beta1), second.lerp(gradient.square(), 1 - beta2), count + 1
+        with torch.no_grad():
+            root = (second / (1 - beta2**count)).sqrt_().add_(o.light_epsilon)
+            light.raw.addcdiv_(first, root, value=-o.light_rate * decay / (1 - beta1**count))
+        self.state = replace(self.state, light=light, light_moments=(first, second, count))
 
     def _differentiate(self, photo: Photo, tables: KernelTables) -> None:
         """Shade the pixels of a photo, leave the gradients in the buffers and add to the sums of the residual."""

@@ -102,7 +102,7 @@ class State:
     steps: int
     transport: Records
     light: EnvironmentLight
-    light_moments: tuple[torch.Tensor, torch.Tensor, torch.Tensor] | None = None
+    light_moments: tuple[torch.Tensor, torch.Tensor, int] | None = None
     from_metal: bool = False
     light_given: bool = False
     adjustments: tuple[LightAdjustment, ...] = ()
