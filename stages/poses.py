@@ -27,7 +27,7 @@ KERNELS = (
 
 STAGE = Stage(
     name="poses",
-    version=16,
+    version=17,
     title="Camera poses",
     run=run,
     summary="{registered} photos registered, {points} tie points, {reprojection_px:px} reprojection error",
