@@ -36,7 +36,7 @@ from gsbake.materials.sparsity_prior import KERNEL_WIDTHS, common_materials
 from gsbake.materials.state import Level, State, copied
 from gsbake.shading.environment import EnvironmentLight
 from gsbake.shading.light_motion import rotated
-from gsbake.shading.light_tables import prefilter_cube_map
+from gsbake.shading.light_tables import LightTables, prefilter_cube_map
 from gsbake.shading.neutral_light import neutral_light_loss
 
 Floats = NDArray[np.float32]
@@ -46,7 +46,8 @@ Floats = NDArray[np.float32]
 class Steps:
     """A run of gradient steps: a `share` of the iterations, with `rate` as a factor on all learning rates and the `passes` made on the way.
 
-    Without `normals` normal offsets stay, without `sparsity` that prior is off.
+    Without `normals` normal offsets stay, without `sparsity` that prior is off. A light that stands takes a step for
+    `photos_per_light` photos together.
     """
 
     share: float
@@ -54,6 +55,7 @@ class Steps:
     normals: bool = False
     sparsity: bool = True
     passes: tuple[Pass, ...] = ()
+    photos_per_light: int = 1
 
 
 @dataclass(frozen=True)
@@ -103,7 +105,7 @@ def descend(scene: Scene, state: State, plan: Steps, each: Each, steps: int | No
     if not photos or not total:
         return state
     scene = replace(scene, random=np.random.default_rng(scene.seed))
-    work = _Work(state, scene.priors)
+    work = _Work(state, scene.priors, plan.photos_per_light)
     order: list[int] = []
     for step in range(total):
         due = [one for one in plan.passes if step in {int(share * total) for share in one.at}]
@@ -123,10 +125,37 @@ def descend(scene: Scene, state: State, plan: Steps, each: Each, steps: int | No
     return work.state
 
 
+class _Lit:
+    """A copy of a `light`, and the gradients of `photos` photos."""
+
+    def __init__(self, light: EnvironmentLight) -> None:
+        self.light, self.photos = copied(light), 0
+        self._radiance, self._loss = self.light.radiance(), torch.zeros(())
+        self._still: LightTables | None = None
+
+    def tables(self, to_light: NDArray[np.float64] | None) -> LightTables:
+        """The tables that a photo sees under the rotation `to_light` (3, 3), differentiable; None: the light stands."""
+        if to_light is not None:
+            return prefilter_cube_map(rotated(self._radiance, to_light))
+        self._still = self._still or prefilter_cube_map(self._radiance)
+        return self._still
+
+    def add(self, tables: LightTables, gradient: Floats) -> None:
+        """Add a photo's `gradient` (rows, 3) of its tables."""
+        self._loss, self.photos = self._loss + (tables.table * torch.from_numpy(gradient)).sum(), self.photos + 1
+
+    def gradient(self, neutral: float) -> torch.Tensor:
+        """The gradient of the light's parameter, with the prior of `neutral` light for each photo."""
+        loss = self._loss + self.photos * neutral * neutral_light_loss(self._radiance) if neutral else self._loss
+        return torch.autograd.grad(loss, self.light.raw)[0]
+
+
 class _Work:
     """Arrays that change from step to step, and the `state` that they make up."""
 
-    def __init__(self, state: State, priors: Priors) -> None:
+    def __init__(self, state: State, priors: Priors, interval: int) -> None:
+        self._lit: _Lit | None = None
+        self._interval = 1 if state.level.moving else interval
         self._priors, n = priors, len(state.values)
         self._shade, self._spare = ShadingStep(n), np.empty_like(state.values)
         self._common = np.zeros((0, 4), np.float32)
@@ -138,6 +167,8 @@ class _Work:
 
     def resume(self, state: State) -> None:
         """Go on from a `state` that a search has made of the present one."""
+        if state.light is not self.state.light:
+            self._lit = None
         self.state = state
 
     def update_transport(self) -> None:
@@ -154,27 +185,25 @@ class _Work:
         if self._given is not None:
             self._differentiate(photo, self._given.tables(photo.to_light))
         else:
-            light = copied(self.state.light)
-            radiance = light.radiance()
-            tables = prefilter_cube_map(rotated(radiance, photo.to_light))
+            self._lit = self._lit or _Lit(self.state.light)
+            tables = self._lit.tables(photo.to_light)
             self._differentiate(photo, KernelTables.of(tables))
-            loss = (tables.table * torch.from_numpy(self._shade.table.sum(0))).sum()
-            if self._priors.neutral_light:
-                loss = loss + len(self.state.values) * self._priors.neutral_light * neutral_light_loss(radiance)
-            self._step_light(light, loss, light_decay)
+            self._lit.add(tables, self._shade.table.sum(0))
+            if self._lit.photos == self._interval:
+                self._step_light(self._lit, light_decay)
         self._step_texels(decay, normals)
 
-    def _step_light(self, light: EnvironmentLight, loss: torch.Tensor, decay: float) -> None:
-        """One step of Adam on the `light`, a copy of the present one. PyTorch's own takes a second to import."""
+    def _step_light(self, lit: _Lit, decay: float) -> None:
+        """One step of Adam on the light, from the gradients of the photos since the last one. PyTorch's own takes a second to import."""
         o, (beta1, beta2) = OPTIONS, OPTIONS.betas
-        (gradient,) = torch.autograd.grad(loss, light.raw)
+        gradient = lit.gradient(len(self.state.values) * self._priors.neutral_light)
         zero = torch.zeros_like(gradient)
         first, second, count = self.state.light_moments or (zero, zero, 0)
         first, second, count = first.lerp(gradient, 1 - beta1), second.lerp(gradient.square(), 1 - beta2), count + 1
         with torch.no_grad():
             root = (second / (1 - beta2**count)).sqrt_().add_(o.light_epsilon)
-            light.raw.addcdiv_(first, root, value=-o.light_rate * decay / (1 - beta1**count))
-        self.state = replace(self.state, light=light, light_moments=(first, second, count))
+            lit.light.raw.addcdiv_(first, root, value=-o.light_rate * decay / (1 - beta1**count))
+        self.state, self._lit = replace(self.state, light=lit.light, light_moments=(first, second, count)), None
 
     def _differentiate(self, photo: Photo, tables: KernelTables) -> None:
         """Shade the pixels of a photo, leave the gradients in the buffers and add to the sums of the residual."""
