@@ -53,7 +53,7 @@ def bake_on_true_mesh(run: Path, capture: Path, out: Path, profile: str = "relig
     for name in ("mesh.ply", "dense.ply"):
         write_mesh(mesh / name, vertices, np.asarray(faces).reshape(-1)[truth.faces])
     figures = bake_textures(ingest, poses, surfels, mesh, baked, BakeOptions.of(settings), monitor=_Printed())
-    export = ExportOptions(settings.export, settings.bake.materials, settings.bake.size, settings.scale)
+    export = ExportOptions(settings.export, settings.bake.materials, settings.scale)
     export_asset(ingest, poses, surfels, baked, out, export)
     return figures
 

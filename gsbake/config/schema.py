@@ -274,7 +274,7 @@ class Mesh(Section):
 class Bake(Section):
     """UV atlas, textures and materials."""
 
-    size: Literal[128, 256, 512, 1024, 2048, 4096] = Field(1024, description="Edge of the square textures in texels.")
+    size: Literal["auto", 128, 256, 512, 1024, 2048, 4096] = Field(1024, description="Edge of the square textures in texels. auto: 1024, and a base colour of up to 4096, as fine as the photos' pixels on the surface.")
     occlusion_rays: int = Field(64, ge=0, le=4096, description="Rays per texel for ambient occlusion; 0 is off.")
     visibility: Literal["none", "ambient", "directional", "bounce", "reflections"] = Field(
         "reflections", description="Light transport in the material fit, each with those before. none: unoccluded; ambient: ambient occlusion; directional: shadows; bounce: indirect diffuse light; reflections: specular reflections of the object itself."
@@ -291,6 +291,11 @@ class Bake(Section):
     sparsity: Weight = Field(0.03, description="Reflectance sparsity prior: an object has few materials. Scaled by the mean residual.")
     light_motion: Literal["auto", "static", "turntable", "camera"] = Field("auto", description="How the light moves, as the object sees it. static: it stands; turntable: the object was turned under it; camera: it is on the camera (flash); auto: what explains validation photos best.")
     default_roughness: Fraction = Field(0.8, description="Roughness where none is fitted (bake.materials = none or delight).")
+
+    @property
+    def map_size(self) -> int:
+        """Edge in texels of all maps but a base colour of automatic size."""
+        return 1024 if self.size == "auto" else self.size
 
 
 class Scale(Section):
@@ -309,7 +314,7 @@ class Export(Section):
     up_points: UpPoints = Field((), max_length=9, description="What is up, by points in the cameras' frame, before export.up: three points of the ground, or the lower and the upper end of an upright edge. --up takes them.")
     front: str = Field("", description="Photo that shows the front: the asset is turned about its up axis to face that camera. Empty: as the cameras' frame has it.")
     origin: Literal["auto", "bottom", "centre"] = Field("auto", description="Origin of the asset. bottom: the middle of its box's bottom; centre: the middle of its box; auto: that of given poses, else bottom.")
-    max_megabytes: float = Field(5.0, gt=0, le=4096, description="Maximum file size in MB: normal and material maps are reduced to meet it; the audit warns above it.")
+    max_megabytes: float = Field(0.0, ge=0, le=4096, description="Maximum file size in MB: normal and material maps are reduced to meet it; the audit warns above it. 0: 5 MB for textures of up to 1024² texels, above in proportion to the base colour's texels.")
     max_triangles: int = Field(100_000, ge=100, le=10_000_000, description="Maximum triangle count; the audit fails above it.")
     copyright: str = Field("", description="Copyright line of the asset.")
 

@@ -30,6 +30,8 @@ class PrecisionLevel:
     text: str
 
 
+#: Rows of a texture that are coded at once: in double precision a large one takes gigabytes.
+_ROWS = 256
 #: Tried in order until the asset fits.
 PRECISION_LEVELS = (
     PrecisionLevel(0, 0, 1, "full precision"),
@@ -38,9 +40,19 @@ PRECISION_LEVELS = (
 )
 
 
+#: Megabytes of an asset whose maps all have the same size, and at most per texel by which a base colour is finer, in a PNG file.
+USUAL_MEGABYTES, BYTES_PER_FINE_TEXEL = 5.0, 3
+
+
+def size_limit(megabytes: float, edge: int, map_edge: int) -> float:
+    """The size limit of an asset in megabytes: the one set, or if that is 0, what the `edge` of the base colour and that of the other
+    maps call for."""
+    return megabytes or USUAL_MEGABYTES + 1e-6 * BYTES_PER_FINE_TEXEL * max(0, edge**2 - map_edge**2)
+
+
 @dataclass(frozen=True)
 class TextureMaps:
-    """The 8-bit maps (s, s, 3): base colour and emission coded in sRGB, ORM and normal map linear.
+    """The 8-bit maps (s, s, 3): base colour and emission coded in sRGB, ORM and normal map linear; the base colour may be finer.
 
     When roughness and metallic are constant, they are stored in `factors`, and `orm` (s, s) is occlusion only.
     """
@@ -59,7 +71,9 @@ def quantise(base_color: NDArray[Any], orm: NDArray[Any], normal: NDArray[Any] |
     if (packed[..., 1:] == packed[0, 0, 1:]).all():
         factors = (round(float(orm[0, 0, 1]), 3), round(float(orm[0, 0, 2]), 3))
         packed = np.ascontiguousarray(packed[..., 0])
-    colour = encode_bytes(np.asarray(base_color, np.float64))
+    colour = np.empty(base_color.shape, np.uint8)
+    for row in range(0, len(colour), _ROWS):
+        colour[row : row + _ROWS] = encode_bytes(np.asarray(base_color[row : row + _ROWS], np.float64))
     return TextureMaps(colour, packed, None if normal is None else _to_8bit(normal), emission, factors)
 
 

@@ -20,7 +20,7 @@ from gsbake.geometry.cameras import CameraSet, Similarity
 from gsbake.geometry.raycast import RayCaster
 from gsbake.gltf.audit import as_json, audit, failed
 from gsbake.gltf.baked import load_mesh_arrays, mesh_in_frame, read_texture
-from gsbake.gltf.encode import TextureMaps, encode_within_budget, quantise
+from gsbake.gltf.encode import TextureMaps, encode_within_budget, quantise, size_limit
 from gsbake.gltf.frame import asset_frame, transforms_json
 from gsbake.gltf.write import GltfMesh, build_glb
 from gsbake.imaging.exr import write_hdr
@@ -40,11 +40,10 @@ PREVIEW_LEVEL = 6
 
 @dataclass(frozen=True)
 class ExportOptions:
-    """Settings of the export; `materials` and `texture_size` are settings of the bake that the asset's extras record."""
+    """Settings of the export; `materials` is a setting of the bake that the asset's extras record."""
 
     export: Export = Export()
     materials: str = "none"
-    texture_size: int = 1024
     scale: Scale = Scale()
 
 
@@ -88,7 +87,8 @@ def export_asset(
         normal, emissive = (read_texture(path) if path.exists() else None for path in (baked / "normal.exr", baked / "emissive.exr"))
         maps = quantise(read_texture(baked / "base_color.exr"), read_texture(baked / "orm.exr"), normal, emissive)
         geometry = sum(a.nbytes for a in (mesh.position, mesh.normal, mesh.tangent, mesh.uv, mesh.faces)) + 4096
-        images, level = encode_within_budget(maps, int(settings.max_megabytes * 1e6) - geometry)
+        limit = size_limit(settings.max_megabytes, len(maps.base_color), len(maps.orm))
+        images, level = encode_within_budget(maps, int(limit * 1e6) - geometry)
     monitor.check_stop()
     with monitor.part("write"):
         extras = _extras(options, cameras, mesh, maps, scale)
@@ -100,9 +100,9 @@ def export_asset(
     with monitor.part("previews"):
         _write_previews(out / "previews", maps, mesh)
     if level.text != "full precision":
-        monitor.decide("texture precision", level.text, f"the size limit is {settings.max_megabytes:g} MB (export.max_megabytes)")
+        monitor.decide("texture precision", level.text, f"the size limit is {limit:g} MB (export.max_megabytes)")
     with monitor.part("audit"):
-        passed, rules = _audit(data, out, settings, monitor)
+        passed, rules = _audit(data, out, limit, settings.max_triangles, monitor)
     return {
         "megabytes": len(data) / 1e6,
         "triangles": len(mesh.faces),
@@ -137,9 +137,9 @@ def _size(mesh: GltfMesh, scale: MetricScale) -> dict[str, Any]:
     return {"size_metres": [round(float(edge), 6) for edge in extent], "scale_relative_error": scale.relative_error}
 
 
-def _audit(data: bytes, out: Path, settings: Export, monitor: Monitor) -> tuple[int, int]:
+def _audit(data: bytes, out: Path, megabytes: float, triangles: int, monitor: Monitor) -> tuple[int, int]:
     """Audit the asset and write `audit.json`; returns the number of passed rules and of all rules."""
-    findings = audit(data, "asset.glb", settings.max_megabytes, settings.max_triangles)
+    findings = audit(data, "asset.glb", megabytes, triangles)
     (out / "audit.json").write_bytes(json.dumps(as_json(findings), indent=1).encode())
     for finding in findings:
         if not finding.passed and finding.severity == "warning":
@@ -163,7 +163,7 @@ def _extras(options: ExportOptions, cameras: CameraSet, mesh: GltfMesh, maps: Te
         return hasher.hexdigest(16)
 
     return {
-        "profile": {"materials": options.materials, "texture_size": options.texture_size, "normal_map": maps.normal is not None},
+        "profile": {"materials": options.materials, "texture_size": len(maps.base_color), "normal_map": maps.normal is not None},
         "scale": "metres" if cameras.metric else "unknown",
         **({} if scale is None else {"scale_relative_error": scale.relative_error}),
         "poses": cameras.poses,

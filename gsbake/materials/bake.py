@@ -24,6 +24,7 @@ from gsbake.meshing.repair import repair_foreign
 from gsbake.monitor import SILENT, Monitor, Rule, decide_skip
 from gsbake.text import number
 from gsbake.texturing.atlas import make_atlas
+from gsbake.texturing.fine_base_color import fine_base_color
 from gsbake.texturing.given_uvs import given_atlas, given_uvs
 from gsbake.texturing.inpainting import fill_empty_texels, inpaint_surface
 from gsbake.texturing.normal_map import DenseSamples, normal_map, sample_dense_mesh, vertex_normals
@@ -32,6 +33,7 @@ from gsbake.texturing.photo_projection import project_photos, project_surfel_mat
 from gsbake.texturing.projection import ProjectedTexture
 from gsbake.texturing.resampling import CoarseTexture
 from gsbake.texturing.skip_rules import normals_agree
+from gsbake.texturing.texture_size import texture_size
 from gsbake.texturing.unwrapped_mesh import UnwrappedMesh
 
 Floats = NDArray[np.float32]
@@ -147,9 +149,10 @@ class _Baking:
         coded = self._normal_map(surface, textures)
         with monitor.part("inpainting"):
             image, emissive = self._image(surface, textures.projected, occlusion, coded, faces, len(vertices))
+        colour = self._base_color(surface, image[..., :3], textures.projected.gains)
         with monitor.part("write"):
-            self._write(surface, textures.projected, detail, image, coded is not None, emissive)
-        return self._figures(surface, detail, textures)
+            self._write(surface, textures.projected, detail, image, colour, coded is not None, emissive)
+        return self._figures(surface, detail, textures, len(colour))
 
     def _read(self, name: str) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.float64] | None]:
         """Vertices, faces and texture coordinates of a PLY of the mesh stage."""
@@ -189,7 +192,7 @@ class _Baking:
 
     def _unwrap(self, vertices: NDArray[np.float64], faces: NDArray[np.int64], uv: NDArray[np.float64] | None) -> UnwrappedMesh:
         """The low-poly mesh with its texels, unwrapped into charts unless the UVs (f, 3, 2) of its corners are given."""
-        size = self.options.bake.size
+        size = self.options.bake.map_size
         with self.monitor.part("atlas"):
             self.monitor.progress(0, len(faces), "unwrapping")
             try:
@@ -295,8 +298,20 @@ class _Baking:
             values = np.concatenate([values, constant], 1)
         values = np.clip(values, 0, 1)
         parts = [values[:, :3], occlusion[:, None], values[:, 3:5], *([] if coded is None else [coded]), values[:, 5:]]
-        image = fill_empty_texels(texels.image(np.concatenate(parts, 1)), texels.covered(), gutter=max(2, settings.size // 256))
+        image = fill_empty_texels(texels.image(np.concatenate(parts, 1)), texels.covered(), gutter=max(2, settings.map_size // 256))
         return image, values.shape[1] == 8
+
+    def _base_color(self, surface: UnwrappedMesh, coarse: Floats, gains: Floats) -> Floats:
+        """The linear base colour: the `coarse` one (s, s, 3), or a finer one where its size is automatic and photos are finer."""
+        bake, monitor, photos = self.options.bake, self.monitor, self.photos
+        if bake.size != "auto" or bake.materials == "surfels":
+            return coarse
+        with monitor.part("base colour"):
+            chosen = texture_size([photos.camera(index) for index in range(len(photos))], surface)
+            monitor.decide("base colour", f"{chosen.size}² texels", chosen.evidence)
+            if chosen.size == surface.texels.size:
+                return coarse
+            return fine_base_color(surface, photos, coarse, chosen.size, gains, self.options.holdout, monitor)
 
     def _write(
         self,
@@ -304,11 +319,12 @@ class _Baking:
         projected: ProjectedTexture,
         detail: DenseSamples,
         image: Floats,
+        colour: Floats,
         normals: bool,
         emissive: bool,
     ) -> None:
         """Write the images, the coverage and the unwrapped mesh."""
-        write_exr(self.out / "base_color.exr", image[..., 0:3])
+        write_exr(self.out / "base_color.exr", colour)
         write_exr(self.out / "orm.exr", image[..., 3:6])
         if normals:
             write_exr(self.out / "normal.exr", image[..., 6:9])
@@ -322,7 +338,7 @@ class _Baking:
         body = {name: np.ascontiguousarray(array, np.float32) for name, array in arrays.items()}
         save_file(body | {"faces": np.ascontiguousarray(surface.atlas.faces, np.int32)}, self.out / "mesh.safetensors")
 
-    def _figures(self, surface: UnwrappedMesh, detail: DenseSamples, textures: Textures) -> dict[str, Any]:
+    def _figures(self, surface: UnwrappedMesh, detail: DenseSamples, textures: Textures, base_color: int) -> dict[str, Any]:
         """Results for the manifest; warns of unobserved surface."""
         projected = textures.projected
         unobserved = float(1 - projected.observed.mean())
@@ -332,6 +348,7 @@ class _Baking:
             "charts": surface.atlas.charts,
             "fill": surface.atlas.fill,
             "texels": len(surface.texels),
+            "base_color_size": base_color,
             "vertices": len(surface.position),
             "faces": len(surface.atlas.faces),
             "texel_edge": surface.texel_size,

@@ -209,14 +209,18 @@ class Renderer:
 
         uv, normal = interpolate(asset.uv), unit(interpolate(asset.normal))
         view = unit(-rays.astype(np.float32))
-        level = select_mip_level(camera, distance, self._density, asset.base_color.shape)
-        base = self._sample_texture("base_color", level, uv)
-        orm = self._sample_texture("orm", level, uv)
-        local = self._sample_texture("normal_map", level, uv)
+
+        def texture(name: str) -> Floats | None:
+            image: Floats | None = getattr(asset, name)
+            if image is None:
+                return None
+            return self._sample_texture(name, select_mip_level(camera, distance, self._density, image.shape), uv)
+
+        base, orm, local = texture("base_color"), texture("orm"), texture("normal_map")
         if local is not None and asset.tangent is not None:
             normal = tangent_space_normal(normal, interpolate(asset.tangent), local)
         if orm is None:
             orm = np.broadcast_to(np.array([1, 1, 0], np.float32), (len(face), 3))
         assert base is not None
-        position, emissive = interpolate(asset.position.astype(np.float32)), self._sample_texture("emissive", level, uv)
+        position, emissive = interpolate(asset.position.astype(np.float32)), texture("emissive")
         return Samples(position, normal, view, base, orm[:, 0], orm[:, 1], orm[:, 2], emissive)

@@ -94,13 +94,15 @@ def missed_panel(asset: Asset, coverage: Path) -> tuple[Panel, ...]:
         image = read_exr(coverage)
     except BadInputError:  # none, as for a file of the user's
         return ()
-    if image.shape[2] < 4 or image.shape[:2] != asset.base_color.shape[:2]:
+    (height, width), (rows, columns) = image.shape[:2], asset.base_color.shape[:2]
+    if image.shape[2] < 4 or (rows % height, columns % width) != (0, 0):  # the base colour may be finer than the other maps
         return ()
     inside, missed = image[..., 0] > 0.5, (image[..., 0] > 0.5) & (image[..., 3] < 0.5)
     share = missed.sum() / max(inside.sum(), 1)
     if share < MIN_MISSED:
         return ()
-    grey = np.repeat(encode(asset.base_color).mean(2, keepdims=True), 3, axis=2) * np.where(inside, 0.7, 0.3)[..., None]
+    reduced = cv2.resize(encode(asset.base_color).mean(2), (width, height), interpolation=cv2.INTER_AREA)
+    grey = np.repeat(reduced[..., None], 3, axis=2) * np.where(inside, 0.7, 0.3)[..., None]
     drawn = np.where(missed[..., None], np.array([0.9, 0.1, 0.1]), grey).astype(np.float32)
     caption = f"red: {share:.1%} of the texels, whose rays met no dense surface; they are flat"
     return (Panel("Missed rays", caption, image_uri(downsample(drawn))),)

@@ -20,6 +20,7 @@ from gsbake.geometry.ply import read_mesh
 from gsbake.gltf.audit import as_json, audit, failed
 from gsbake.gltf.baked import load_mesh_arrays, mesh_in_frame
 from gsbake.gltf.container import unpack_glb
+from gsbake.gltf.encode import size_limit
 from gsbake.gltf.frame import frame_between, read_transforms_json
 from gsbake.gltf.write import Geometry, GltfMesh, GltfTextures, Level, build_glb
 from gsbake.meshing.decimation import Deviation, surface_deviation
@@ -146,7 +147,8 @@ class _Builder:
     def budget(self, target: Target) -> tuple[float, int, Budget]:
         """Megabytes and triangles of a target, with its budget."""
         budget, export = BUDGETS[target.name], self.options.export
-        return budget.megabytes or export.max_megabytes, budget.triangles or export.max_triangles, budget
+        megabytes = budget.megabytes or size_limit(export.max_megabytes, min(self.maps.edge, budget.texture), self.maps.map_edge)
+        return megabytes, budget.triangles or export.max_triangles, budget
 
     # -- one target -----------------------------------------------------------------------------------------------------------------
 
@@ -306,7 +308,7 @@ class _Builder:
                 (folder / path.name).write_bytes(path.read_bytes())
                 names.append(f"{target.stem}/{path.name}")
         if self.maps.edge < BUDGETS["film"].texture:
-            evidence = "the bake has no more; bake.size = 4096 gives 4096² where photos have the detail"
+            evidence = "the bake has no more; bake.size = 4096 gives all maps 4096²"
             self.monitor.decide("film", f"{self.maps.edge}² texels", evidence)
         size = sum((self.out / name).stat().st_size for name in names)
         return {names[0]: {"target": target.text, "level": 0, "bytes": size, "texture_size": self.maps.edge, "parts": names[1:]}}

@@ -28,7 +28,10 @@ Floats = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class BakedMaps:
-    """Linear textures (s, s, 3) of the `mesh` that was baked: base colour, ORM, the coded normal map and emission, the last two or None."""
+    """Linear textures (s, s, 3) of the `mesh` that was baked: base colour, ORM, the coded normal map and emission, the last two or None.
+
+    The base colour may be finer than the others.
+    """
 
     mesh: GltfMesh
     base_color: Floats
@@ -44,8 +47,13 @@ class BakedMaps:
 
     @property
     def edge(self) -> int:
-        """Edge of the textures in texels."""
-        return int(self.base_color.shape[0])
+        """Edge of the base colour in texels."""
+        return len(self.base_color)
+
+    @property
+    def map_edge(self) -> int:
+        """Edge of the other textures in texels."""
+        return len(self.orm)
 
 
 class MapSource:
@@ -57,7 +65,8 @@ class MapSource:
         self.world_normals = cache(self._world_normals)
 
     def at(self, mesh: GltfMesh, edge: int) -> TextureMaps:
-        """The 8-bit maps for `mesh`, a decimated form of the baked one or itself, at an `edge` of at most the baked one."""
+        """The 8-bit maps for `mesh`, a decimated form of the baked one or itself, at an `edge` of at most the base colour's; other maps
+        are no larger than they were baked."""
         plain = self.plain(edge)
         if mesh is self.maps.mesh:
             return plain
@@ -70,8 +79,8 @@ class MapSource:
         return quantise(resized(maps.base_color, edge), resized(maps.orm, edge), normal, emissive)
 
     def _world_normals(self, edge: int) -> Floats:
-        """Unit normals (edge, edge, 3) in the asset's frame, continued beyond the charts as far as seams move."""
-        mesh, full = self.maps.mesh, self.maps.edge
+        """Unit normals (edge, edge, 3), at most as many as baked, in the asset's frame, continued beyond the charts as seams move."""
+        mesh, full = self.maps.mesh, self.maps.map_edge
         texels = rasterise(mesh.uv, mesh.faces, full)
         normal = texels.interpolate(mesh.normal, mesh.faces)
         if self.maps.normal is None:
@@ -84,6 +93,7 @@ class MapSource:
 
     def _normal_map(self, mesh: GltfMesh, edge: int) -> Bytes:
         """8-bit normal map of a decimated mesh."""
+        edge = min(edge, self.maps.map_edge)
         texels = rasterise(mesh.uv, mesh.faces, edge)
         normal, tangent = (texels.interpolate(values, mesh.faces) for values in (mesh.normal, mesh.tangent))
         local = world_to_frame(self.world_normals(edge).reshape(-1, 3)[texels.index], normal, tangent)
@@ -94,8 +104,8 @@ class MapSource:
 
 
 def resized(image: NDArray[Any], edge: int) -> Floats:
-    """A square image filtered to a smaller `edge`, by area."""
-    if image.shape[0] == edge:
+    """A square image filtered to a smaller `edge`, by area; unchanged where it is no larger."""
+    if image.shape[0] <= edge:
         return np.asarray(image, np.float32)
     return np.asarray(cv2.resize(np.asarray(image, np.float32), (edge, edge), interpolation=cv2.INTER_AREA), np.float32)
 

@@ -84,7 +84,7 @@ def baked_materials(maps: BakedMaps, points: Doubles) -> Doubles:
     """Linear base colour, roughness and metallic (n, 5) of the baked surface nearest to `points` (n, 3) in the asset's frame."""
     from scipy.spatial import cKDTree
 
-    edge = min(maps.edge, MAP_EDGE)
+    edge = min(maps.map_edge, MAP_EDGE)
     texels = rasterise(maps.mesh.uv, maps.mesh.faces, edge)
     nearest = cKDTree(texels.interpolate(maps.mesh.position, maps.mesh.faces)).query(points)[1]
     values = np.concatenate([resized(maps.base_color, edge), resized(maps.orm, edge)[..., 1:]], -1)

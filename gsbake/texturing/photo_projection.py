@@ -5,11 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gsbake.capture.exposure import TiePointExposure
 from gsbake.capture.full_photos import FullPhotos
 from gsbake.capture.photos.roles import held_out
 from gsbake.capture.posed_photos import PosedPhotos
+from gsbake.geometry.cameras import Camera
 from gsbake.imaging.srgb import decode_bytes
 from gsbake.monitor import Monitor, Rule, decide_skip
 from gsbake.surfels.renderer import SurfelRenderer
@@ -17,6 +19,8 @@ from gsbake.texturing.projection import ProjectedTexture, ProjectionBlender, mas
 from gsbake.texturing.skip_rules import constant_exposure
 from gsbake.texturing.unwrapped_mesh import UnwrappedMesh
 from gsbake.texturing.usable_pixels import UsablePixels
+
+Floats = NDArray[np.float32]
 
 #: Weight of held-out photos: they fill only what no other photo observed, so that validation figures stay unbiased.
 HELD_OUT_WEIGHT = 1e-4
@@ -26,27 +30,43 @@ MASK_MARGIN = 0.008
 MIN_ALPHA = 0.8
 
 
+class PhotoReader:
+    """Reads photos at the size that a texture needs, with the weights of their pixels.
+
+    `holdout` is that of training.
+    """
+
+    def __init__(self, photos: FullPhotos, holdout: int) -> None:
+        self._photos = photos
+        self._usable = UsablePixels(photos.posed)
+        self._held_out = set(held_out(len(photos), holdout))
+
+    def add(self, blender: ProjectionBlender, index: int) -> tuple[Camera, Floats]:
+        """Add photo `index` to `blender`; returns its camera and linear colours (h, w, 3)."""
+        working = self._photos.posed.cameras.cameras[index]
+        size = blender.useful_size(self._photos.camera(index))
+        view = self._photos.view(index, max(size, working.width, working.height))
+        linear = decode_bytes(view.rgb)
+        mask = self._usable.mask(index, view)
+        weights = None if mask is None else mask_weights(mask, MASK_MARGIN * max(view.camera.width, view.camera.height))
+        blender.add(view.camera, linear, weights, HELD_OUT_WEIGHT if index in self._held_out else 1.0)
+        return view.camera, linear
+
+
 def project_photos(surface: UnwrappedMesh, photos: FullPhotos, holdout: int, equalisation: Rule, monitor: Monitor) -> ProjectedTexture:
     """Linear colours (n, 3) of the texels, fused from the photos, each at a size at which its pixels are as fine as texels.
 
     `holdout` is that of training. `equalisation` is the rule of [skip] for dividing out exposure gains.
     """
     posed = photos.posed
-    held_out_views = set(held_out(len(posed), holdout))
     blender = ProjectionBlender(surface.texel_position, surface.texel_normal, surface.caster, 3, surface.texel_size)
-    usable, measured = UsablePixels(posed), equalisation != "skip"
+    reader, measured = PhotoReader(photos, holdout), equalisation != "skip"
     tie_points = TiePointExposure.from_model(posed.folder / "sparse", posed.cameras.to_world.inverse()) if measured else None
     for index in range(len(posed)):
         monitor.check_stop()
-        working = posed.cameras.cameras[index]
-        size = blender.useful_size(photos.camera(index))
-        view = photos.view(index, max(size, working.width, working.height))
-        linear = decode_bytes(view.rgb)
+        camera, linear = reader.add(blender, index)
         if tie_points is not None:
-            tie_points.add(view.camera, linear)
-        mask = usable.mask(index, view)
-        weights = None if mask is None else mask_weights(mask, MASK_MARGIN * max(view.camera.width, view.camera.height))
-        blender.add(view.camera, linear, weights, HELD_OUT_WEIGHT if index in held_out_views else 1.0)
+            tie_points.add(camera, linear)
         monitor.progress(index + 1, len(posed), "projection")
     projected = blender.result(solve_exposure=measured)
     constant, evidence = True, "not measured"

@@ -34,6 +34,8 @@ DEPTH_SIZE = 800
 EDGE_MARGIN = 0.008
 #: A depth step larger than this share of the object's diagonal is an edge.
 EDGE_STEP = 0.015
+#: Photos are reduced to the size of texels that are at least so many pixels wide.
+FINER = 1.5
 #: A texel may lie behind the depth map by this share of the object's diagonal.
 DEPTH_SLACK = 0.003
 
@@ -59,9 +61,19 @@ class ProjectionBlender:
     """Fuses images of `channels` channels into n texels with `position` (n, 3) and unit `normal` (n, 3).
 
     `caster` holds the mesh of the texels; `texel_size` is the edge of a texel in mesh units, used to filter photos finer than the texture.
+    Where the texels are a part of the surface, `whole` (m, 3) are points of all of it: all parts filter photos the same way.
     """
 
-    def __init__(self, position: NDArray[Any], normal: NDArray[Any], caster: RayCaster, channels: int, texel_size: float) -> None:
+    def __init__(
+        self,
+        position: NDArray[Any],
+        normal: NDArray[Any],
+        caster: RayCaster,
+        channels: int,
+        texel_size: float,
+        whole: NDArray[Any] | None = None,
+    ) -> None:
+        self._whole = np.asarray(position if whole is None else whole, np.float32)
         self._position = np.ascontiguousarray(position, np.float32)
         self._normal = np.ascontiguousarray(normal, np.float32)
         self._caster = caster
@@ -97,30 +109,33 @@ class ProjectionBlender:
         self._count += 1
         return sum(shown)
 
-    def result(self, solve_exposure: bool = False) -> ProjectedTexture:
-        """Fuse the views added. `solve_exposure` first divides out a gain per view and channel (for photos, not for materials)."""
+    def result(self, solve_exposure: bool = False, known_gains: Floats | None = None) -> ProjectedTexture:
+        """Fuse the views added. `solve_exposure` first divides out a gain per view and channel (for photos, not for materials);
+        `known_gains` (views, c) are divided out as they are."""
         channels = self._values.shape[2]
-        gains, explained = np.ones((max(self._count, 1), channels), np.float32), 0.0
+        gains, explained = np.ones((max(self._count, 1), channels), np.float32) if known_gains is None else known_gains, 0.0
         if solve_exposure and self._count > 1:
             gains, explained = solve_gains(self._values, self._weights, self._view, self._count)
         values, views, confidence = fuse(self._values, self._weights, self._view, gains)
         return ProjectedTexture(values, views, confidence, gains, explained)
 
     def useful_size(self, camera: Camera) -> int:
-        """Longer side in pixels, at most that of `camera`, at which the view's pixels are as fine as texels; rounded up."""
-        return int(np.ceil(max(camera.width, camera.height) / max(1.0, self._texel_width(camera))))
+        """Longer side in pixels at which pixels are as fine as texels, rounded up; that of `camera` where they are not much finer:
+        a filter would blur them."""
+        longer, width = max(camera.width, camera.height), self._texel_width(camera)
+        return longer if width < FINER else int(np.ceil(longer / width))
 
     def _texel_width(self, camera: Camera) -> float:
         """Width in pixels of a texel at the median depth; 0 when all lie behind the camera."""
-        offset = self._position - camera.centre.astype(np.float32)
-        depth = offset[:: max(1, len(offset) // 2000)] @ camera.R[2].astype(np.float32)
+        offset = self._whole[:: max(1, len(self._whole) // 2000)] - camera.centre.astype(np.float32)
+        depth = offset @ camera.R[2].astype(np.float32)
         depth = depth[depth > 0]
         return self._texel_size * camera.fx / float(np.median(depth)) if len(depth) else 0.0
 
     def _filtered(self, camera: Camera, pixels: Floats, mask: Floats) -> tuple[Camera, Floats, Floats]:
         """The view reduced by an area filter when its pixels are much finer than texels, against aliasing."""
         texel_width = self._texel_width(camera)
-        if texel_width < 1.5:
+        if texel_width < FINER:
             return camera, pixels, mask
         size = (max(2, round(camera.width / texel_width)), max(2, round(camera.height / texel_width)))
         # Plane by plane: OpenCV's area filter takes at most four channels.

@@ -77,14 +77,18 @@ class Texels:
         return out.reshape(self.size, self.size)
 
 
-def rasterise(uv: NDArray[Any], faces: NDArray[Any], size: int) -> Texels:
-    """Texels of a mesh with `uv` (v, 2) (origin top left, 0..1) and `faces` (f, 3) on a square texture of `size`."""
-    owner = np.full((size, size), -1, np.int32)
-    bary = np.zeros((size, size, 3), np.float32)
-    distance = np.full((size, size), np.float32(np.inf))
-    _draw(np.asarray(uv, np.float64) * size, np.ascontiguousarray(faces, np.int32), owner, bary, distance)
+def rasterise(uv: NDArray[Any], faces: NDArray[Any], size: int, rows: tuple[int, int] | None = None) -> Texels:
+    """Texels of a mesh with `uv` (v, 2) (origin top left, 0..1) and `faces` (f, 3) on a square texture of `size`.
+
+    `rows`, the first and the one after the last, are those that are looked at; all by default.
+    """
+    first, end = rows or (0, size)
+    owner = np.full((end - first, size), -1, np.int32)
+    bary = np.zeros((*owner.shape, 3), np.float32)
+    distance = np.full(owner.shape, np.float32(np.inf))
+    _draw(np.asarray(uv, np.float64) * size - [0, first], np.ascontiguousarray(faces, np.int32), owner, bary, distance)
     index = np.flatnonzero(owner.ravel() >= 0)
-    return Texels(size, index, owner.ravel()[index], bary.reshape(-1, 3)[index], distance.ravel()[index] == 0)
+    return Texels(size, index + first * size, owner.ravel()[index], bary.reshape(-1, 3)[index], distance.ravel()[index] == 0)
 
 
 def overlapping(uv: NDArray[Any], faces: NDArray[Any], size: int) -> int:
@@ -106,7 +110,7 @@ def _overlaps(uv: NDArray[Any], faces: NDArray[Any], size: int) -> tuple[int, ND
 @kernel("f8[:, ::1], i4[:, ::1], i4[:, ::1], f4[:, :, ::1], f4[:, ::1]", error_model="numpy")
 def _draw(uv: Doubles, faces: NDArray[np.int32], owner: NDArray[np.int32], bary: Floats, distance: Floats) -> None:
     """Fill `owner`, `bary` and `distance` (texels to the triangle, 0 inside) with the nearest triangle within `BORDER`."""
-    size = owner.shape[0]
+    height, width = owner.shape
     corner = np.zeros((3, 2))
     weight = np.zeros(3)
     for f in range(faces.shape[0]):
@@ -116,9 +120,9 @@ def _draw(uv: Doubles, faces: NDArray[np.int32], owner: NDArray[np.int32], bary:
         if not abs(area) > 1e-12:
             continue
         low_i = max(0, int(np.ceil(corner[:, 0].min() - BORDER - 0.5)))
-        high_i = min(size - 1, int(np.floor(corner[:, 0].max() + BORDER - 0.5)))
+        high_i = min(width - 1, int(np.floor(corner[:, 0].max() + BORDER - 0.5)))
         low_j = max(0, int(np.ceil(corner[:, 1].min() - BORDER - 0.5)))
-        high_j = min(size - 1, int(np.floor(corner[:, 1].max() + BORDER - 0.5)))
+        high_j = min(height - 1, int(np.floor(corner[:, 1].max() + BORDER - 0.5)))
         for j in range(low_j, high_j + 1):
             for i in range(low_i, high_i + 1):
                 if distance[j, i] == 0:

@@ -57,6 +57,8 @@ def formula(stage: str, photos: PhotoSet, settings: Mapping[str, Any]) -> tuple[
     step = 0.012 + 0.15 * megapixels("train.max_size", 512)
     matched = count * max(megapixels("stereo.max_size", 800), value("stereo.min_scale", 0.3) ** 2 * photos.megapixels)
     fit = settings.get("bake.materials") == "fit"
+    # A base colour of automatic size has about as many texels as a photo has pixels; it is projected in bands.
+    fine = min(photos.megapixels, 17.0) if settings.get("bake.size") == "auto" and photos.megapixels > 2.5 else 0.0
     match stage:
         case "ingest":
             return 0.5 + 0.12 * count * photos.megapixels, 130 + 40 * photos.megapixels
@@ -71,9 +73,12 @@ def formula(stage: str, photos: PhotoSet, settings: Mapping[str, Any]) -> tuple[
         case "mesh":
             return 2 + 0.08 * value("mesh.max_resolution", 384), 450 + 0.8 * value("mesh.max_resolution", 384)
         case "bake":
-            return 6 + (110 if fit else 8) * texels, 700 + (1100 if fit else 320) * texels
+            return (
+                6 + (110 if fit else 8) * texels + 0.2 * count * fine,
+                max(700 + (1100 if fit else 320) * texels, 500 + 60 * photos.megapixels + 60 * fine),
+            )
         case "export":
-            return 2 + 4 * texels, 300 + 270 * texels
+            return 2 + 4 * texels + 1.2 * fine, 300 + 270 * texels + 60 * fine
         case "report":
             return 7.0, 830.0
     return 10.0, 500.0

@@ -10,6 +10,7 @@ import numpy as np
 
 from gsbake.config.schema import Export
 from gsbake.gltf.audit import as_json, audit
+from gsbake.gltf.encode import size_limit
 from gsbake.gltf.scene import Scene, open_scene
 from gsbake.imaging.encoded import image_format
 from gsbake.imaging.image_process import read_image
@@ -25,6 +26,8 @@ def inspect_file(path: Path) -> dict[str, Any]:
     low, high = scene.vertices.min(0), scene.vertices.max(0)
     textures = _textures(scene)
     data, limits = path.read_bytes(), Export()
+    edges = [t["width"] for t in textures]
+    megabytes = size_limit(limits.max_megabytes, max(edges, default=0), min(edges, default=0))
     return {
         "file": str(path),
         "bytes": document.size,
@@ -55,7 +58,7 @@ def inspect_file(path: Path) -> dict[str, Any]:
         "texture_bytes": sum(t["bytes"] for t in textures),
         "gpu_megabytes": sum(t["width"] * t["height"] * 4 * 4 / 3 for t in textures) / 1e6,
         "notes": list(scene.notes),
-        "audit": as_json(audit(data, path.name, limits.max_megabytes, limits.max_triangles, foreign=True)) if data[:4] == b"glTF" else [],
+        "audit": as_json(audit(data, path.name, megabytes, limits.max_triangles, foreign=True)) if data[:4] == b"glTF" else [],
     }
 
 

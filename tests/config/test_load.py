@@ -126,7 +126,7 @@ def test_extends_origins_and_overrides(tmp_path: Path) -> None:
         ("[bake]\nfaces = 5\n", ["'bake.faces'", "the nearest is 'mesh.faces'"]),
         ("faces = 5\n", ["'faces'", "the nearest is 'mesh.faces'"]),
         ("[mesh]\nfaces = 5\n", ["mesh.faces = 5 is invalid: it must be a whole number from 100 to 10 000 000."]),
-        ("[bake]\nsize = 1000\n", ["bake.size = 1000", "one of 128, 256"]),
+        ("[bake]\nsize = 1000\n", ["bake.size = 1000", "one of auto, 128, 256"]),
         ('[mesh]\nholes = "leaves"\n', ["mesh.holes = 'leaves'", "one of close, leave", "did you mean 'leave'?"]),
         ('[ingest]\ninvert_masks = "perhaps"\n', ["ingest.invert_masks", "must be true or false"]),
         ('[train]\niterations = "many"\n', ["train.iterations = 'many' is not a number: it must be a whole number from 0 to 10 000 000."]),

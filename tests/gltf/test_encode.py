@@ -7,7 +7,7 @@ import io
 import numpy as np
 from PIL import Image
 
-from gsbake.gltf.encode import PRECISION_LEVELS, encode_within_budget, quantise
+from gsbake.gltf.encode import PRECISION_LEVELS, encode_within_budget, quantise, size_limit
 
 
 def pixels(content: bytes) -> np.ndarray:
@@ -20,6 +20,19 @@ def test_colour_is_coded_in_srgb_and_the_rest_is_linear() -> None:
     maps = quantise(grey, grey, np.tile([0.5, 0.5, 1.0], (4, 4, 1)))
     assert (maps.base_color == 128).all() and (maps.orm == 55).all()
     assert maps.normal is not None and (maps.normal == [128, 128, 255]).all()
+
+
+def test_the_size_limit_follows_a_finer_base_colour_unless_it_is_set() -> None:
+    assert size_limit(0.0, 1024, 1024) == size_limit(0.0, 2048, 2048) == 5
+    assert size_limit(0.0, 4096, 1024) == 5 + 3e-6 * (4096**2 - 1024**2)
+    assert size_limit(7.5, 4096, 1024) == 7.5
+
+
+def test_a_large_texture_is_coded_like_a_small_one() -> None:
+    column = np.linspace(0, 1, 600)[:, None, None] * np.ones((1, 2, 3))
+    maps = quantise(column, np.ones((2, 2, 3)), None)
+    assert np.array_equal(maps.base_color[500:], quantise(column[500:], np.ones((2, 2, 3)), None).base_color)
+    assert maps.base_color.shape == (600, 2, 3) and maps.orm.shape == (2, 2)
 
 
 def test_budget_lowers_the_linear_maps_only() -> None:

@@ -48,7 +48,7 @@ def bake(folder: Path, out: Path, mesh: Path | None = None, **settings: Any) -> 
 def export(folder: Path, out: Path, monitor: Monitor = SILENT, materials: str = "none", **settings: Any) -> dict[str, Any]:
     """Export the run in `folder`, baked, into the new folder `out`."""
     out.mkdir()
-    options = ExportOptions(Export(**settings), materials, SIZE)
+    options = ExportOptions(Export(**settings), materials)
     return export_asset(*(folder / name for name in ("ingest", "poses", "refine", "bake")), out, options, monitor=monitor)
 
 
@@ -126,7 +126,7 @@ def test_a_known_distance_makes_metres(run: Path, asset: GltfAsset, tmp_path: Pa
     )
     pixels, _ = camera.project(points)
     picks = " ".join(f"{camera.name}.jpg:{x:.4f},{y:.4f}" for x, y in pixels)
-    options = ExportOptions(Export(), "none", SIZE, Scale(known_distances=(f"{picks} 3m",)))
+    options = ExportOptions(Export(), "none", Scale(known_distances=(f"{picks} 3m",)))
     (tmp_path / "out").mkdir()
     result = export_asset(tmp_path, tmp_path, run / "refine", run / "bake", tmp_path / "out", options)
     assert result["scale"] == "metres" and 0 < result["scale_relative_error"] < 0.05
@@ -295,7 +295,7 @@ def test_an_earlier_export_is_overwritten(run: Path, tmp_path: Path) -> None:
     before = (tmp_path / "export/previews/base_color.png").read_bytes()
     (tmp_path / "export/previews/base_color.png").write_bytes(b"old")
     folders = (run / name for name in ("ingest", "poses", "refine", "bake"))
-    export_asset(*folders, tmp_path / "export", ExportOptions(Export(), "none", SIZE))
+    export_asset(*folders, tmp_path / "export", ExportOptions(Export(), "none"))
     assert (tmp_path / "export/previews/base_color.png").read_bytes() == before
 
 

@@ -80,7 +80,9 @@ def test_where_rays_missed_the_dense_mesh_is_shown_in_red(asset: Asset, tmp_path
     assert missed_panel(asset, tmp_path / "coverage.exr") == ()
     coverage[:16, :, 3] = 0
     write_exr(tmp_path / "coverage.exr", coverage)
+    finer = replace(asset, base_color=np.full((256, 256, 3), 0.4, np.float32))
     (panel,) = missed_panel(asset, tmp_path / "coverage.exr")
+    assert missed_panel(finer, tmp_path / "coverage.exr") == (panel,)
     assert "25.0% of the texels" in panel.caption
     data = base64.b64decode(panel.image.partition(",")[2])
     shown = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)[..., ::-1].astype(int)

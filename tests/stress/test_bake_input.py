@@ -63,7 +63,7 @@ def export(folder: Path, materials: str = "none") -> bool:
     """Export what was baked and check the asset; False where it was refused."""
     out = folder / "export"
     out.mkdir()
-    options = ExportOptions(Export(), materials, SIZE)
+    options = ExportOptions(Export(), materials)
     names = (folder / name for name in ("ingest", "poses", "refine", "bake"))
     try:
         results = export_asset(*names, out, options, monitor=Recorder())
