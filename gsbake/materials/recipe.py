@@ -39,6 +39,8 @@ COARSE = Steps(
 )
 #: Texels and light adapt to a change; slowly, so that noise of single photos does not decide.
 ADAPT = Steps(0.15, rate=0.3, sparsity=False)
+#: The same to another kind, in many trials.
+TURN = Steps(0.1, rate=0.3, sparsity=False, photos_per_light=2)
 ADAPT_AND_SEARCH = Steps(0.15, rate=0.3, sparsity=False, passes=(Pass("light-search", LightSearch(), at=(0.0,)),))
 #: Texels adapt to a light that is given.
 RELIT = Steps(0.05, rate=0.5, normals=True)
@@ -47,8 +49,9 @@ FINE = Steps(0.25, normals=True, passes=(Pass("metal-search", MetalSearch(), at=
 
 
 def coarsest(steps: Steps) -> Steps:
-    """The same on the coarsest level: with one step of the light, which takes most of the time there, for two photos."""
-    return replace(steps, photos_per_light=2)
+    """The same on the coarsest level: fewer, as only the order of the starts counts, and with one step of the light, which takes most of
+    the time there, for two photos."""
+    return replace(steps, share=0.6 * steps.share, photos_per_light=2)
 
 
 _STARTS = StartComparison(coarsest(TRIAL), coarsest(COARSE))
@@ -62,7 +65,7 @@ FIT = (
     Pass("coarse-steps", GradientSteps(TRIAL, "material fit, coarse level")),
     Pass("coarse-steps", GradientSteps(COARSE, "material fit, coarse level")),
     Pass("metal-noise", MetalNoise(rounds=2, steps=ADAPT)),
-    Pass("metal-trials", KindTrials(ADAPT)),
+    Pass("metal-trials", KindTrials(TURN)),
     Pass("light-level", LightLevel(ADAPT_AND_SEARCH)),
     Pass("remaining-shading", RemainingShading(RELIT, rounds=4)),
     Pass("pure-metals", PureMetals()),
