@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
@@ -45,8 +46,10 @@ def measure_maps(bake: Path, mesh: Path, poses: Path, capture: Path) -> MapError
 
     unwrapped = load_file(bake / "mesh.safetensors")
     base, orm, coverage = (read_exr(bake / f"{name}.exr") for name in ("base_color", "orm", "coverage"))
-    texels = rasterise(unwrapped["uv"], unwrapped["faces"], len(base))
-    observed = np.flatnonzero(coverage.reshape(-1, 3)[texels.index, 1] > 0.5)
+    if len(base) > len(orm):  # the base colour alone may be finer
+        base = np.asarray(cv2.resize(base, orm.shape[1::-1], interpolation=cv2.INTER_AREA))
+    texels = rasterise(unwrapped["uv"], unwrapped["faces"], len(orm))
+    observed = np.flatnonzero(coverage.reshape(-1, coverage.shape[-1])[texels.index, 1] > 0.5)
     chosen = observed[:: max(1, len(observed) // MAX_TEXELS)]
     baked = np.concatenate([base, orm[..., 1:]], 2).reshape(-1, 5)[texels.index[chosen]].astype(np.float64)
     points = texels.interpolate(unwrapped["position"], unwrapped["faces"])[chosen]

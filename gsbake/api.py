@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from gsbake.capture.masks.weights import resolve_network
-from gsbake.capture.sources import PHOTO_FOLDERS, discover, list_masks, source_files
+from gsbake.capture.sources import PHOTO_FOLDERS, discover, list_masks, require_photo, source_files
 from gsbake.config.load import DEFAULT, LoadedProfile, fields, load_profile
 from gsbake.config.renamed import present_override
 from gsbake.config.schema import Profile
@@ -95,6 +95,7 @@ class Session:
         """
         if until == TARGETS and TARGETS not in self.engine.registry.names:
             raise UsageError("No target is set: name them, as in --target web,ar:usdz (settings: targets.files).")
+        self._require_front()
         self.engine.shared = open_shared_store(self.store)
         try:
             with self.engine.uses:  # until the results are copied
@@ -111,7 +112,9 @@ class Session:
         return Result(self.out, files, tuple(states), notes)
 
     def store_settings(self) -> None:
-        """Store the options in the output folder, for its next run. Raises BadInputError where it cannot be written."""
+        """Store the options in the output folder, for its next run. Raises BadInputError where it cannot be written, or for a
+        front that no photo shows."""
+        self._require_front()
         try:
             ensure_output_folder(self.out)
             self.project.save(self.out)
@@ -119,6 +122,12 @@ class Session:
             raise disk_error(error, self.out) or BadInputError(
                 f"The output folder '{self.out}' cannot be written ({error.strerror}); choose another with --out."
             ) from error
+
+    def _require_front(self) -> None:
+        """Refuse the name of a front that is no photo, which else the last stage would find."""
+        front = self.profile.profile.export.front
+        if front and self.project.photos is not None:
+            require_photo(Path(self.project.photos), front, "export.front")
 
     def _publish(self, states: Sequence[StageState]) -> tuple[dict[str, Path], tuple[str, ...]]:
         """Copy the results of these stages to the output folder; returns {file: path} and what needs a word."""

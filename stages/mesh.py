@@ -16,13 +16,14 @@ def run(ctx: Context) -> dict[str, Any]:
         s.mesh,
         s.train.max_size,
         s.stereo.max_size,
+        s.stereo.min_scale,
         s.skip.empty_cells,
         s.surfels.projected_depth,
         s.export.max_triangles,
         s.train.holdout,
     )
     return extract_mesh(
-        ctx.inputs["poses"], ctx.inputs["refine"], ctx.out, options, stereo=ctx.inputs["stereo"],
+        ctx.inputs["poses"], ctx.inputs["refine"], ctx.out, options, ingest=ctx.inputs["ingest"], stereo=ctx.inputs["stereo"],
         seed=ctx.seed, threads=ctx.threads, device=ctx.device, scratch=ctx.checkpoint, monitor=ctx,
     )  # fmt: skip
 
@@ -48,13 +49,13 @@ def kernels(settings: Any) -> tuple[str, ...]:
 
 STAGE = Stage(
     name="mesh",
-    version=11,
+    version=12,
     title="Mesh",
     run=run,
     summary="{faces} triangles, {dense_faces} before decimation",
-    needs=("poses", "stereo", "refine"),
+    needs=("ingest", "poses", "stereo", "refine"),
     settings=(
-        "mesh.*", "surfels.projected_depth", "train.max_size", "train.holdout", "stereo.max_size", "skip.empty_cells",
+        "mesh.*", "surfels.projected_depth", "train.max_size", "train.holdout", "stereo.max_size", "stereo.min_scale", "skip.empty_cells",
         "export.max_triangles",
     ),
     uses_device=True,

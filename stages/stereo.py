@@ -12,8 +12,8 @@ def run(ctx: Context) -> dict[str, Any]:
     from gsbake.mvs.stereo import run_stereo
 
     return run_stereo(
-        ctx.inputs["poses"], ctx.out, ctx.settings.stereo, holdout=ctx.settings.train.holdout, seed=ctx.seed, threads=ctx.threads,
-        scratch=ctx.checkpoint, monitor=ctx,
+        ctx.inputs["poses"], ctx.out, ctx.settings.stereo, ingest=ctx.inputs["ingest"], holdout=ctx.settings.train.holdout, seed=ctx.seed,
+        threads=ctx.threads, scratch=ctx.checkpoint, monitor=ctx,
     )  # fmt: skip
 
 
@@ -27,11 +27,11 @@ KERNELS = (
 
 STAGE = Stage(
     name="stereo",
-    version=13,
+    version=14,
     title="Multi-view stereo",
     run=run,
     summary="{points} points, {confirmed_share:%} of the object confirmed",
-    needs=("poses",),
+    needs=("ingest", "poses"),
     settings=("stereo.*", "train.holdout"),
     seeded=True,
     kernels=lambda settings: () if settings.stereo.enabled == "never" else KERNELS,

@@ -45,6 +45,11 @@ def test_errors_are_single_sentences(photos: Path) -> None:
         gsbake.run(out="none")
     with pytest.raises(BadInputError, match="nearest is 'mesh.faces'"):
         gsbake.run(photos, settings={"mesh.face": 3})
+    with pytest.raises(
+        BadInputError, match=r"export\.front names the photo 'd\.jpg', which is none of the photos \(a\.jpg, b\.jpg, c\.jpg\)"
+    ):
+        gsbake.run(photos, out="front", settings={"export.front": "d.jpg"})
+    assert not Path("front").exists()
     with pytest.raises(UsageError, match="The seed must be a whole number from 0"):
         gsbake.run(photos, seed=2**31)
 

@@ -27,7 +27,7 @@ from gsbake.capture.photos.undistortion import intrinsics_key, pinhole_camera, r
 from gsbake.capture.posed_photos import DIGESTS, REGION, PosedPhotos
 from gsbake.capture.poses.normalisation import BoundingSphere, bounding_sphere_from_masks, bounding_sphere_from_views
 from gsbake.capture.sfm.feature_masks import FeatureMasks
-from gsbake.capture.sfm.solve import PoseSolver
+from gsbake.capture.sfm.solve import PoseSolver, Solved
 from gsbake.config.schema import Poses
 from gsbake.errors import BadInputError
 from gsbake.geometry.cameras import Camera, CameraSet
@@ -39,6 +39,8 @@ from gsbake.text import shortlist
 
 #: Agreement of the network's guesses from which no others are tried.
 CERTAIN_AGREEMENT = 0.95
+#: Agreement from which guesses are used where cameras stand before a turntable.
+MIN_TABLE_AGREEMENT = 0.7
 #: Smallest number of tie points that is written: fewer do not describe the shape.
 MIN_POINTS = 30
 #: Surface points at which the coverage of photos is measured.
@@ -108,7 +110,7 @@ class _Estimation:
         CameraSet(tuple(solved.cameras), poses="given" if given else "solved").save(self.out / "photo_cameras.json")
         points, colours = read_cloud(solved.cloud) if solved.cloud.exists() else (None, None)
         with monitor.part("automatic masks"):
-            automatic = self._write_automatic_masks(entries, solved.cameras, points)
+            automatic = self._write_automatic_masks(entries, solved, points)
         with monitor.part("undistortion"):
             pinholes = self._undistort(solved.cameras)
         region = self._region(given)
@@ -183,12 +185,15 @@ class _Estimation:
         inside = None if points is None else region.contains(points)
         return (None, None) if inside is None else (points[inside], None if colours is None else colours[inside])
 
-    def _write_automatic_masks(self, entries: Sequence[dict[str, Any]], cameras: Sequence[Camera], points: Any) -> dict[str, Any]:
+    def _write_automatic_masks(self, entries: Sequence[dict[str, Any]], solved: Solved, points: Any) -> dict[str, Any]:
         """Write `photo_masks/`: guesses corrected by agreement between photos, as the photos show them; returns the figures.
 
         Guesses are those of the network, or of what stands on a plane among the tie `points` where these agree better. Nothing is written
-        where no mask was guessed, or the guesses do not agree with the cameras.
+        where no mask was guessed, or the guesses do not agree with the cameras. Before a turntable, where that is no question of the
+        cameras, they may agree less: in all photos of a round the same part of the room looks like one of the object.
         """
+        cameras = solved.cameras
+        least = MIN_TABLE_AGREEMENT if solved.on_table else MIN_USED_AGREEMENT
         by_name = {e["name"]: e for e in entries}
         files = FeatureMasks(self.ingest, [by_name[c.name] for c in cameras], self.scratch).files
         guessed = [c.name for c in cameras if not by_name[c.name]["mask"] and by_name[c.name].get("guess")]
@@ -198,15 +203,15 @@ class _Estimation:
         agreement = 0.0 if found is None else found.agreement
         evidence = f"the guesses of the network agree with the cameras to {agreement:.2f}"
         photos = {c.name: self.ingest / by_name[c.name]["file"] for c in cameras}
-        if agreement < CERTAIN_AGREEMENT and len(guessed) == len(cameras) and points is not None:
+        if not solved.on_table and agreement < CERTAIN_AGREEMENT and len(guessed) == len(cameras) and points is not None:
             sets = plane_masks(cameras, photos, files, points, self.scratch / "plane_masks", self.seed, self.threads)
             for masks, kind in zip(sets, ("", ", with the plane below it in question,"), strict=False):
                 if (other := find_consensus(cameras, masks)) is not None:
                     evidence += f", masks of what stands on the support plane{kind} to {other.agreement:.2f}"
                     if other.agreement > agreement:
                         found, files, agreement = other, masks, other.agreement
-        if found is None or agreement < MIN_USED_AGREEMENT:
-            evidence += f", which is below {MIN_USED_AGREEMENT:g}"
+        if found is None or agreement < least:
+            evidence += f", which is below {least:g}"
             self.monitor.decide("automatic masks", "not used", evidence)
             return {"automatic_masks": 0, "mask_agreement": agreement}
         (self.out / "photo_masks").mkdir()

@@ -23,12 +23,13 @@ _OTHER_MASK = 128
 
 class FullPhotos:
     """Photos of the poses stage by index, with the cameras of `posed`, read from the originals of the ingest stage; a context manager that
-    ends the process that decodes."""
+    ends the processes that decode."""
 
-    def __init__(self, ingest: Path, poses: Path, trained: Path | None = None) -> None:
-        """Open artifact folders of the ingest and the poses stage; `trained` as in `PosedPhotos.open`."""
+    def __init__(self, ingest: Path | None, poses: Path, trained: Path | None = None, readers: int = 1) -> None:
+        """Open artifact folders of the ingest and the poses stage; `trained` as in `PosedPhotos.open`. Without `ingest` there are no
+        originals. `readers` photos are decoded at a time."""
         self.posed = PosedPhotos.open(poses, trained)
-        self._originals = Originals(ingest)
+        self._originals = Originals(ingest, readers)
         self._lenses, self._pinholes = self._pairs(poses)
 
     def __enter__(self) -> FullPhotos:
@@ -38,7 +39,7 @@ class FullPhotos:
         self.close()
 
     def close(self) -> None:
-        """End the process that decodes; a later call starts it again."""
+        """End the processes that decode; a later call starts them again."""
         self._originals.close()
 
     def __len__(self) -> int:
@@ -63,6 +64,10 @@ class FullPhotos:
             lenses[name] = lens.scaled(width, height)
             pinholes[name] = camera.scaled(round(camera.width * width / lens.width), round(camera.height * height / lens.height))
         return lenses, pinholes
+
+    def size_of(self, least: int, share: float) -> int:
+        """Longer side in pixels of this `share` of the photos' full size, in the median; at least `least`."""
+        return max(least, round(share * float(np.median([max(c.width, c.height) for c in map(self.camera, range(len(self)))]))))
 
     def camera(self, index: int, max_size: int | None = None) -> Camera:
         """Pinhole camera `index` of the photo at full size, or with the longer side at most `max_size` pixels."""

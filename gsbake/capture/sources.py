@@ -14,6 +14,8 @@ from gsbake.capture.photos.heic_and_raw import HEIC_SUFFIXES, RAW_SUFFIXES
 from gsbake.capture.poses.folder_formats import has_xmp, is_colmap_model
 from gsbake.capture.poses.frame_masks import frame_masks, mask_folder
 from gsbake.errors import BadInputError
+from gsbake.system.names import portable_name
+from gsbake.text import shortlist
 
 #: File name suffixes of images, which masks are as well, and of photos.
 IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".exr", ".webp"})
@@ -54,6 +56,15 @@ def is_video(path: Path) -> bool:
 def source_files(source: Path) -> list[str]:
     """Names of the photos of a folder, relative to it, or of the video. Raises BadInputError as `list_photos`."""
     return [source.name] if is_video(source) else [path.relative_to(source).as_posix() for path in list_photos(source)]
+
+
+def require_photo(source: Path, photo: str, what: str) -> None:
+    """Raise BadInputError, which says `what` names it, where `photo` is none of the photos of the folder: neither a path, nor a file's
+    name, nor the name that it gets. Frames of a video have names once they are read; a folder that is gone has none to compare with."""
+    if source.is_dir():
+        files = source_files(source)
+        if not any(photo in (name, name.rsplit("/", 1)[-1], portable_name(name.rsplit(".", 1)[0].replace("/", "_"))) for name in files):
+            raise BadInputError(f"{what} names the photo '{photo}', which is none of the photos ({shortlist(files)}).")
 
 
 def reads_subfolders(folder: Path) -> bool:

@@ -126,6 +126,7 @@ class Stereo(Section):
 
     enabled: Literal["auto", "always", "never"] = Field("auto", description="Run multi-view stereo before training. auto: unless photos are too few or too small.")
     max_size: int = Field(800, ge=64, le=4000, description="Longer side in pixels of the photos that are matched.")
+    min_scale: Fraction = Field(0.3, description="Photos larger than working photos are matched at this share of their size, where that is more than max_size. 0: never.")
     neighbours: int = Field(6, ge=1, le=8, description="Source views per reference view.")
     best_views: int = Field(4, ge=1, le=8, description="Source views with the lowest matching cost, over which a pixel's cost is averaged.")
     consistency_views: int = Field(12, ge=1, le=32, description="Views with which the geometric consistency of a depth map is checked.")

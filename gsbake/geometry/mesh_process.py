@@ -21,6 +21,8 @@ from gsbake.memory_budget import check, child_limit
 
 #: File name suffixes of the formats.
 SUFFIXES = (".ply", ".obj", ".stl")
+#: Faces of an OBJ, and those with texture coordinates.
+_OBJ_FACE = {False: re.compile(rb"^f[ \t]", re.MULTILINE), True: re.compile(rb"^f[ \t]+-?\d+/-?\d", re.MULTILINE)}
 #: Bytes that reading takes per byte of the file (text is split into Python's objects), and beyond: libraries, what the allocator reserves.
 MEMORY_FACTOR, SPARE_MEMORY = 24, 1 << 30
 #: Seconds that a mesh may take: at least, and per byte of the file (half a megabyte a second).
@@ -80,6 +82,7 @@ def answer(request: dict[str, Any]) -> dict[str, Any]:
         faces = np.concatenate([np.zeros((0, 3), np.int64), *corners])
         uv = np.concatenate([np.zeros((0, 2)), *(_texture_coordinates(part) for part in parts)])
         materials = len(set(re.findall(rb"^usemtl[ \t]+(.*?)\s*$", content, re.MULTILINE))) if options else 1
+        total, mapped = (len(_OBJ_FACE[uv].findall(content)) if options else 0 for uv in (False, True))
     except OSError as error:
         return {"error": f"{name} cannot be read: {error.strerror or error}."}
     except MemoryError:
@@ -88,6 +91,8 @@ def answer(request: dict[str, Any]) -> dict[str, Any]:
         return {"error": f"{name} is not a readable mesh ({' '.join(repr(error).split())[:120]})."}
     if len(faces) == 0 or not (np.abs(vertices) <= MAX_COORDINATE).all() or faces.min() < 0 or faces.max() >= len(vertices):
         return {"error": f"{name} holds no triangles, or vertices that are not finite or beyond {MAX_COORDINATE:g}."}
+    if 0 < mapped < total:  # trimesh drops all of them
+        return {"error": f"{name} has no UVs on {total - mapped} of its {total} faces; unwrap all of it, or none."}
     np.savez(Path(request["target"]), vertices=vertices, faces=faces, uv=uv, materials=max(1, materials))
     return {}
 

@@ -1,4 +1,4 @@
-"""Whether poses are those of a turntable: cameras on exact circles about the axis of a table, for each position of the object.
+"""The turntable that poses show: cameras on exact circles about the axis of a table, for each position of the object on it.
 
 As the object sees it, a camera that stands moves about the axis of the table by a pure rotation. So all photos of a round have one height,
 one distance and one orientation to the axis, to the accuracy of the poses, which neither a camera in the hand nor a spiral has.
@@ -6,12 +6,14 @@ A camera that is moved between rounds makes several circles; an object that is l
 
 The turn between two photos of a round is about the axis. The direction that most pairs agree on, and the line in that direction, are the
 axis. Photos count whose height, distance and orientation enough others of other azimuths share; those with slightly others must be few,
-else they lie along a spiral. What is left is searched for a further axis.
+else they lie along a spiral. What is left is searched for a further axis: the object was laid down differently. Its photos are fewer and
+its poses less exact, but there is no question any more whether there is a table.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,29 +25,67 @@ Doubles = NDArray[np.float64]
 
 #: Largest difference of two photos of a round, in radians and in shares of the distance. Solved poses differ by .01, from hand by .05.
 SAME_ROUND = 0.02
+#: The same where an axis was found already: poses of the second position of a tankard differ by .03.
+SAME_FURTHER = 0.03
 #: Fewest photos of a round.
 MIN_ROUND = 5
 #: Within so many times SAME_ROUND a photo of a round has few others than those of its round: this share is of the round.
 NEARBY, MIN_ALONE = 3.0, 0.5
 #: Least turn in degrees between two photos for them to say where the axis is, and to count for one another.
 MIN_TURN = 8.0
+#: Least range of the azimuths about an axis, in degrees.
+MIN_RANGE = 90.0
 #: Directions of the axis that are tried, pairs of photos they are compared on, and pairs that must agree.
 DIRECTIONS, PAIRS, MIN_PAIRS = 1000, 4000, 6
 
 
-def turntable_share(cameras: Sequence[Camera]) -> float:
-    """Share of the `cameras`, posed in the object's frame, that stand on exact circles as those of a turntable do; 0 where few do."""
+@dataclass(frozen=True)
+class Turntable:
+    """A table: its upward `axes` (positions, 3) in the object's frame and a point (positions, 3) on each, the `position` (n,) of the object
+    in each photo, and whether the photo's camera stands on an exact circle (n,)."""
+
+    axes: Doubles
+    points: Doubles
+    position: NDArray[np.int64]
+    on_circle: NDArray[np.bool_]
+
+    @property
+    def share(self) -> float:
+        """Share of the cameras that stand on exact circles."""
+        return float(self.on_circle.mean())
+
+    @property
+    def counts(self) -> list[int]:
+        """Photos of each position."""
+        return np.bincount(self.position, minlength=len(self.axes)).tolist()
+
+    def to_room(self, cameras: Sequence[Camera]) -> Doubles:
+        """Rotations (n, 3, 3) from the object's frame to that of the room, where up is the z axis and the camera stands in the direction of
+        the x axis, in whatever position the object lies."""
+        rows = [_frames((c.centre - self.points[k])[None], self.axes[k])[0] for c, k in zip(cameras, self.position, strict=True)]
+        return np.stack(rows)
+
+
+def find_turntable(cameras: Sequence[Camera]) -> Turntable | None:
+    """The turntable before the `cameras`, which are posed in the object's frame; None where there is none."""
     if len(cameras) < MIN_ROUND:
-        return 0.0
+        return None
     rotation, centre = np.stack([c.R for c in cameras]), np.stack([c.centre for c in cameras])
-    left, found = np.arange(len(cameras)), 0
-    while len(left) >= MIN_ROUND and (line := _axis(rotation[left], centre[left])) is not None:
-        inside = _in_rounds(rotation[left], centre[left], *line)
-        if inside.sum() < MIN_ROUND:
+    lines: list[tuple[Doubles, Doubles]] = []
+    position = np.full(len(cameras), -1)
+    while (left := np.flatnonzero(position < 0)).size >= MIN_ROUND and (line := _axis(rotation[left], centre[left])) is not None:
+        inside = left[_in_rounds(rotation[left], centre[left], *line, further=bool(lines))]
+        if len(inside) < MIN_ROUND:
             break
-        found += int(inside.sum())
-        left = left[~inside]
-    return found / len(cameras)
+        upright = -np.sign(np.mean(rotation[inside, 1] @ line[0])) or 1.0  # y axes of cameras point down
+        position[inside] = len(lines)
+        lines.append((upright * line[0], line[1]))
+    if not lines:
+        return None
+    # What no round has belongs to the position whose cameras stand, with respect to its axis, as this one does.
+    apart = np.stack([_nearest(rotation, centre, *line, position == k) for k, line in enumerate(lines)])
+    axes, points = map(np.stack, zip(*lines, strict=True))
+    return Turntable(axes, points, np.where(position < 0, apart.argmin(0), position), position >= 0)
 
 
 def _axis(rotation: Doubles, centre: Doubles) -> tuple[Doubles, Doubles] | None:
@@ -102,13 +142,27 @@ def _seen_from_axis(rotation: Doubles, centre: Doubles, axis: Doubles, point: Do
     return np.concatenate([height[:, None] / scale, distance[:, None] / scale, turned], 1), azimuth
 
 
-def _in_rounds(rotation: Doubles, centre: Doubles, axis: Doubles, point: Doubles) -> NDArray[np.bool_]:
-    """Which cameras (n,) are in rounds about the axis: none where others are just beside, as on a spiral."""
+def _in_rounds(rotation: Doubles, centre: Doubles, axis: Doubles, point: Doubles, further: bool) -> NDArray[np.bool_]:
+    """Which cameras (n,) are in rounds about the axis: none where they turn little, or where others are just beside, as on a spiral, which
+    is not asked about a `further` axis."""
     constant, azimuth = _seen_from_axis(rotation, centre, axis, point)
     apart = np.linalg.norm(constant[:, None] - constant[None], axis=2)
     turned = np.abs((azimuth[:, None] - azimuth[None] + 180) % 360 - 180) > MIN_TURN
-    same, nearby = ((turned & (apart < bound)).sum(1) for bound in (SAME_ROUND, NEARBY * SAME_ROUND))
+    bound = SAME_FURTHER if further else SAME_ROUND
+    same, nearby = ((turned & (apart < b)).sum(1) for b in (bound, NEARBY * bound))
     core = same >= MIN_ROUND - 1
-    if not core.any() or np.median(same[core] / nearby[core]) < MIN_ALONE:
+    if not core.any() or _range(azimuth[core]) < MIN_RANGE or not further and np.median(same[core] / nearby[core]) < MIN_ALONE:
         return np.zeros(len(rotation), bool)
-    return np.asarray(core | (apart[:, core] < SAME_ROUND).any(1))
+    return np.asarray(core | (apart[:, core] < bound).any(1))
+
+
+def _range(azimuth: Doubles) -> float:
+    """The range of the azimuths in degrees, around their largest gap."""
+    around = np.sort(azimuth)
+    return 360 - max(float(np.diff(around, append=around[0] + 360).max()), 0.0)
+
+
+def _nearest(rotation: Doubles, centre: Doubles, axis: Doubles, point: Doubles, members: NDArray[np.bool_]) -> Doubles:
+    """How far the cameras (n,) are, as seen from the axis, from the next of the `members` (n,) of a position."""
+    constant, _ = _seen_from_axis(rotation, centre, axis, point)
+    return np.asarray(np.linalg.norm(constant[:, None] - constant[None, members], axis=2).min(1))

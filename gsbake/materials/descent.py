@@ -34,8 +34,9 @@ from gsbake.materials.passes import Pass, Priors, Scene, run_passes
 from gsbake.materials.photo import Photo
 from gsbake.materials.sparsity_prior import KERNEL_WIDTHS, common_materials
 from gsbake.materials.state import Level, State, copied
+from gsbake.shading.environment import EnvironmentLight
 from gsbake.shading.light_motion import rotated
-from gsbake.shading.light_tables import prefilter_cube_map
+from gsbake.shading.light_tables import LightTables, prefilter_cube_map
 from gsbake.shading.neutral_light import neutral_light_loss
 
 Floats = NDArray[np.float32]
@@ -45,7 +46,8 @@ Floats = NDArray[np.float32]
 class Steps:
     """A run of gradient steps: a `share` of the iterations, with `rate` as a factor on all learning rates and the `passes` made on the way.
 
-    Without `normals` normal offsets stay, without `sparsity` that prior is off.
+    Without `normals` normal offsets stay, without `sparsity` that prior is off. A light that stands takes a step for
+    `photos_per_light` photos together.
     """
 
     share: float
@@ -53,6 +55,7 @@ class Steps:
     normals: bool = False
     sparsity: bool = True
     passes: tuple[Pass, ...] = ()
+    photos_per_light: int = 1
 
 
 @dataclass(frozen=True)
@@ -68,8 +71,9 @@ class DescentOptions:
     light_final_rate: float = 0.03
     #: Adam's decay rates of the first and second moments; short, as a fit has a few hundred steps.
     betas: tuple[float, float] = (0.9, 0.99)
-    #: Adam's ε for texels and normals, a gradient of the loss per texel: texels that few pixels show take smaller steps.
+    #: Adam's ε for texels and normals, a gradient of the loss per texel: texels that few pixels show take smaller steps; and for the light.
     epsilon: float = 2e-3
+    light_epsilon: float = 1e-8
     #: Factor on the reconstruction error against the priors.
     residual_weight: float = 1.5
     #: Pseudo-Huber scale in sRGB values (0..1): larger errors count linearly.
@@ -101,7 +105,7 @@ def descend(scene: Scene, state: State, plan: Steps, each: Each, steps: int | No
     if not photos or not total:
         return state
     scene = replace(scene, random=np.random.default_rng(scene.seed))
-    work = _Work(state, scene.priors)
+    work = _Work(state, scene.priors, plan.photos_per_light)
     order: list[int] = []
     for step in range(total):
         due = [one for one in plan.passes if step in {int(share * total) for share in one.at}]
@@ -118,13 +122,40 @@ def descend(scene: Scene, state: State, plan: Steps, each: Each, steps: int | No
         decay, light_decay = (plan.rate * final ** (step / total) for final in (o.final_rate, o.light_final_rate))
         work.step(photos[order.pop()], decay, light_decay, plan.normals)
         each(step + 1, total)
-    return work.finished()
+    return work.state
+
+
+class _Lit:
+    """A copy of a `light`, and the gradients of `photos` photos."""
+
+    def __init__(self, light: EnvironmentLight) -> None:
+        self.light, self.photos = copied(light), 0
+        self._radiance, self._loss = self.light.radiance(), torch.zeros(())
+        self._still: LightTables | None = None
+
+    def tables(self, to_light: NDArray[np.float64] | None) -> LightTables:
+        """The tables that a photo sees under the rotation `to_light` (3, 3), differentiable; None: the light stands."""
+        if to_light is not None:
+            return prefilter_cube_map(rotated(self._radiance, to_light))
+        self._still = self._still or prefilter_cube_map(self._radiance)
+        return self._still
+
+    def add(self, tables: LightTables, gradient: Floats) -> None:
+        """Add a photo's `gradient` (rows, 3) of its tables."""
+        self._loss, self.photos = self._loss + (tables.table * torch.from_numpy(gradient)).sum(), self.photos + 1
+
+    def gradient(self, neutral: float) -> torch.Tensor:
+        """The gradient of the light's parameter, with the prior of `neutral` light for each photo."""
+        loss = self._loss + self.photos * neutral * neutral_light_loss(self._radiance) if neutral else self._loss
+        return torch.autograd.grad(loss, self.light.raw)[0]
 
 
 class _Work:
     """Arrays that change from step to step, and the `state` that they make up."""
 
-    def __init__(self, state: State, priors: Priors) -> None:
+    def __init__(self, state: State, priors: Priors, interval: int) -> None:
+        self._lit: _Lit | None = None
+        self._interval = 1 if state.level.moving else interval
         self._priors, n = priors, len(state.values)
         self._shade, self._spare = ShadingStep(n), np.empty_like(state.values)
         self._common = np.zeros((0, 4), np.float32)
@@ -133,28 +164,12 @@ class _Work:
         moments = (state.moments[0].copy(), state.moments[1].copy())
         self.state = replace(state, values=state.values.copy(), logits=state.logits.copy(), moments=moments)
         self._weights = _weights(state.level, priors)
-        self._start_light()
-
-    def _start_light(self) -> None:
-        """Give the present light to an optimiser of its own."""
-        light = copied(self.state.light)
-        self._adam = torch.optim.Adam([light.raw], lr=OPTIONS.light_rate, betas=OPTIONS.betas)
-        if self.state.light_moments is not None:
-            first, second, steps = (moment.clone() for moment in self.state.light_moments)
-            self._adam.state[light.raw] = {"step": steps, "exp_avg": first, "exp_avg_sq": second}
-        self.state = replace(self.state, light=light)
 
     def resume(self, state: State) -> None:
         """Go on from a `state` that a search has made of the present one."""
-        light, self.state = self.state.light, state
-        if state.light is not light:
-            self._start_light()
-
-    def finished(self) -> State:
-        """The state after the last step."""
-        found = self._adam.state.get(self.state.light.raw)
-        moments = (found["exp_avg"], found["exp_avg_sq"], found["step"]) if found else None
-        return replace(self.state, light_moments=moments)
+        if state.light is not self.state.light:
+            self._lit = None
+        self.state = state
 
     def update_transport(self) -> None:
         """Visibility, indirect light and reflections of the present state; the residual of older ones counts less."""
@@ -170,17 +185,25 @@ class _Work:
         if self._given is not None:
             self._differentiate(photo, self._given.tables(photo.to_light))
         else:
-            radiance = self.state.light.radiance()
-            tables = prefilter_cube_map(rotated(radiance, photo.to_light))
+            self._lit = self._lit or _Lit(self.state.light)
+            tables = self._lit.tables(photo.to_light)
             self._differentiate(photo, KernelTables.of(tables))
-            loss = (tables.table * torch.from_numpy(self._shade.table.sum(0))).sum()
-            if self._priors.neutral_light:
-                loss = loss + len(self.state.values) * self._priors.neutral_light * neutral_light_loss(radiance)
-            self._adam.zero_grad()
-            loss.backward()
-            self._adam.param_groups[0]["lr"] = OPTIONS.light_rate * light_decay
-            self._adam.step()
+            self._lit.add(tables, self._shade.table.sum(0))
+            if self._lit.photos == self._interval:
+                self._step_light(self._lit, light_decay)
         self._step_texels(decay, normals)
+
+    def _step_light(self, lit: _Lit, decay: float) -> None:
+        """One step of Adam on the light, from the gradients of the photos since the last one. PyTorch's own takes a second to import."""
+        o, (beta1, beta2) = OPTIONS, OPTIONS.betas
+        gradient = lit.gradient(len(self.state.values) * self._priors.neutral_light)
+        zero = torch.zeros_like(gradient)
+        first, second, count = self.state.light_moments or (zero, zero, 0)
+        first, second, count = first.lerp(gradient, 1 - beta1), second.lerp(gradient.square(), 1 - beta2), count + 1
+        with torch.no_grad():
+            root = (second / (1 - beta2**count)).sqrt_().add_(o.light_epsilon)
+            lit.light.raw.addcdiv_(first, root, value=-o.light_rate * decay / (1 - beta1**count))
+        self.state, self._lit = replace(self.state, light=lit.light, light_moments=(first, second, count)), None
 
     def _differentiate(self, photo: Photo, tables: KernelTables) -> None:
         """Shade the pixels of a photo, leave the gradients in the buffers and add to the sums of the residual."""

@@ -310,9 +310,11 @@ def adam_step(
     `start`, `neighbour` is the adjacency list; `smoothness` (PARAMETERS,) weighs |Δ| of the materials and Δ² of the normal offsets of each
     pair, `mean_weight` (PARAMETERS,) the values (of base colour the
     diffuse part), `offset_weight` the squared normal offset; `common` (texels or 0, 4) with
-    `common_weight` (4,) draws sRGB base colour and roughness. `rate` (PARAMETERS,) learning rates; `first`, `second` moments.
+    `common_weight` (4,) draws sRGB base colour and roughness. `rate` (PARAMETERS,) learning rates, without one of normal offsets these and
+    their moments stay; `first`, `second` moments.
     """
     regular, texels = common.shape[0] > 0, raw.shape[0]
+    active = PARAMETERS if rate[5] > _0 else 5
     size = -(-texels // CHUNKS)
     for chunk in prange(CHUNKS):
         pull = np.empty(PARAMETERS, np.float32)
@@ -322,9 +324,12 @@ def adam_step(
                 other = np.uint64(neighbour[e])
                 for c in range(5):
                     pull[c] += _sign(values[t, c] - values[other, c])
-                for c in range(5, PARAMETERS):
+                for c in range(5, active):
                     pull[c] += values[t, c] - values[other, c]
-            for c in range(PARAMETERS):
+            for c in range(active, PARAMETERS):
+                data[t, c] = _0
+                new_values[t, c] = values[t, c]
+            for c in range(active):
                 value = values[t, c]
                 g = data[t, c] + mean_weight[c] * (_1 - values[t, 4] if c < 3 else _1)  # of base colour only the diffuse part
                 data[t, c] = _0

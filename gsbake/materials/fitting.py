@@ -13,17 +13,15 @@ from gsbake.capture.posed_photos import PosedPhotos
 from gsbake.capture.view_dependence import is_diffuse
 from gsbake.config.schema import Bake
 from gsbake.geometry.cameras import Camera
-from gsbake.geometry.turntable import turntable_share
-from gsbake.materials.passes import Finer, Priors, Scene, Target, run_passes
+from gsbake.materials.light_motions import light_motions
+from gsbake.materials.passes import Priors, Scene, Target, run_passes
 from gsbake.materials.photo import SURFACE_POINTS, MeshBrightness, Photo, PhotoReader, texel_weight
 from gsbake.materials.recipe import FIT, MAPS
-from gsbake.materials.starts import MOTIONS
-from gsbake.materials.state import Level, State
-from gsbake.materials.surface import InterpolatedTransport, Materials, Surface, neighbours
+from gsbake.materials.state import Finer, Level, State
+from gsbake.materials.surface import InterpolatedTransport, Materials, Surface, Transport, neighbours
 from gsbake.materials.visibility import Visibility
 from gsbake.meshing.resolution import pixel_footprint
 from gsbake.monitor import Monitor, PartSequence, Rule, decide_skip, skips
-from gsbake.shading.light_motion import LightMotion, Motion, light_rotations
 from gsbake.texturing.normal_map import DenseSamples
 from gsbake.texturing.projection import ProjectedTexture
 from gsbake.texturing.resampling import MIN_SIZE, CoarseTexture
@@ -41,8 +39,6 @@ SMOOTHING_RADIUS = 3.0
 MAX_PIXELS = 60_000
 #: Least weight of a texel, in frontal views at a texel's size, for its normal to be refined and for it to count as observed.
 MIN_OBSERVATIONS = 0.3
-#: Share of the cameras that must stand on exact circles for the light to turn (.59 on a turntable, 0 on captures from hand).
-MIN_TURNTABLE_SHARE = 0.5
 
 
 @dataclass(frozen=True)
@@ -109,10 +105,10 @@ def fit_materials(
         parts.start("light transport")
         cameras = [camera.downscaled_to(bake.fit_size) for camera in posed.cameras.cameras]
         footprint = pixel_footprint(cameras, surface.position.mean(0))
-        texture, half = _textures(surface, footprint, monitor)
+        texture, *coarser = _textures(surface, footprint, monitor)
         reader = PhotoReader(surface.atlas_caster, surface.atlas.uv, texture.texels, texture.down(detail.normal), surface.diagonal)
         read = _read_photos(surface, posed, reader, projected.gains, settings, monitor)
-        fine, coarse = _surfaces(surface, texture, half, reader.normal, occlusion, projected.values, bake, monitor)
+        fine, *surfaces = _surfaces(surface, texture, coarser, reader.normal, occlusion, projected.values, bake, monitor)
         diffuse = skips(settings.specular, read.diffuse)
         if fine.transport is not None and bake.visibility == "reflections" and not diffuse:
             offset = RAY_OFFSET * surface.diagonal
@@ -127,15 +123,17 @@ def fit_materials(
             rule: Rule = settings.metallic_map if name == "metallic_map" else settings.roughness_map
             return decide_skip(monitor, name, rule, holds, evidence, skipped, done)
 
-        level = read.level(fine)
-        motion, motions = _light_motions(cameras, bake.light_motion, monitor)
+        level, kept_out = read.level(fine), settings.holdout
+        for at, reduced in zip(surfaces, coarser, strict=True):
+            level, kept_out = _coarser_level(level, at, reduced, kept_out), 0
+        motion, motions = light_motions(cameras, bake.light_motion, monitor)
         scene = Scene(
             Priors.of(bake), bake.fit_iterations, settings.light_size, seed, diffuse, settings.without, progress,
-            motions=motions, flash=all(camera.flash for camera in cameras), decide=monitor.decide, finer=Finer(level, half),
+            motions=motions, flash=all(camera.flash for camera in cameras), decide=monitor.decide,
             target=Target(surface, texture, projected.values, read.cameras, skip),
         )  # fmt: skip
         started = time.perf_counter()
-        first = State.start(_coarse_level(level, coarse, half, settings.holdout).under(motion.rotations), settings.light_size, 0.5)
+        first = State.start(level.under(motion.rotations), settings.light_size, 0.5)
         state = run_passes(FIT, scene, replace(first, light_motion=motion))
         _report(state, read, settings.specular, monitor, 0.0 if diffuse else time.perf_counter() - started)
         parts.start("full texture")
@@ -143,13 +141,17 @@ def fit_materials(
         return _result(state, texture, footprint, read, detail)
 
 
-def _textures(surface: UnwrappedMesh, footprint: float, monitor: Monitor) -> tuple[CoarseTexture, CoarseTexture]:
-    """The texture of the fit, whose texels are about a pixel of the photos wide (`footprint`, in mesh units), and that of half its edge."""
+def _textures(surface: UnwrappedMesh, footprint: float, monitor: Monitor) -> list[CoarseTexture]:
+    """The texture of the fit, whose texels are about a pixel of the photos wide (`footprint`, in mesh units), and those of half its edge
+    and a quarter."""
     texture = CoarseTexture.of(surface.atlas.uv, surface.atlas.faces, surface.texels, surface.texel_size, footprint)
     size = texture.texels.size
-    half = CoarseTexture.sized(surface.atlas.uv, surface.atlas.faces, texture.texels, texture.edge, max(MIN_SIZE, size // 2))
+    found = [texture]
+    for part in (2, 4):
+        last = found[-1]
+        found.append(CoarseTexture.sized(surface.atlas.uv, surface.atlas.faces, last.texels, last.edge, max(MIN_SIZE, size // part)))
     monitor.decide("fit texture", f"{size}² texels", f"texel width {texture.edge / footprint:.2f} pixels")
-    return texture, half
+    return found
 
 
 def _read_photos(
@@ -175,58 +177,44 @@ def _read_photos(
 def _surfaces(
     surface: UnwrappedMesh,
     texture: CoarseTexture,
-    half: CoarseTexture,
+    coarser: list[CoarseTexture],
     normal: Floats,
     occlusion: Floats,
     projected: Floats,
     bake: Bake,
     monitor: Monitor,
-) -> tuple[Surface, Surface]:
-    """The texels of the fine and of the coarse level: geometry, ambient occlusion, light transport and initial base colour."""
+) -> list[Surface]:
+    """The texels of the fine level and of the `coarser` ones: geometry, ambient occlusion, light transport and initial base colour."""
     ambient, base = texture.down(occlusion[:, None]), texture.down(projected)
     position = texture.texels.interpolate(surface.position, surface.atlas.faces)
     if bake.visibility == "none":
         ambient = np.ones_like(ambient)
     pairs, indirect = neighbours(texture.texels, position, normal), bake.visibility in ("bounce", "reflections")
     fine = Surface(texture.texels, position, pairs, normal, ambient[:, 0], base, None, indirect)
-    coarse = fine.coarse(half)
+    found = [fine]
+    for reduced in coarser:
+        found.append(found[-1].coarse(reduced))
     if bake.visibility == "none" or not bake.occlusion_rays:
-        return fine, coarse
-    radius, rays = SMOOTHING_RADIUS * half.edge, 2 * bake.occlusion_rays  # over the whole sphere
-    transport = Visibility.trace(
-        coarse.texels, surface.atlas.uv, surface.atlas_caster, coarse.normal, rays, RAY_OFFSET * surface.diagonal, radius,
-        lambda *_: monitor.check_stop(),
-    )  # fmt: skip
-    return replace(fine, transport=InterpolatedTransport(transport, half)), replace(coarse, transport=transport)
+        return found
+    rays, offset = 2 * bake.occlusion_rays, RAY_OFFSET * surface.diagonal  # over the whole sphere
+    traced = [
+        Visibility.trace(
+            one.texels, surface.atlas.uv, surface.atlas_caster, one.normal, rays, offset, SMOOTHING_RADIUS * reduced.edge,
+            lambda *_: monitor.check_stop(),
+        )
+        for one, reduced in zip(found[1:], coarser, strict=True)
+    ]  # fmt: skip
+    transports: list[Transport] = [InterpolatedTransport(traced[0], coarser[0]), *traced]
+    return [replace(one, transport=transport) for one, transport in zip(found, transports, strict=True)]
 
 
-def _coarse_level(fine: Level, surface: Surface, half: CoarseTexture, holdout: int) -> Level:
-    """The coarse level. Few photos are held out, so it adds some of those to fit to the validation photos; the fine level fits them."""
-    photos, validation = ([p.on_coarse_texels(half, surface.normal) for p in role] for role in (fine.photos, fine.validation))
-    added = set(held_out(len(photos), holdout)) if validation else set()
+def _coarser_level(fine: Level, surface: Surface, texture: CoarseTexture, holdout: int) -> Level:
+    """The next coarser level. Few photos are held out, so it adds every `holdout`-th of those to fit to the validation photos, 0: none; the
+    fine level fits them."""
+    photos, validation = ([p.on_coarse_texels(texture, surface.normal) for p in role] for role in (fine.photos, fine.validation))
+    added = set(held_out(len(photos), holdout)) if validation and holdout else set()
     kept = [p for i, p in enumerate(photos) if i not in added]
-    return Level(surface, kept, validation + [photos[i] for i in sorted(added)])
-
-
-def _light_motions(cameras: list[Camera], asked: str, monitor: Monitor) -> tuple[LightMotion, dict[Motion, Doubles | None]]:
-    """How the light moves as `bake.light_motion` says, and where it does not, between which motions validation photos decide."""
-    motions: tuple[Motion, ...] = ("turntable", "camera")
-    under = {motion: rotations for motion in motions if (rotations := light_rotations(cameras, motion)) is not None}
-    if asked == "auto":
-        share = turntable_share(cameras) if "turntable" in under else 1.0
-        if share < MIN_TURNTABLE_SHARE:  # photos of a plain round object fit a light that turns too, by their noise
-            del under["turntable"]
-            monitor.decide("turntable", "none", f"{share:.0%} of the cameras stand on exact circles; {MIN_TURNTABLE_SHARE:.0%} are needed")
-        if "camera" in under and all(camera.flash is False for camera in cameras):
-            del under["camera"]
-            monitor.decide("flash", "none", f"EXIF says of all {len(cameras)} photos that it did not fire")
-        return LightMotion(), {"static": None, **under}
-    found = next((motion for motion in under if motion == asked), None)
-    if asked != "static" and found is None:
-        monitor.warn(f"bake.light_motion is {asked}, but the cameras do not turn about one axis; the light is taken to stand.")
-    motion = LightMotion() if found is None else LightMotion(found, under[found])
-    monitor.decide("light", MOTIONS[motion.motion], "bake.light_motion")
-    return motion, {}
+    return Level(surface, kept, validation + [photos[i] for i in sorted(added)], Finer(fine, texture))
 
 
 def _report(state: State, read: _Photos, specular: Rule, monitor: Monitor, saved: float) -> None:

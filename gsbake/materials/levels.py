@@ -46,16 +46,16 @@ class PureMetals:
 
 @dataclass(frozen=True)
 class FineLevel:
-    """Goes on to the finer level, with base colours that take their detail from the photos' colours there."""
+    """Goes on to the next finer level, with base colours that take their detail from the photos' colours there."""
 
     def applies(self, scene: Scene, state: State) -> bool:
         """Where there is one."""
-        return scene.finer is not None
+        return state.level.finer is not None
 
     def run(self, scene: Scene, state: State) -> State:
         """The state interpolated at the finer texels."""
-        assert scene.finer is not None
-        up, level = scene.finer.texture.up, scene.finer.level.under(state.light_motion.rotations)
+        assert state.level.finer is not None
+        up, level = state.level.finer.texture.up, state.level.finer.level.under(state.light_motion.rotations)
         values = up(state.values)
         detail = (level.surface.base_color + DETAIL_OFFSET) / (up(state.level.surface.base_color) + DETAIL_OFFSET)
         values[:, :3] = np.clip(values[:, :3] * np.clip(detail, 1 / MAX_DETAIL_RATIO, MAX_DETAIL_RATIO), *LIMITS.base_color)
@@ -76,8 +76,9 @@ class GradientSteps:
         return True
 
     def run(self, scene: Scene, state: State) -> State:
-        """The state after the steps."""
-        return descend(scene, state, self.steps, scene.each(self.name))
+        """The state after the steps, with the light's intensity that searches left."""
+        found = descend(scene, state, self.steps, scene.each(self.name))
+        return replace(found, intensity=found.mean_intensity)
 
 
 @dataclass(frozen=True)

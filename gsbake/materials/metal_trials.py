@@ -52,6 +52,8 @@ class KindTrialOptions:
     #: things are.
     min_decrease: float = 0.005
     min_own_decrease: float = 0.5
+    #: So many trials in a row that changed nothing are the last: the evidence for those that follow is weaker.
+    max_refused: int = 4
 
 
 OPTIONS = KindTrialOptions()
@@ -96,8 +98,12 @@ class KindTrials:
                 before, tried = tried, tried.with_trial(models, metal, likelier, observed)
                 if tried.turns != before.turns:
                     models, tries = _candidates(tried.base, observed)
+        refused = 0
         for _, metal, group in tries:
-            tried = tried.with_trial(models, metal, [group], observed)
+            before, tried = tried, tried.with_trial(models, metal, [group], observed)
+            refused = refused + (tried.count > before.count) if tried.turns == before.turns else 0
+            if refused == OPTIONS.max_refused:
+                break
         found = f"{tried.count} trials of the other kind: {', '.join(map(str, tried.turns)) or 'none kept'}"
         return replace(tried.base, kinds_changed=bool(tried.turns), evidence=f"{state.evidence}; {found}")
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from gsbake.config.schema import Bake
 from gsbake.geometry.cameras import Camera
 from gsbake.materials.concurrent_fits import Each
-from gsbake.materials.state import Level, State
+from gsbake.materials.state import State
 from gsbake.shading.light_motion import Motion
 from gsbake.texturing.resampling import CoarseTexture
 from gsbake.texturing.unwrapped_mesh import UnwrappedMesh
@@ -48,14 +48,6 @@ def _undecided(what: str, choice: str, evidence: str) -> None:
 
 
 @dataclass(frozen=True)
-class Finer:
-    """A finer `level`, whose texels `texture` reduces to those of the present one."""
-
-    level: Level
-    texture: CoarseTexture
-
-
-@dataclass(frozen=True)
 class Target:
     """Where the maps go: the `mesh` with the texels of the asset, which `texture` reduces to those of the fit, the photos' colours
     `projected` (n, 3) there, and their `cameras`; `skip` decides on a rule of [skip] by measurements."""
@@ -74,7 +66,7 @@ class Scene:
     `iterations` of one candidate in all; `light_size`, edge of the environment map's faces in texels; `diffuse`: without specular
     reflection; `without`, names of passes that are left out; `random` decides which texels searches look at. `motions`, the ways in
     which the light may move with its rotations (photos, 3, 3); whether a `flash` fired in all photos; `decide` reports a decision: what,
-    the choice, the evidence. The fit goes on from its level to the `finer` one, and from there to the `target`.
+    the choice, the evidence. The maps go to the `target`.
     """
 
     priors: Priors
@@ -87,7 +79,6 @@ class Scene:
     motions: Mapping[Motion, NDArray[np.float64] | None] = field(default_factory=dict)
     flash: bool = False
     decide: Callable[[str, str, str], None] = _undecided
-    finer: Finer | None = None
     target: Target | None = None
     random: np.random.Generator = field(default_factory=lambda: np.random.default_rng(0))
 

@@ -52,8 +52,6 @@ class PixelWeights:
 WEIGHTS = PixelWeights()
 #: Offsets of supersampling rays from a pixel's centre, in pixels: a rotated grid, no two in one row or column.
 SUBPIXEL_OFFSETS = ((-0.17, -0.5), (0.5, -0.17), (0.17, 0.5), (-0.5, 0.17))
-#: The coarse level keeps every so many pixels of a photo: as its texels cover as many.
-COARSE_STEP = 4
 
 
 @dataclass(frozen=True)
@@ -124,9 +122,9 @@ class Photo:
         return replace(self, colour=encode(decode(self.colour) / np.asarray(gain, np.float32)))
 
     def on_coarse_texels(self, texture: CoarseTexture, normal: NDArray[np.floating]) -> Photo:
-        """Every `COARSE_STEP`-th pixel, reading the coarse texels of `texture`, which have the `normal` (m, 3), that contain the fine
-        ones."""
-        chosen, parent = self.every(COARSE_STEP), coarse_texels(texture)
+        """One pixel of as many as a coarse texel of `texture` has fine ones, reading the coarse texels that contain these, which have the
+        `normal` (m, 3)."""
+        chosen, parent = self.every(_factor(texture) ** 2), coarse_texels(texture)
         found = parent[chosen.texel]
         bilinear = np.where(found >= 0, chosen.bilinear, 0).astype(np.float32)
         total = bilinear.sum(1)
@@ -139,9 +137,14 @@ class Photo:
 
 def coarse_texels(texture: CoarseTexture) -> NDArray[np.int64]:
     """The coarse texel (n,) that contains each fine one, -1: none."""
-    factor = texture.fine.size // texture.texels.size
+    factor = _factor(texture)
     row, column = np.divmod(texture.fine.index, texture.fine.size)
     return texture.texels.lookup[row // factor * texture.texels.size + column // factor]
+
+
+def _factor(texture: CoarseTexture) -> int:
+    """Edge of a coarse texel in fine ones."""
+    return texture.fine.size // texture.texels.size
 
 
 def texel_weight(photos: Iterable[Photo], count: int) -> Floats:

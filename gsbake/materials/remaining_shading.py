@@ -19,7 +19,7 @@ iteratively reweighted least squares.
 That is not convex: where shading is strong, pairs across it look like different base colours and drop out before it is found. So it is
 solved twice, once with scales that start wide (graduated non-convexity: Blake & Zisserman, *Visual Reconstruction*, 1987), and the
 solution with which more pairs agree is taken; the wide one must win clearly, as it may take a base colour that varies with the normal
-for shading.
+for shading. What is left after such a solution is weak, and not looked for with wide scales again.
 
 Delighting compares near points only, under one white light whose irradiance E(n) = 1 + Σ_k e_k Y_k(n) itself is of low order. Its intensity
 is not observable: the median shading is set to 1, and no base colour may exceed that of white paper.
@@ -55,8 +55,8 @@ POINTS, PARTNERS, NEIGHBOURS, NEIGHBOUR_RADIUS = 4000, 64, 48, 0.15
 CHROMATICITY_SCALE, BRIGHTNESS_SCALE, NEARBY_BRIGHTNESS_SCALE = 0.06, 0.1, 0.2
 #: Added to linear base colours before the logarithm; differences of logarithms below the second are noise.
 LOG_OFFSET, NOISE_FLOOR = 0.004, 0.03
-#: Ridge weight of the coefficients, rounds of reweighting, and damping of a step.
-RIDGE, ROUNDS, DAMPING = 1e-3, 25, 0.7
+#: Ridge weight of the coefficients, rounds of reweighting at most, damping of a step, and the change of a coefficient below which they end.
+RIDGE, ROUNDS, DAMPING, CONVERGED = 1e-3, 25, 0.7, 1e-3
 #: Factor on all scales and on the noise floor where they start wide, the share of the rounds in which it falls to 1, and by how much the
 #: agreement must then be larger.
 WIDENING, WIDENED_SHARE, MIN_AGREEMENT_GAIN = 20.0, 0.6, 0.01
@@ -95,15 +95,16 @@ class RemainingShading:
             if turn:
                 state = descend(scene, state, self.steps, scene.each("remaining shading"))
             seed = scene.seed + turn
-            state = moved_to_light(state, shading_of(state, seed), seed)
+            state = moved_to_light(state, shading_of(state, seed, widen=not turn), seed)
         return state
 
 
-def shading_of(state: State, seed: int) -> Doubles:
-    """Coefficients (8, 3) of the log shading that is left in the base colours of dielectrics."""
+def shading_of(state: State, seed: int, widen: bool = True) -> Doubles:
+    """Coefficients (8, 3) of the log shading that is left in the base colours of dielectrics; `widen`: it may be strong."""
     texel, surface = np.flatnonzero(state.dielectric), state.level.surface
     position = np.asarray(surface.position)[texel]
-    return remaining_shading(state.materials.base_color[texel], surface.unit_normals[texel], position, np.random.default_rng(seed))
+    generator = np.random.default_rng(seed)
+    return remaining_shading(state.materials.base_color[texel], surface.unit_normals[texel], position, generator, widen)
 
 
 @torch.no_grad()
@@ -222,17 +223,24 @@ class _Pairs(NamedTuple):
 
 
 def remaining_shading(
-    base_color: NDArray[np.floating], normal: NDArray[np.floating], position: NDArray[np.floating], generator: np.random.Generator
+    base_color: NDArray[np.floating],
+    normal: NDArray[np.floating],
+    position: NDArray[np.floating],
+    generator: np.random.Generator,
+    widen: bool = True,
 ) -> Doubles:
     """Coefficients e (8, 3) of the log shading that is left in the linear base colours (n, 3) of points with unit normals (n, 3) and
-    positions (n, 3); zeros where there are fewer than two points."""
+    positions (n, 3); zeros where there are fewer than two points. Without `widen` scales do not start wide."""
     if len(base_color) < 2:
         return np.zeros((8, 3))
     chosen = generator.choice(len(base_color), min(POINTS, len(base_color)), replace=False)
     logs = np.log(np.maximum(np.asarray(base_color[chosen], np.float64), 0) + LOG_OFFSET)
     points = np.column_stack([harmonics(normal[chosen]), logs]).astype(np.float32)
     pairs = _Pairs.of(points, np.asarray(position[chosen], np.float64), generator)
-    (plain, agreement), (widened, widened_agreement) = (_solve(pairs, widening) for widening in (1.0, WIDENING))
+    plain, agreement = _solve(pairs, 1.0)
+    if not widen:
+        return plain
+    widened, widened_agreement = _solve(pairs, WIDENING)
     return widened if widened_agreement > (1 + MIN_AGREEMENT_GAIN) * agreement else plain
 
 
@@ -246,10 +254,13 @@ def _solve(pairs: _Pairs, widening: float) -> tuple[Doubles, float]:
     for turn in range(ROUNDS):
         wider = max(1.0, widening ** (1 - turn / (WIDENED_SHARE * ROUNDS)))
         normal_equations(*pairs, found.astype(np.float32), wider, *sums)
+        before = found.copy()
         for channel in range(3):
             ridge = RIDGE * max(float(weights[:, channel].sum()), 1e-12)
             step = rights[:, channel].sum(0) - ridge * found[:, channel]
             found[:, channel] += DAMPING * np.linalg.solve(matrices[:, channel].sum(0) + ridge * np.eye(8), step)
+        if wider == 1 and np.abs(found - before).max() < CONVERGED:
+            break
     normal_equations(*pairs, found.astype(np.float32), 1.0, *sums)
     return found, float(agreement.sum())
 

@@ -44,7 +44,7 @@ class LightSearch:
     it by the prior where most is metal. Adds to the `adjustments`."""
 
     #: Pixels that a search uses at most: more do not change what it finds.
-    pixels: int = 100_000
+    pixels: int = 40_000
     #: Photos that take part where the light moves: each has tables of its own.
     moving_photos: int = 12
     #: Searches that include the light's tint on a diffuse object: its reflections hardly determine the tint, which then drifts.

@@ -2,9 +2,10 @@
 
 Gradient steps find the optimum near their start. A surface that starts too rough cannot localise light, and its reflections end up in base
 colour; one that starts dielectric explains a metal's reflections by a diffuse base colour under a light of their colour, and stays there.
-So short fits on the coarse level, from all-dielectric and all-metal starts of several roughnesses, are compared on photos that they were
+So short fits on the coarsest level, from all-dielectric and all-metal starts of several roughnesses, are compared on photos that they were
 not fitted to. On the way texels are decided one by one between metal and dielectric, so either start can end as any mixture. Those close to
-the best are continued with all searches, on the coarse level, and compared again.
+the best are continued with all searches, and compared again. What is used of them is the start that won: the fit itself starts there anew,
+on a finer level.
 
 They are compared by a robust error: a sharp reflection a few pixels off counts twice in the squared error, where it is and where it should
 be, so that the PSNR prefers materials that are too rough. Fits that started with another roughness often explain the photos as well, by a
@@ -78,15 +79,16 @@ class StartComparison:
         return True
 
     def run(self, scene: Scene, state: State) -> State:
-        """The chosen fit on the level of `state`, with the evidence."""
+        """The same with the chosen start and the evidence."""
 
         def tried(level: Level, starts: Sequence[Start]) -> Trials:
             return descend_all(started(scene, level, starts), self.trial, scene, "trial fits")
 
         starts, reason = self.compared(state.level, scene.diffuse, tried)
-        trials = tried(state.level, starts)
-        best = self.best(trials, lambda chosen: descend_all(chosen, self.full, scene, "material fit, coarse level"), reason)
-        return replace(best, intensity=best.mean_intensity, light_motion=state.light_motion)
+        if len(starts) == 1:
+            return replace(state, chosen_start=starts[0], evidence=reason)
+        best = self.best(tried(state.level, starts), lambda chosen: descend_all(chosen, self.full, scene, "trial fits"))
+        return replace(state, chosen_start=best.chosen_start, evidence=best.evidence)
 
     def compared(self, level: Level, diffuse: bool, tried: Callable[[Level, Sequence[Start]], Trials]) -> tuple[tuple[Start, ...], str]:
         """The starts to compare, and why, where that is one: of a diffuse object, or without validation photos."""
@@ -105,11 +107,10 @@ class StartComparison:
         reason = f"no validation photos; by every {self.kind_holdout}th photo, fitted afterwards: {_percent(errors)}"
         return (metal if clear else self.default_start,), reason
 
-    def best(self, trials: Trials, further: RunAll, reason: str = "") -> State:
-        """The state with the least validation error of those that continue the best of the `trials` by `further`; `reason` is the evidence
-        for a single one."""
+    def best(self, trials: Trials, further: RunAll) -> State:
+        """The state with the least validation error of those that continue the best of the `trials` by `further`, with the evidence."""
         errors = {start: state.error for start, state in trials.items()}
-        evidence = _percent(errors) if len(errors) > 1 else reason
+        evidence = _percent(errors)
         found = further({start: trials[start] for start in self.close(errors)})
         continued = {start: state.error for start, state in found.items()}
         weighed = {start: error * _prior_factor(found[start]) for start, error in continued.items()}
@@ -161,6 +162,22 @@ class MotionComparison:
         best = min(errors, key=lambda motion: errors[motion] / (1 - gains[motion]))
         scene.decide("light", MOTIONS[best], ", ".join(f"{error:.2%} error where it {MOTIONS[m]}" for m, error in errors.items()))
         return replace(state, level=levels[best], light_motion=LightMotion(best, scene.motions[best]))
+
+
+@dataclass(frozen=True)
+class ChosenStart:
+    """Starts anew on the next finer level, from the start that was chosen on this one."""
+
+    def applies(self, scene: Scene, state: State) -> bool:
+        """Always."""
+        return True
+
+    def run(self, scene: Scene, state: State) -> State:
+        """The start there."""
+        assert state.level.finer is not None
+        level = state.level.finer.level.under(state.light_motion.rotations)
+        (start,) = started(scene, level, (state.chosen_start,)).values()
+        return replace(start, chosen_start=state.chosen_start, evidence=state.evidence, light_motion=state.light_motion)
 
 
 def started(scene: Scene, level: Level, starts: Sequence[Start]) -> Trials:

@@ -22,6 +22,7 @@ from gsbake.shading.cubemap import solid_angles
 from gsbake.shading.environment import EnvironmentLight
 from gsbake.shading.light_motion import LightMotion, mean_radiance
 from gsbake.shading.light_tables import irradiance
+from gsbake.texturing.resampling import CoarseTexture
 
 Floats = NDArray[np.float32]
 Doubles = NDArray[np.float64]
@@ -56,12 +57,21 @@ LIMITS = Limits()
 
 
 @dataclass(frozen=True)
+class Finer:
+    """A finer `level`, whose texels `texture` reduces to those of the present one."""
+
+    level: Level
+    texture: CoarseTexture
+
+
+@dataclass(frozen=True)
 class Level:
-    """One resolution of the fit: the texels of its `surface`, the `photos` to fit, and those for `validation`."""
+    """One resolution of the fit: the texels of its `surface`, the `photos` to fit, and those for `validation`; and the next `finer` one."""
 
     surface: Surface
     photos: list[Photo]
     validation: list[Photo]
+    finer: Finer | None = None
 
     @property
     def validated(self) -> bool:
@@ -102,7 +112,7 @@ class State:
     steps: int
     transport: Records
     light: EnvironmentLight
-    light_moments: tuple[torch.Tensor, torch.Tensor, torch.Tensor] | None = None
+    light_moments: tuple[torch.Tensor, torch.Tensor, int] | None = None
     from_metal: bool = False
     light_given: bool = False
     adjustments: tuple[LightAdjustment, ...] = ()

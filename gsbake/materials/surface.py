@@ -1,8 +1,9 @@
-"""The surface of a fit: texels of a texture with their geometry, neighbours and light transport, at the two resolutions of the fit.
+"""The surface of a fit: texels of a texture with their geometry, neighbours and light transport, at the three resolutions of the fit.
 
 The fit works on a texture of about a pixel of the photos per texel, and on one of half its edge with a quarter of the pixels, on which
-starts are compared and searches are made. Visibility and indirect light vary slowly over the surface: they are traced on the coarse
-texture and interpolated. Neighbours are texels that share an edge in the texture, and texels across seams between charts.
+searches are made; starts are compared on one of half the edge of that. Visibility and indirect light vary slowly over the surface: they are
+traced on the coarser textures, and interpolated on the finest. Neighbours are texels that share an edge in the texture, and texels across
+seams between charts.
 
 Texels of similar appearance decide together: averages of texel values over the surface stop at edges of its appearance. The average u of
 values f solves (1 + L) u = f, where L is the Laplacian of the graph of neighbouring texels, across seams included; edge weights fall with

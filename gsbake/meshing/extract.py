@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -12,21 +12,20 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from gsbake.capture.full_photos import FullPhotos
 from gsbake.capture.photos.roles import test_photos
 from gsbake.capture.posed_photos import PosedPhotos
 from gsbake.config.schema import Mesh
 from gsbake.errors import BadInputError
-from gsbake.geometry.cameras import Camera
 from gsbake.geometry.ply import write_mesh
 from gsbake.meshing import cleanup
 from gsbake.meshing.decimation import decimate_to_error_bound
 from gsbake.meshing.decimator_choice import resolve_decimator
-from gsbake.meshing.decimators import remesh
 from gsbake.meshing.depth_cache import DepthViewCache
 from gsbake.meshing.depth_views import DepthView, depth_noise
 from gsbake.meshing.refinement.normal_filter import denoise
 from gsbake.meshing.refinement.normals import NormalAccumulator, integrate_normals
-from gsbake.meshing.refinement.photometric_measure import PatchTargets, PhotometricViews
+from gsbake.meshing.refinement.shape import ShapeRefinement
 from gsbake.meshing.repair import close_holes, repair
 from gsbake.meshing.resolution import Resolution, choose_resolution, pixel_footprint
 from gsbake.meshing.stereo_depth import merge_stereo_depth
@@ -35,11 +34,6 @@ from gsbake.meshing.tsdf import SparseTsdf
 from gsbake.meshing.untangling import untangle
 from gsbake.monitor import SILENT, Monitor, Rule, decide_skip, skips
 from gsbake.mvs.depth_maps import read_depth
-from gsbake.mvs.pyramids import Photo, load_photo
-from gsbake.shape_refinement.refine import pixel_size, proxy_edge, refine_shape
-from gsbake.shape_refinement.samples import load_photos
-from gsbake.shape_refinement.surface import Surface
-from gsbake.shape_refinement.transfer import transfer_displacements
 from gsbake.surfels.field import Field
 from gsbake.surfels.fields.continuous import ContinuousField
 from gsbake.surfels.fields.registry import load_field
@@ -55,10 +49,6 @@ Faces = NDArray[np.int32]
 TRUNCATION_CELLS = (4.0, 10.0)
 #: Maximum difference in voxels at which a stereo depth replaces a rendered one.
 STEREO_TOLERANCE = 3.0
-#: Memory for photos whose patches are compared, in bytes.
-PHOTO_CACHE_BYTES = 1 << 29
-#: Most photos that the shape is refined with.
-MAX_REFINEMENT_PHOTOS = 96
 #: Minimum extent of the surfels in the unit frame.
 MIN_EXTENT = 1e-9
 #: Maximum boundary edges of a hole that is filled after meshing; larger ones are openings.
@@ -68,12 +58,13 @@ MAX_HOLE_EDGES = 400
 @dataclass(frozen=True)
 class MeshOptions:
     """Settings of mesh extraction; `train_size` and `stereo_size` are the longer sides in pixels of the photos in training and stereo,
-    `empty_cells` is the rule of [skip], `projected_depth` that of [surfels], `max_triangles` the limit of the exported asset; every
-    `holdout`-th photo is kept out."""
+    which matches larger photos at `stereo_scale` of their size, `empty_cells` is the rule of [skip], `projected_depth` that of [surfels],
+    `max_triangles` the limit of the exported asset; every `holdout`-th photo is kept out."""
 
     mesh: Mesh = Mesh()
     train_size: int = 512
     stereo_size: int = 800
+    stereo_scale: float = 0.3
     empty_cells: Rule = "auto"
     projected_depth: bool = False
     max_triangles: int = 100_000
@@ -91,6 +82,7 @@ def extract_mesh(
     out: Path,
     options: MeshOptions | None = None,
     *,
+    ingest: Path | None = None,
     stereo: Path | None = None,
     seed: int = 0,
     threads: int = 2,
@@ -100,11 +92,11 @@ def extract_mesh(
 ) -> dict[str, Any]:
     """Mesh the surfels of the folder `surfels`; write `dense.ply` and `mesh.ply` (unit frame) into `out` and return the results.
 
-    `stereo` is the folder that `run_stereo` wrote; temporary depth maps are written below `scratch`. Raises BadInputError when the surfels
-    contain no surface.
+    `ingest` has the photos at full size; `stereo` is the folder that `run_stereo` wrote; temporary depth maps are written below `scratch`.
+    Raises BadInputError when the surfels contain no surface.
     """
-    run = _Extraction(PosedPhotos.open(poses, surfels), surfels, stereo, out, options or MeshOptions(), seed, threads, device, monitor)
-    with tempfile.TemporaryDirectory(dir=scratch, prefix="depth-") as folder:
+    with FullPhotos(ingest, poses, surfels) as photos, tempfile.TemporaryDirectory(dir=scratch, prefix="depth-") as folder:
+        run = _Extraction(photos, surfels, stereo, out, options or MeshOptions(), seed, threads, device, monitor)
         return run.extract(DepthViewCache(Path(folder)))
 
 
@@ -112,7 +104,7 @@ def extract_mesh(
 class _Extraction:
     """Inputs and settings of one mesh extraction."""
 
-    posed: PosedPhotos
+    photos: FullPhotos
     trained: Path
     stereo: Path | None
     out: Path
@@ -121,6 +113,11 @@ class _Extraction:
     threads: int
     device: str
     monitor: Monitor
+
+    @property
+    def posed(self) -> PosedPhotos:
+        """The working photos."""
+        return self.photos.posed
 
     @cached_property
     def renderer(self) -> SurfelRenderer:
@@ -305,55 +302,19 @@ class _Extraction:
         return integrate_normals(vertices, faces, normals, confidence, wavelength, max_displacement=1.5 * cell)
 
     def _refine_shape(self, vertices: Doubles, faces: Faces, cell: float) -> tuple[Doubles, dict[str, float]]:
-        """Refine the vertices by the masks and photos, on a coarser mesh; also results for the manifest."""
-        settings, monitor, posed = self.options.mesh, self.monitor, self.posed
+        """The vertices refined by masks and photos (`ShapeRefinement`); also results for the manifest."""
+        options, posed = self.options, self.posed
         if len(faces) == 0:
             return vertices, {}
-        if not settings.refinement_vertices:
-            monitor.decide("shape refinement", "skipped", "set by the profile")
+        if not options.mesh.refinement_vertices:
+            self.monitor.decide("shape refinement", "skipped", "set by the profile")
             return vertices, {}
-        test = set(test_photos(len(posed), self.options.holdout))
-        chosen = evenly([index for index in range(len(posed)) if index not in test], MAX_REFINEMENT_PHOTOS)
-        size, decimator = self.options.stereo_size, resolve_decimator(settings.decimator)
-        cameras = [posed.cameras.cameras[index].downscaled_to(size) for index in chosen]
-        pixel = pixel_size(vertices, cameras)
-        edge = proxy_edge(vertices, faces, pixel, settings.refinement_vertices)
-        coarse, coarse_faces = remesh(vertices, faces, edge, settings.refinement_vertices, decimator)
-        if len(coarse_faces) == 0:
-            return vertices, {}
-        result = refine_shape(
-            coarse, coarse_faces, lambda blur: load_photos(posed, chosen, size, blur, monitor.check_stop),
-            (lambda: (posed.mask(index) for index in chosen)) if posed.has_masks else None,
-            pixel, self._patches(chosen, cameras, STEREO_TOLERANCE * cell), seed=self.seed, threads=self.threads, monitor=monitor,
+        test = set(test_photos(len(posed), options.holdout))
+        run = ShapeRefinement(
+            self.photos, [index for index in range(len(posed)) if index not in test], self.stereo, STEREO_TOLERANCE * cell,
+            options.mesh.refinement_vertices, resolve_decimator(options.mesh.decimator), self.seed, self.threads, self.monitor,
         )  # fmt: skip
-        before, fine = Surface(len(coarse), coarse_faces), Surface(len(vertices), faces)
-        move = transfer_displacements(vertices, fine.normals(vertices), coarse, before.normals(coarse), result.vertices)
-        figures = result.figures
-        evidence = f"{len(coarse)} vertices in {len(chosen)} photos; {100 * figures['confirmed']:.0f} % of the surface match in most photos"
-        if "explained" in figures:
-            evidence += f"; reflections explain {100 * figures['explained']:.0f} % of what changes between photos"
-        elif "predicted" in figures:
-            evidence += f"; no reflections: fitted to other photos they predict {100 * figures['predicted']:.0f} % of what changes"
-        if "contour_after" in figures:
-            evidence += f"; contours {figures['contour_before']:+.2f} px from the masks before, {figures['contour_after']:+.2f} px after"
-        monitor.decide("shape refinement", f"mean displacement {figures['moved_pixels']:.2f} px", evidence)
-        return vertices + move, {f"refinement_{name}": value for name, value in figures.items()}
-
-    def _patches(self, chosen: list[int], cameras: list[Camera], tolerance: float) -> PatchTargets | None:
-        """What compares patches of the `chosen` photos where stereo confirmed depths; None where it did nowhere."""
-        files = [] if self.stereo is None else [self.stereo / "depth" / f"{camera.name}.npz" for camera in cameras]
-        if not any(file.exists() for file in files):
-            return None
-
-        @lru_cache(maxsize=max(8, PHOTO_CACHE_BYTES // (2 * max(c.width * c.height for c in cameras))))
-        def photo(index: int) -> Photo:
-            self.monitor.check_stop()
-            return load_photo(self.posed, chosen[index], self.options.stereo_size)
-
-        return PatchTargets(
-            PhotometricViews(cameras, photo, lambda index: read_depth(files[index]) if files[index].exists() else None, tolerance),
-            self.threads,
-        )
+        return run.refine(vertices, faces, options.stereo_size, self.photos.size_of(options.stereo_size, options.stereo_scale))
 
     def _decimate(self, vertices: Doubles, faces: Faces, cell: float) -> dict[str, Any]:
         """Decimate and write the low-poly mesh; its results for the manifest."""
@@ -380,12 +341,6 @@ class _Extraction:
             "decimation_deviation_cells": deviation,
             "decimation_error_cells": result.deviation.maximum / cell,
         }
-
-
-def evenly(indices: list[int], most: int) -> list[int]:
-    """At most `most` of the indices, evenly spread."""
-    count = min(len(indices), most)
-    return [indices[k * len(indices) // count] for k in range(count)]
 
 
 def _noise(cache: DepthViewCache) -> float:

@@ -8,11 +8,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from gsbake.capture.full_photos import FullPhotos
 from gsbake.capture.hull.visual_hull import Hull
-from gsbake.capture.posed_photos import PosedPhotos
+from gsbake.capture.posed_photos import Bytes, PosedPhotos
 from gsbake.checkpoint import is_sealed, seal_file
 from gsbake.geometry.cameras import Array
 from gsbake.mvs.carving import CarvedHull, carve_hull
@@ -37,13 +39,15 @@ MAX_CONSISTENCY_THREADS = 6
 
 @dataclass
 class StereoRun:
-    """State of one run. `settings` is the section [stereo]; matched planes go into the folder `planes_folder`.
+    """State of one run. `size` is the longer side of the matched photos in pixels; `settings` is the section [stereo]; matched planes go
+    into the folder `planes_folder`.
 
     `report(i, text)` is called in the main thread after each photo and may raise to stop. Per photo: the image pyramid, the source views,
     the views of the consistency check, and the depths (h, w; 0 = none) that were consistent in the first check.
     """
 
-    posed: PosedPhotos
+    photos: FullPhotos
+    size: int
     settings: Any
     hull: Hull | None
     seed: int
@@ -55,9 +59,14 @@ class StereoRun:
     consistency_views: list[list[int]] = field(default_factory=list)
     consistent_depths: list[NDArray[np.float32]] = field(default_factory=list)
 
+    @property
+    def posed(self) -> PosedPhotos:
+        """The working photos."""
+        return self.photos.posed
+
     def prepare(self) -> None:
         """Load the photos and select their views."""
-        self.pyramids = self.parallel(lambda i: image_pyramid(load_photo(self.posed, i, self.settings.max_size)), "photos")
+        self.pyramids = self.parallel(lambda i: image_pyramid(load_photo(self.photos, i, self.size)), "photos")
         points, normals = self._surface_samples()
         cameras, settings = self.posed.cameras.cameras, self.settings
         self.sources, self.consistency_views = select_views(cameras, points, normals, settings.neighbours, settings.consistency_views)
@@ -164,5 +173,10 @@ class StereoRun:
 
     def fuse(self, maps: Sequence[DepthMap]) -> StereoCloud:
         """Fuse the depth maps."""
-        size = self.settings.max_size
-        return fuse(maps, self.consistency_views, lambda i: self.posed.view(i, size).rgb, lambda i: self.report(i + 1, "fusing"))
+        return fuse(maps, self.consistency_views, self._colours, lambda i: self.report(i + 1, "fusing"))
+
+    def _colours(self, index: int) -> Bytes:
+        """The working photo (h, w, 3) at the size of the matched one."""
+        camera, rgb = self.pyramids[index][-1].camera, self.posed.view(index, self.size).rgb
+        size = camera.width, camera.height
+        return rgb if rgb.shape[1::-1] == size else np.asarray(cv2.resize(rgb, size, interpolation=cv2.INTER_LINEAR), np.uint8)

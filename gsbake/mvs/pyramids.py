@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gsbake.capture.posed_photos import PosedPhotos
+from gsbake.capture.full_photos import FullPhotos
 from gsbake.geometry.cameras import Array, Camera
 from gsbake.mvs.ncc import RADIUS, pack_2x2
 
@@ -38,17 +38,17 @@ class Photo:
         return Photo(self.camera.scaled(width, height), np.asarray(grey, np.uint8), (inside >= 128).astype(np.uint8))
 
 
-def load_photo(posed: PosedPhotos, index: int, max_size: int) -> Photo:
+def load_photo(photos: FullPhotos, index: int, max_size: int) -> Photo:
     """Photo `index` of a capture with the longer side at most `max_size`; without a mask all pixels are inside, but for those that
     do not show the region."""
-    view = posed.view(index, max_size)
+    view = photos.view(index, max_size)
     grey = cv2.cvtColor(view.rgb, cv2.COLOR_RGB2GRAY)
     if view.mask is None:
         inside = np.ones(grey.shape, np.uint8)
     else:
         box = np.ones((2 * MASK_DILATION + 1, 2 * MASK_DILATION + 1), np.uint8)
         inside = np.asarray(cv2.dilate((view.mask > 127).astype(np.uint8), box), np.uint8)
-    if (region := posed.region) is not None:
+    if (region := photos.posed.region) is not None:
         inside &= region.silhouette(view.camera) // np.uint8(255)
     return Photo(view.camera, np.asarray(grey, np.uint8), inside)
 

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import tempfile
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from gsbake.capture.full_photos import FullPhotos
 from gsbake.capture.hull.rigidity import moved_part
 from gsbake.capture.hull.softness import SOFT, surface_softness
 from gsbake.capture.hull.thin_parts import find_thin_parts
@@ -39,6 +41,7 @@ def run_stereo(
     out: Path,
     options: Stereo | None = None,
     *,
+    ingest: Path | None = None,
     holdout: int = 8,
     seed: int = 0,
     threads: int = 2,
@@ -48,17 +51,25 @@ def run_stereo(
     """Match the photos of the folder `poses` and write depth maps and points into the folder `out`; return the figures.
 
     Written: `points.ply` (unit frame), `depth/<name>.npz`, and with masks `hull.npz` and `thin.npz`. Nothing is written where matching is
-    skipped: by the options, or because photos are too few or too small. `scratch` keeps finished planes, so an interrupted run resumes.
+    skipped: by the options, or because photos are too few or too small. `ingest` has the photos at full size; without it the working photos
+    are the largest. `scratch` keeps finished planes, so an interrupted run resumes.
     """
     options = options or Stereo()
-    posed = PosedPhotos.open(poses)
-    reason = _skip_reason(posed, options)
-    if reason is not None:
-        monitor.decide("stereo", "skipped", reason)
-        return {"points": 0}
-    if scratch is None:
-        with tempfile.TemporaryDirectory(prefix="gsbake-stereo-") as folder:
-            return run_stereo(poses, out, options, holdout=holdout, seed=seed, threads=threads, scratch=Path(folder), monitor=monitor)
+    with FullPhotos(ingest, poses, readers=threads) as photos, ExitStack() as stack:
+        reason = _skip_reason(photos.posed, options)
+        if reason is not None:
+            monitor.decide("stereo", "skipped", reason)
+            return {"points": 0}
+        if scratch is None:
+            scratch = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="gsbake-stereo-")))
+        return _run(photos, out, options, holdout, seed, threads, scratch, monitor)
+
+
+def _run(
+    photos: FullPhotos, out: Path, options: Stereo, holdout: int, seed: int, threads: int, scratch: Path, monitor: Monitor
+) -> dict[str, Any]:
+    """See `run_stereo`."""
+    posed, size = photos.posed, photos.size_of(options.max_size, options.min_scale)
 
     def report(done: int, text: str) -> None:
         monitor.check_stop()
@@ -66,7 +77,7 @@ def run_stereo(
 
     with single_threaded_opencv():
         hull, softness = _hull(posed, monitor)
-        run = StereoRun(posed, options, hull, seed, threads, scratch / "planes", report)
+        run = StereoRun(photos, size, options, hull, seed, threads, scratch / "planes", report)
         with monitor.part("photos"):
             run.prepare()
         with monitor.part("matching"):

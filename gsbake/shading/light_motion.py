@@ -7,8 +7,8 @@ in which the light stands:
     turntable    R_k: the turn about the table's axis by the azimuth of camera k, back to that of the first one
     camera       R_k: the rotation of camera k, relative to the first one (a flash)
 
-The table's axis is perpendicular to the x axes of all cameras, where they were held level, whatever their heights; the azimuth is that of
-the camera's x axis. A rotation of a cube map is a sparse matrix, the same for all steps.
+The camera stands in one direction from the table, and what is up stays up. So an object that was laid down differently, whose photos have
+another axis of the table, sees the same light, turned once more. A rotation of a cube map is a sparse matrix, the same for all steps.
 """
 
 from __future__ import annotations
@@ -24,19 +24,14 @@ import numpy as np
 import scipy.sparse
 import torch
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from gsbake.errors import BadInputError
 from gsbake.geometry.cameras import Camera
+from gsbake.geometry.turntable import Turntable, find_turntable
 from gsbake.shading.cubemap import directions, interpolation_matrix
 
 Motion = Literal["static", "turntable", "camera"]
 Doubles = NDArray[np.float64]
-
-#: Largest sine of the angle between a camera's x axis and the plane perpendicular to the axis, as a root mean square.
-MAX_TILT = 0.1
-#: Least range of azimuths of a turn, in degrees.
-MIN_TURN = 90.0
 
 
 @dataclass(frozen=True)
@@ -65,26 +60,18 @@ class LightMotion:
         return cls(motion, rotations)
 
 
-def light_rotations(cameras: Sequence[Camera], motion: Motion) -> Doubles | None:
-    """Rotations (n, 3, 3) from the object's frame to that of the light, for each camera; None for a light that stands, or where the cameras
-    do not turn about one axis."""
+def light_rotations(cameras: Sequence[Camera], motion: Motion, table: Turntable | None = None) -> Doubles | None:
+    """Rotations (n, 3, 3) from the object's frame to that of the light, for each camera; None for a light that stands, or where there is no
+    turntable before the cameras. `table` is that turntable, where it is known already."""
     if motion == "static" or len(cameras) < 2:
         return None
-    rotation = np.stack([camera.R for camera in cameras])
     if motion == "camera":
-        return np.asarray(rotation[0].T @ rotation)
-    right = rotation[:, 0]
-    axis = np.linalg.eigh(right.T @ right)[1][:, 0]
-    if float(np.sqrt(np.mean((right @ axis) ** 2))) > MAX_TILT:
+        to_room = np.stack([camera.R for camera in cameras])
+    elif (table := table or find_turntable(cameras)) is not None:
+        to_room = table.to_room(cameras)
+    else:
         return None
-    first = right[0] - axis * (right[0] @ axis)
-    first /= np.linalg.norm(first)
-    angle = np.arctan2(right @ np.cross(axis, first), right @ first)
-    around = np.sort(angle)
-    gap = max(float(np.diff(around).max()), 2 * np.pi - float(around[-1] - around[0]))
-    if np.degrees(2 * np.pi - gap) < MIN_TURN:
-        return None
-    return np.asarray(Rotation.from_rotvec(-angle[:, None] * axis).as_matrix())
+    return np.asarray(to_room[0].T @ to_room)
 
 
 def rotated(radiance: torch.Tensor, to_light: Doubles | None) -> torch.Tensor:

@@ -18,7 +18,7 @@ import torch
 from numpy.typing import NDArray
 
 from gsbake.shading import octahedral
-from gsbake.shading.prefilter import Layout, prefilter_operator
+from gsbake.shading.prefilter import Layout, PrefilterOperator, irradiance_operator, prefilter_operator
 
 
 def _sparse_tensor(matrix: scipy.sparse.csr_matrix, dtype: torch.dtype, device: torch.device) -> torch.Tensor:
@@ -30,27 +30,40 @@ def _sparse_tensor(matrix: scipy.sparse.csr_matrix, dtype: torch.dtype, device: 
         return torch.sparse_csr_tensor(rows, columns, values, csr.shape, dtype=dtype, check_invariants=True).to(device)
 
 
+@dataclass(frozen=True, eq=False)
+class _Matrices:
+    """Those of `PrefilterOperator`."""
+
+    reduce: torch.Tensor
+    mirror: torch.Tensor
+    octant: torch.Tensor
+    place: torch.Tensor
+
+    def __call__(self, radiance: torch.Tensor) -> torch.Tensor:
+        """The table of a flattened map."""
+        images = (self.mirror @ torch.cat([radiance, self.reduce @ radiance])).reshape(-1, 24)
+        return self.place @ (self.octant @ images).reshape(-1, 3)
+
+
 @lru_cache(maxsize=8)
-def _matrices(size: int, dtype: torch.dtype, device: torch.device) -> tuple[torch.Tensor, ...]:
-    """Downsampling and filter weights for a map size, each with its transpose."""
-    op = prefilter_operator(size)
-    return tuple(_sparse_tensor(m, dtype, device) for m in (op.reduce, op.reduce.T, op.weights, op.weights.T))
+def _matrices(op: PrefilterOperator, dtype: torch.dtype, device: torch.device, transposed: bool = False) -> _Matrices:
+    """The matrices of an operator, each transposed if asked for."""
+    return _Matrices(*(_sparse_tensor(m.T if transposed else m, dtype, device) for m in (op.reduce, op.mirror, op.octant, op.place)))
 
 
 class _Filter(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, radiance: torch.Tensor, size: int) -> torch.Tensor:
-        reduce, _, weights, _ = _matrices(size, radiance.dtype, radiance.device)
         ctx.size = size
-        return weights @ torch.cat([radiance, reduce @ radiance])
+        return _matrices(prefilter_operator(size), radiance.dtype, radiance.device)(radiance)
 
     @staticmethod
     def backward(ctx: Any, *grads: torch.Tensor) -> tuple[torch.Tensor, None]:
         grad = grads[0].contiguous()
-        reduce, reduce_t, _, weights_t = _matrices(ctx.size, grad.dtype, grad.device)
-        both = weights_t @ grad
-        fine = reduce.shape[1]
-        return both[:fine] + reduce_t @ both[fine:], None
+        m = _matrices(prefilter_operator(ctx.size), grad.dtype, grad.device, True)
+        both = m.mirror @ (m.octant @ (m.place @ grad).reshape(-1, 24)).reshape(-1, 3)
+        fine = 6 * ctx.size**2
+        return both[:fine] + m.reduce @ both[fine:], None
 
 
 def clamp_straight_through(value: torch.Tensor, low: float, high: float) -> torch.Tensor:
@@ -113,4 +126,6 @@ def prefilter_cube_map(radiance: torch.Tensor) -> LightTables:
 def irradiance(radiance: NDArray[Any], normals: NDArray[Any]) -> NDArray[np.float32]:
     """Irradiance / π (n, 3) at unit `normals` (n, 3) under the cube map `radiance` (6, N, N, 3)."""
     light, directions = (torch.from_numpy(np.ascontiguousarray(array, np.float32)) for array in (radiance, normals))
-    return np.asarray(prefilter_cube_map(light).diffuse(directions).numpy())
+    op = irradiance_operator(light.shape[1])
+    table = _matrices(op, light.dtype, light.device)(light.reshape(-1, 3))
+    return np.asarray(LightTables(table, op.layout).diffuse(directions).numpy())

@@ -65,12 +65,19 @@ class Layout:
 
 @dataclass(frozen=True, eq=False)
 class PrefilterOperator:
-    """table = weights @ [radiance; reduce @ radiance], radiance flattened to (6·size², 3)."""
+    """table = place @ (octant @ (mirror @ pyramid)) with pyramid = [radiance; reduce @ radiance], radiance flattened to (6·size², 3).
+
+    Filters and map are symmetric about the three coordinate planes. So `octant` has the weights of the directions of one octant alone; it
+    applies to the pyramid and its mirror images side by side, which `mirror` makes of it: rows pyramid texel · 8 + image. `place` takes
+    each texel of the table from the rows direction · 8 + image of the result. That is an eighth of the weights, with the same sums.
+    """
 
     size: int
     layout: Layout
     reduce: scipy.sparse.csr_matrix
-    weights: scipy.sparse.csr_matrix
+    mirror: scipy.sparse.csr_matrix
+    octant: scipy.sparse.csr_matrix
+    place: scipy.sparse.csr_matrix
 
 
 def ggx_lobe(alpha: float, count: int) -> tuple[Array, Array, Array]:
@@ -170,21 +177,28 @@ def _quadrature_rows(size: int, axes: Array, alpha: float) -> scipy.sparse.csr_m
     return scipy.sparse.hstack(blocks, format="csr")
 
 
-def _reflections(size: int) -> list[tuple[Array, Index]]:
-    """The eight sign patterns (3,), each with the permutation of the pyramid texels to their mirror images."""
-    out = []
-    for pattern in range(8):
-        sign = np.array([1.0 - 2.0 * (pattern >> k & 1) for k in range(3)])
+def _mirror_images(size: int) -> scipy.sparse.csr_matrix:
+    """The matrix (8 · pyramid texels, pyramid texels) that gives every texel of the pyramid its eight mirror images; bit k of the image is
+    a reflection along axis k."""
+    images = []
+    for image in range(8):
+        sign = np.array([1.0 - 2.0 * (image >> k & 1) for k in range(3)])
         columns, start = [], 0
         for edge in pyramid_sizes(size):
             columns.append(start + cubemap.texel_index(edge, cubemap.directions(edge).reshape(-1, 3) * sign))
             start += 6 * edge * edge
-        out.append((sign, np.concatenate(columns)))
-    return out
+        images.append(np.concatenate(columns))
+    return _choice(np.stack(images, 1).ravel(), len(images[0]))
 
 
-def _level_rows(size: int, edge: int, alpha: float, reflections: list[tuple[Array, Index]]) -> scipy.sparse.csr_matrix:
-    """Weights of one bordered octahedral level, ((edge+2)², all pyramid texels)."""
+def _choice(index: Index, count: int) -> scipy.sparse.csr_matrix:
+    """The matrix (n, count) that takes the rows `index` (n,)."""
+    return scipy.sparse.csr_matrix((np.ones(len(index)), index, np.arange(len(index) + 1)), shape=(len(index), count))
+
+
+def _level_rows(size: int, edge: int, alpha: float) -> tuple[scipy.sparse.csr_matrix, Index]:
+    """Weights (directions, all pyramid texels) of one octahedral level in one octant, and direction · 8 + mirror image of each texel of the
+    level with its border, ((edge+2)²,)."""
     dirs = octahedral.texel_directions(edge)
     canonical = octahedral.texel_index(edge, np.abs(dirs))
     octant, inverse = np.unique(canonical, return_inverse=True)
@@ -198,14 +212,8 @@ def _level_rows(size: int, edge: int, alpha: float, reflections: list[tuple[Arra
     base.data[base.data < _MIN_WEIGHT] = 0.0
     base.eliminate_zeros()
     base = (scipy.sparse.diags(1.0 / np.asarray(base.sum(axis=1)).ravel()) @ base).tocsr()
-    negative = (dirs < -1e-9) @ np.array([1, 2, 4])
-    order, parts = [], []
-    for pattern, (_, columns) in enumerate(reflections):
-        rows = np.flatnonzero(negative == pattern)
-        order.append(rows)
-        parts.append(base[inverse[rows]][:, columns])
-    borderless = scipy.sparse.vstack(parts, format="csr")[np.argsort(np.concatenate(order))]
-    return borderless[octahedral.border_indices(edge).ravel()]
+    place = 8 * inverse + (dirs < -1e-9) @ np.array([1, 2, 4])
+    return base, place[octahedral.border_indices(edge).ravel()]
 
 
 @lru_cache(maxsize=4)
@@ -214,12 +222,26 @@ def prefilter_operator(size: int) -> PrefilterOperator:
     if size < 4:
         raise ValueError(f"an environment cube map needs at least 4 texels per edge, not {size}")
     sizes = level_sizes(size)
-    reflections = _reflections(size)
-    levels = []
+    levels, places, rows = [], [], 0
     for roughness, edge in zip(ROUGHNESS_LEVELS, sizes, strict=True):
-        levels.append(_level_rows(size, edge, roughness**2, reflections))
+        level, place = _level_rows(size, edge, roughness**2)
+        levels.append(level)
+        places.append(place + 8 * rows)
+        rows += level.shape[0]
     counts = [(edge + 2) ** 2 for edge in sizes]
     offsets = tuple(int(o) for o in np.cumsum([0, *counts[:-1]]))
     coarse = [cubemap.downsampling_matrix(size, edge) for edge in pyramid_sizes(size)[1:]]
     reduce = scipy.sparse.vstack(coarse, format="csr") if coarse else scipy.sparse.csr_matrix((0, 6 * size * size))
-    return PrefilterOperator(size, Layout(ROUGHNESS_LEVELS, sizes, offsets, sum(counts)), reduce, scipy.sparse.vstack(levels, format="csr"))
+    layout, place = Layout(ROUGHNESS_LEVELS, sizes, offsets, sum(counts)), _choice(np.concatenate(places), 8 * rows)
+    return PrefilterOperator(size, layout, reduce, _mirror_images(size), scipy.sparse.vstack(levels, format="csr"), place)
+
+
+@lru_cache(maxsize=4)
+def irradiance_operator(size: int) -> PrefilterOperator:
+    """The part of `prefilter_operator` that gives the last level, irradiance / π, alone."""
+    op = prefilter_operator(size)
+    layout, start = op.layout, op.layout.offsets[-1]
+    place = op.place[start:]
+    row = int(place.indices.min()) // 8
+    last = Layout(layout.roughness[-1:], layout.sizes[-1:], (0,), layout.texels - start)
+    return PrefilterOperator(size, last, op.reduce, op.mirror, op.octant[row:], place[:, 8 * row :])

@@ -52,8 +52,7 @@ def given_uvs(vertices: NDArray[Any], faces: NDArray[Any], uv: NDArray[Any] | No
     corner = np.asarray(uv, np.float64)[faces] * (1, -1) + (0, 1)
     usable = (np.abs(corner) <= MAX_UV).all((1, 2))
     if not usable.all():
-        share = 1 - usable.mean()
-        raise ValueError(f"has no UVs on {share:.0%} of its triangles; unwrap all of it, or none")
+        raise ValueError(f"has no UVs on {int((~usable).sum())} of its {len(usable)} triangles; unwrap all of it, or none")
     points, joined = np.unique(np.asarray(vertices, np.float32), axis=0, return_inverse=True)
     triangles = joined.ravel()[faces]
     area = _areas(points.astype(np.float64)[triangles])

@@ -55,7 +55,7 @@ def formula(stage: str, photos: PhotoSet, settings: Mapping[str, Any]) -> tuple[
 
     count, texels = photos.count, 1e-6 * value("bake.size", 1024) ** 2
     step = 0.012 + 0.15 * megapixels("train.max_size", 512)
-    matched = count * megapixels("stereo.max_size", 800)
+    matched = count * max(megapixels("stereo.max_size", 800), value("stereo.min_scale", 0.3) ** 2 * photos.megapixels)
     fit = settings.get("bake.materials") == "fit"
     # A base colour of automatic size has about as many texels as a photo has pixels; it is projected in bands.
     fine = min(photos.megapixels, 17.0) if settings.get("bake.size") == "auto" and photos.megapixels > 2.5 else 0.0

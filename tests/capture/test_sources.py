@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from gsbake.capture.sources import Sources, discover, list_masks, list_photos
+from gsbake.capture.sources import Sources, discover, list_masks, list_photos, require_photo
 from gsbake.errors import BadInputError
 
 
@@ -68,6 +68,18 @@ def test_bad_folders(tmp_path: Path, make: list[str], words: str) -> None:
     touch(*(tmp_path / m for m in make))
     with pytest.raises(BadInputError, match=words):
         discover(tmp_path / "cap")
+
+
+def test_a_photo_that_is_not_there(tmp_path: Path) -> None:
+    touch(tmp_path / "images/front/a.JPG", tmp_path / "images/b.png", tmp_path / "v.mp4")
+    for name in ("front/a.JPG", "a.JPG", "front_a", "b.png", "b"):
+        require_photo(tmp_path / "images", name, "export.front")
+    with pytest.raises(
+        BadInputError, match=r"export\.front names the photo 'c\.png', which is none of the photos \(b\.png, front/a\.JPG\)"
+    ):
+        require_photo(tmp_path / "images", "c.png", "export.front")
+    for absent in (tmp_path / "v.mp4", tmp_path / "moved"):
+        require_photo(absent, "c.png", "export.front")
 
 
 def test_bad_overrides(tmp_path: Path) -> None:

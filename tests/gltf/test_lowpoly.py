@@ -94,6 +94,14 @@ def test_without_uvs_it_is_unwrapped(folder: Path, tmp_path: Path) -> None:
     assert found.split()[2] is None
 
 
+def test_uvs_on_some_faces_are_refused(folder: Path, tmp_path: Path) -> None:
+    path = tmp_path / "half.obj"
+    points = "".join(f"v {x} {y} 0\nvt {x} {y}\n" for x, y in ((0, 0), (1, 0), (1, 1), (0, 1)))
+    path.write_text(f"{points}f 1/1 2/2 3/3\nf 1 3 4\nf -4//1 -2//1 -1//1\n", encoding="utf-8")
+    with pytest.raises(BadInputError, match="has no UVs on 2 of its 3 faces; unwrap all of it, or none"):
+        read_lowpoly(path, folder / "dense.ply", None)
+
+
 def test_a_mesh_elsewhere_and_a_damaged_one(folder: Path, tmp_path: Path) -> None:
     unwrapped(Similarity(7.0)).export(tmp_path / "large.glb")
     with pytest.raises(BadInputError, match="large.glb' does not lie on the dense mesh: .* with .Y or .Z up"):

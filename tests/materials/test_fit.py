@@ -21,11 +21,11 @@ from gsbake.geometry.raycast import RayCaster
 from gsbake.imaging.srgb import decode, encode
 from gsbake.materials.descent import Steps, descend
 from gsbake.materials.levels import FineLevel, PureMetals
-from gsbake.materials.passes import Finer, Priors, Scene
+from gsbake.materials.passes import Priors, Scene
 from gsbake.materials.photo import Photo, PhotoReader, coarse_texels, texel_weight
 from gsbake.materials.recipe import COARSE, TRIAL
-from gsbake.materials.starts import Start, StartComparison, Trials, descend_all, started
-from gsbake.materials.state import Level, State
+from gsbake.materials.starts import ChosenStart, Start, StartComparison, Trials, descend_all, started
+from gsbake.materials.state import Finer, Level, State
 from gsbake.materials.surface import InterpolatedTransport, Surface, neighbours
 from gsbake.shading.environment import EnvironmentLight
 from gsbake.shading.light_motion import Motion, light_rotations
@@ -66,6 +66,16 @@ def cameras(count: int, size: int = 48) -> list[Camera]:
     return out
 
 
+def rounds(count: int, size: int = 48) -> list[Camera]:
+    """Of a turntable: two heights of a camera that stands."""
+    out = []
+    for k in range(count):
+        turn, high = 2.4 * k, (0.5, -0.25)[k % 2]
+        centre = 4 * np.array([np.cos(turn) * np.cos(high), np.sin(turn) * np.cos(high), np.sin(high)])
+        out.append(look_at(centre, size=size, focal=1.7 * size, name=f"{k}"))
+    return out
+
+
 def room(directions: NDArray[np.float64]) -> NDArray[np.float64]:
     """Radiance of dim walls with one window and a small bright light."""
     window = np.exp(12 * (directions @ np.array([0.8, 0.0, 0.6]) - 1))
@@ -76,7 +86,8 @@ def room(directions: NDArray[np.float64]) -> NDArray[np.float64]:
 class Sphere:
     """A sphere of two base colours, or of a uniform distribution between them (`even`), with constant `roughness`, in `count` photos.
 
-    With `reference` the images are made by `tests.support.monte_carlo`; `motion` is that of the light. With `striped` only the second base
+    With `reference` the images are made by `tests.support.monte_carlo`; `motion` is that of the light, which shows before cameras that are
+    `posed` in rounds. With `striped` only the second base
     colour has the `metallic` given, the first is dielectric: `metallic` (n,) has the true values."""
 
     def __init__(
@@ -88,6 +99,7 @@ class Sphere:
         metallic: float = 0.0,
         motion: Motion = "static",
         striped: bool = False,
+        posed: Sequence[Camera] = (),
     ) -> None:
         mesh, uv = sphere()
         caster = RayCaster(mesh.vertices, mesh.faces, 1)
@@ -102,8 +114,9 @@ class Sphere:
         tables = EnvironmentLight.from_function(room, 16).prefilter()
         reader = PhotoReader(caster, uv, self.texels, self.normal, 2.0)
         self.photos: list[Photo] = []
-        turned = light_rotations(cameras(count), motion)
-        for k, camera in enumerate(cameras(count)):
+        self.posed = posed or cameras(count)
+        turned = light_rotations(self.posed, motion)
+        for k, camera in enumerate(self.posed):
             if turned is not None:
                 tables = EnvironmentLight.from_function(lambda d, turn=turned[k]: room(d @ turn.T), 16).prefilter()
             blank = reader.read(camera, np.zeros((camera.height, camera.width, 3), np.uint8), None, index=k)
@@ -280,13 +293,26 @@ def test_the_fine_level_continues_from_the_coarse_one(glossy: Sphere) -> None:
     known = parent >= 0
     distance = np.linalg.norm(coarse.position[parent[known]] - fine.position[known], axis=1)
     assert known.mean() > 0.9 and distance.max() < 0.2  # texels are about 0.1 wide
-    fitted = after(State.start(Level(coarse, photos[2:], photos[:2]), 16, 0.2), 150, PLAIN)
-    scene = replace(SCENE, finer=Finer(Level(fine, glossy.photos[2:], glossy.photos[:2]), texture))
-    continued = after(FineLevel().run(scene, fitted), 1, replace(PLAIN, rate=1e-6))
+    finer = Finer(Level(fine, glossy.photos[2:], glossy.photos[:2]), texture)
+    fitted = after(State.start(Level(coarse, photos[2:], photos[:2], finer), 16, 0.2), 150, PLAIN)
+    continued = after(FineLevel().run(SCENE, fitted), 1, replace(PLAIN, rate=1e-6))
     np.testing.assert_allclose(np.median(continued.values, 0), np.median(fitted.values, 0), atol=0.03)
     scratch = after(glossy.start(0.2, held_out=2), 1, replace(PLAIN, rate=1e-6))
     assert continued.psnr is not None and scratch.psnr is not None
     assert continued.psnr > scratch.psnr + 3
+
+
+def test_the_fit_starts_anew_from_the_start_that_was_chosen_on_a_coarser_level(glossy: Sphere) -> None:
+    fine = glossy.start(0.2).level
+    tried = replace(after(glossy.start(0.7), 3, PLAIN), chosen_start=(0.05, 0.2), evidence="less error")
+    found = ChosenStart().run(SCENE, replace(tried, level=replace(fine, finer=Finer(fine, tried_texture(glossy)))))
+    assert found.level is fine and found.steps == 0 and (found.chosen_start, found.evidence) == ((0.05, 0.2), "less error")
+    np.testing.assert_allclose(found.values[:, 3], 0.2)
+
+
+def tried_texture(scene: Sphere) -> CoarseTexture:
+    """Half the edge of the scene's texture."""
+    return CoarseTexture.sized(sphere()[1], sphere()[0].faces, scene.texels, 1.0, SIZE // 2)
 
 
 def test_coarse_transport_is_interpolated(glossy: Sphere) -> None:
@@ -325,6 +351,17 @@ def test_momentum_of_the_light_goes_on_until_another_light(glossy: Sphere) -> No
     assert fitted.light_moments is not None and again.light_moments is not None
     assert [float(state[2]) for state in (fitted.light_moments, again.light_moments)] == [3, 5]
     assert fitted.with_light(fitted.light).light_moments is None
+
+
+def test_a_light_that_stands_steps_for_several_photos_together(glossy: Sphere) -> None:
+    start, together = glossy.start(0.2), replace(PLAIN, photos_per_light=2)
+    moments = after(start, 5, together).light_moments
+    assert moments is not None and moments[2] == 2
+    assert not np.array_equal(after(start, 2, together).radiance, start.radiance)
+    np.testing.assert_array_equal(after(start, 1, together).radiance, start.radiance)
+    level = replace(start.level, photos=[replace(photo, to_light=np.eye(3)) for photo in start.level.photos])
+    moments = after(replace(start, level=level), 5, together).light_moments
+    assert moments is not None and moments[2] == 5
 
 
 def test_a_light_that_is_given_stays(glossy: Sphere) -> None:

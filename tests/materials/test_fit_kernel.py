@@ -161,3 +161,13 @@ def test_adam_step_follows_pytorch() -> None:
         assert not gradient.any()
     np.testing.assert_allclose(values[:, :5], torch.sigmoid(logits).detach().numpy(), atol=2e-4)
     np.testing.assert_allclose(values[:, 5:], offset.detach().numpy(), atol=2e-4)
+
+    kept = [array[:, 5:].copy() for array in (raw, values, first, second)]
+    gradient, rate[5:] = data.copy(), 0
+    fit_kernel.adam_step(
+        raw, values, spare, gradient, first, second, start, neighbour, smoothness, mean, f(offset_weight), common, common_weight, rate,
+        f(0.9), f(0.99), f(1), f(1), f(2e-3),
+    )  # fmt: skip
+    assert not gradient.any() and not np.array_equal(spare[:, :5], values[:, :5])
+    for before, after in zip(kept, (raw, spare, first, second), strict=True):
+        np.testing.assert_array_equal(after[:, 5:], before)

@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from gsbake.materials import metal_trials
 from gsbake.materials.descent import Steps
-from gsbake.materials.metal_trials import GROUPS, MIN_SHARE, KindTrials, LightLevel, _groups, _Tried
+from gsbake.materials.metal_trials import GROUPS, MIN_SHARE, OPTIONS, KindTrials, LightLevel, _groups, _Tried
 from gsbake.materials.passes import Scene
 from gsbake.materials.recipe import ADAPT_AND_SEARCH
 from gsbake.materials.state import State
@@ -57,6 +58,20 @@ def test_groups_that_are_likelier_as_metal_are_turned_together(monkeypatch: pyte
     assert metal and groups > 1 and kept
     assert all(count == 1 for _, count, _ in tries[2:])
     assert (found.metal & ~before.metal).mean() > 2 * MIN_SHARE
+
+
+def test_trials_end_after_some_that_changed_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    state, tries = after(Sphere(0.25).start(0.3, held_out=2), 3, QUIET), []
+
+    def refused(self: _Tried, models: Any, metal: bool, groups: list[Any], known: Any) -> _Tried:
+        tries.append(groups)
+        return replace(self, count=self.count + 1)
+
+    every = [(1.0, True, np.arange(9))] * 9
+    monkeypatch.setattr(metal_trials, "_candidates", lambda base, known: (None, every))
+    monkeypatch.setattr(_Tried, "with_trial", refused)
+    found = TRIALS.run(replace(SCENE, iterations=10), state)
+    assert len(tries) == OPTIONS.max_refused < len(every) and "4 trials" in found.evidence
 
 
 @pytest.mark.slow

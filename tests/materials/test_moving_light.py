@@ -7,15 +7,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from gsbake.geometry.turntable import find_turntable
 from gsbake.imaging.srgb import encode
 from gsbake.materials import starts
-from gsbake.materials.fitting import _light_motions
+from gsbake.materials.light_motions import light_motions
 from gsbake.materials.passes import Scene
 from gsbake.materials.photo import Photo
 from gsbake.materials.recipe import MOTION_TRIAL
 from gsbake.materials.starts import MotionComparison
 from gsbake.shading.light_motion import Motion, light_rotations
-from tests.materials.test_fit import WEAK_PRIORS, Sphere, after, cameras, observed, room
+from tests.materials.test_fit import WEAK_PRIORS, Sphere, after, cameras, observed, room, rounds
 from tests.support.cameras import look_at
 from tests.support.recorder import Recorder
 from tests.support.slow import slow
@@ -25,12 +26,13 @@ COUNT = 12
 
 @pytest.fixture(scope="module", params=["turntable", slow("camera")])
 def moving(request: pytest.FixtureRequest) -> tuple[Motion, Sphere]:
-    return request.param, Sphere(0.25, COUNT, motion=request.param)
+    posed = rounds(COUNT) if request.param == "turntable" else cameras(COUNT)
+    return request.param, Sphere(0.25, COUNT, motion=request.param, posed=posed)
 
 
 def under(scene: Sphere, motion: Motion) -> list[Photo]:
     """The photos, explained by a light that moves so."""
-    rotations = light_rotations(cameras(COUNT), motion)
+    rotations = light_rotations(scene.posed, motion)
     return scene.photos if rotations is None else [replace(p, to_light=r) for p, r in zip(scene.photos, rotations, strict=True)]
 
 
@@ -60,16 +62,16 @@ def test_how_the_light_moves_is_found(moving: tuple[Motion, Sphere]) -> None:
 
 
 def test_a_light_that_stands_is_found() -> None:
-    assert best_motion(Sphere(0.25, COUNT)) == "static"
+    assert best_motion(Sphere(0.25, COUNT, posed=rounds(COUNT))) == "static"
 
 
 def test_a_turn_that_is_asked_for_and_not_there_is_said() -> None:
     """Cameras rolled at random have no common axis: the light stands, and the report does not say otherwise."""
     recorder = Recorder()
     rolled = [look_at(np.random.default_rng(k).normal(size=3) * 3, roll=2.3 * k) for k in range(9)]
-    motion, choices = _light_motions(rolled, "turntable", recorder)
+    motion, choices = light_motions(rolled, "turntable", recorder)
     assert motion.motion == "static" and not choices
-    assert any("do not turn about one axis" in text for text in recorder.warnings)
+    assert any("stand on no circles" in text for text in recorder.warnings)
 
 
 def test_a_turn_is_tried_only_where_cameras_stand_on_circles() -> None:
@@ -78,9 +80,9 @@ def test_a_turn_is_tried_only_where_cameras_stand_on_circles() -> None:
     for spread, turns in ((0.0, True), (0.5, False)):
         eyes = [np.array([3 * np.cos(a), 3 * np.sin(a), 1.5]) * (1 + rng.uniform(-spread, spread)) for a in angles]
         recorder = Recorder()
-        motion, choices = _light_motions([look_at(eye, (0, 0, rng.uniform(-spread, spread))) for eye in eyes], "auto", recorder)
+        motion, choices = light_motions([look_at(eye, (0, 0, rng.uniform(-spread, spread))) for eye in eyes], "auto", recorder)
         assert motion.motion == "static" and ("turntable" in choices) == turns and "camera" in choices
-        assert ("turntable" in recorder.decisions) != turns
+        assert (recorder.decisions["turntable"][0] == "none") != turns
 
 
 @pytest.mark.parametrize(
@@ -89,9 +91,9 @@ def test_a_turn_is_tried_only_where_cameras_stand_on_circles() -> None:
 def test_a_light_on_the_camera_is_not_tried_where_no_flash_fired(flash: list[bool | None], tried: bool) -> None:
     recorder = Recorder()
     posed = [replace(camera, flash=fired) for camera, fired in zip(cameras(9), flash, strict=True)]
-    _, choices = _light_motions(posed, "auto", recorder)
+    _, choices = light_motions(posed, "auto", recorder)
     assert ("camera" in choices) == tried != ("flash" in recorder.decisions)
-    asked, _ = _light_motions(posed, "camera", recorder)  # a lamp beside the lens is not in EXIF
+    asked, _ = light_motions(posed, "camera", recorder)  # a lamp beside the lens is not in EXIF
     assert asked.motion == "camera"
 
 
@@ -108,9 +110,9 @@ def test_a_flash_that_fired_needs_less_evidence(monkeypatch: pytest.MonkeyPatch,
 
 
 def best_motion(scene: Sphere) -> Motion:
-    motions: tuple[Motion, ...] = ("static", "turntable", "camera")
+    motions: list[Motion] = ["static", "camera"] + ["turntable"] * (find_turntable(scene.posed) is not None)
     comparison = MotionComparison(MOTION_TRIAL)
-    context = Scene(WEAK_PRIORS, 400, 16, motions={motion: light_rotations(cameras(COUNT), motion) for motion in motions})
+    context = Scene(WEAK_PRIORS, 400, 16, motions={motion: light_rotations(scene.posed, motion) for motion in motions})
     start = scene.start(0.5, held_out=2)
     assert comparison.applies(context, start)
     found = comparison.run(context, start)

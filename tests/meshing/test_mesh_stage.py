@@ -17,7 +17,8 @@ from gsbake.config.schema import Mesh
 from gsbake.errors import BadInputError
 from gsbake.geometry.cameras import Array, CameraSet
 from gsbake.geometry.region import Region
-from gsbake.meshing.extract import MeshOptions, evenly, extract_mesh
+from gsbake.meshing.extract import MeshOptions, extract_mesh
+from gsbake.meshing.refinement.shape import evenly
 from gsbake.surfels.model import create
 from tests.meshing.scenes import cameras_around, gradient, torus, trace
 from tests.support.recorder import Recorder

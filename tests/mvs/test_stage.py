@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from gsbake.capture.hull.visual_hull import Hull, visual_hull
+from gsbake.capture.photos.originals import file_digest
 from gsbake.capture.posed_photos import PosedPhotos
 from gsbake.config.schema import Profile, Stereo
 from gsbake.errors import InterruptedRun
@@ -55,6 +56,40 @@ def poses(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def done(poses: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
     out = tmp_path_factory.mktemp("done") / "out"
     return out, run(poses, out)
+
+
+def test_larger_photos_are_matched_at_a_share_of_their_size(poses: Path, done: tuple[Path, dict[str, Any]], tmp_path: Path) -> None:
+    """Working photos of half the size: with the originals depths are as they are without any reduction, else coarser."""
+    small, ingest = tmp_path / "poses", tmp_path / "ingest"
+    for folder in (small / "photos", small / "masks", ingest / "photos", ingest / "originals"):
+        folder.mkdir(parents=True)
+    halves = [camera.scaled(camera.width // 2, camera.height // 2) for camera in CAMERAS]
+    entries, digests = [], {}
+    for camera in halves:
+        file, size = f"photos/{camera.name}.png", (camera.width, camera.height)
+        for sub in ("photos", "masks"):
+            whole = cv2.imread(str(poses / sub / f"{camera.name}.png"), cv2.IMREAD_GRAYSCALE)
+            assert whole is not None
+            cv2.imwrite(str(small / sub / f"{camera.name}.png"), cv2.resize(whole, size, interpolation=cv2.INTER_AREA))
+        shutil.copy(small / file, ingest / file)
+        shutil.copy(poses / file, ingest / "originals" / f"{camera.name}.png")
+        digests[camera.name] = file_digest(ingest / file)
+        original = {"original": f"originals/{camera.name}.png", "source_width": 2 * camera.width, "source_height": 2 * camera.height}
+        entries.append({"name": camera.name, "file": file, "digest": digests[camera.name], "full_mask": None, "source": "a"} | original)
+    (ingest / "photos.json").write_text(json.dumps({"photos": entries}))
+    (small / "photo_digests.json").write_text(json.dumps(digests))
+    for name in ("cameras.json", "photo_cameras.json"):
+        CameraSet(tuple(halves)).save(small / name)
+    errors = []
+    for scale in (0.0, 0.75):
+        out = tmp_path / str(scale)
+        out.mkdir()
+        run_stereo(small, out, Stereo(enabled="always", min_scale=scale, max_size=halves[0].width), ingest=ingest)
+        depths = [read_depth(out / "depth" / f"{camera.name}.npz")[0] for camera in CAMERAS[:5]]
+        assert {depth.shape[1] for depth in depths} == {round(max(0.5, scale) * CAMERAS[0].width)}
+        truths = [sphere_depth(camera.downscaled_to(max(depth.shape))) for camera, depth in zip(CAMERAS, depths, strict=False)]
+        errors.append(np.median(np.concatenate([np.abs(d - t)[(d > 0) & (t > 0)] for d, t in zip(depths, truths, strict=True)])))
+    assert errors[1] < 0.8 * errors[0]
 
 
 def test_nothing_is_matched_outside_the_region(poses: Path, done: tuple[Path, dict[str, Any]], tmp_path: Path) -> None:
@@ -110,9 +145,7 @@ def test_resume_after_interruption(poses: Path, done: tuple[Path, dict[str, Any]
     assert (tmp_path / "again" / "hull.npz").read_bytes() == (done[0] / "hull.npz").read_bytes()
 
 
-def test_silhouettes_of_an_object_that_is_not_rigid_are_a_warning(
-    poses: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_silhouettes_of_an_object_that_is_not_rigid_are_a_warning(poses: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The stage asks about the hull of all masks; `tests/capture/hull/test_rigidity.py` has what is found."""
     asked, monitor = [], Recorder()
 

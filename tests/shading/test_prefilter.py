@@ -11,7 +11,7 @@ import torch
 from gsbake.geometry.vectors import unit
 from gsbake.shading import cubemap, prefilter
 from gsbake.shading.environment import EnvironmentLight
-from gsbake.shading.light_tables import LightTables, prefilter_cube_map
+from gsbake.shading.light_tables import LightTables, irradiance, prefilter_cube_map
 
 
 def random_directions(count: int, seed: int = 0) -> np.ndarray:
@@ -51,6 +51,13 @@ def test_last_level_is_the_cosine_irradiance_of_a_single_texel() -> None:
     got = prefilter_cube_map(cube).diffuse(torch.from_numpy(probe)).numpy()
     assert np.abs(got - expected).max() / expected.max() < 0.08  # worst at the terminator's kink
     assert np.sqrt(((got - expected) ** 2).mean() / (expected**2).mean()) < 0.04
+
+
+def test_irradiance_is_the_last_level_of_the_whole_table() -> None:
+    cube = torch.rand(6, 12, 12, 3, generator=torch.Generator().manual_seed(0))
+    probe = random_directions(50).astype(np.float32)
+    whole = prefilter_cube_map(cube).diffuse(torch.from_numpy(probe)).numpy()
+    np.testing.assert_allclose(irradiance(cube.numpy(), probe), whole, rtol=1e-6)
 
 
 def test_hemisphere_light_gives_the_linear_irradiance() -> None:

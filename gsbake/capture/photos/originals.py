@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import tempfile
 from pathlib import Path
+from queue import SimpleQueue
 from typing import Any
 
 import cv2
@@ -26,13 +27,21 @@ _BYTES = 36
 
 
 class Originals:
-    """Photos by name, from the artifact folder of the ingest stage; a context manager that ends the process that decodes."""
+    """Photos by name, from the artifact folder of the ingest stage, or none; a context manager that ends the processes that decode.
 
-    def __init__(self, ingest: Path) -> None:
-        self._ingest = ingest
-        entries: list[dict[str, Any]] = json.loads((ingest / "photos.json").read_text(encoding="utf-8"))["photos"]
+    Threads may read at the same time: `readers` do, the others wait.
+    """
+
+    def __init__(self, ingest: Path | None, readers: int = 1) -> None:
+        self._folder = ingest or Path()
+        entries: list[dict[str, Any]] = []
+        if ingest is not None:
+            entries = json.loads((ingest / "photos.json").read_text(encoding="utf-8"))["photos"]
         self._entries = {entry["name"]: entry for entry in entries}
-        self._process = ParserProcess(READER, ONE_THREAD)
+        self._readers = [ParserProcess(READER, ONE_THREAD) for _ in range(readers)]
+        self._idle: SimpleQueue[ParserProcess] = SimpleQueue()
+        for process in self._readers:
+            self._idle.put(process)
 
     def __enter__(self) -> Originals:
         return self
@@ -41,13 +50,14 @@ class Originals:
         self.close()
 
     def close(self) -> None:
-        """End the process that decodes; a later call starts it again."""
-        self._process.close()
+        """End the processes that decode; a later call starts them again."""
+        for process in self._readers:
+            process.close()
 
     def has(self, name: str) -> bool:
         """Whether there is more of a photo than its working photo."""
         entry = self._entries.get(name, {})
-        return bool(entry.get("original")) and file_digest(self._ingest / entry["file"]) == entry["digest"]
+        return bool(entry.get("original")) and file_digest(self._folder / entry["file"]) == entry["digest"]
 
     def size(self, name: str) -> tuple[int, int]:
         """Width and height of a photo that has an original."""
@@ -63,10 +73,14 @@ class Originals:
         pixels = entry["source_width"] * entry["source_height"]
         with tempfile.TemporaryDirectory(prefix="gsbake-photo-") as folder:
             out = Path(folder) / "pixels.npy"
-            request = {"task": "read", "path": str(self._ingest / entry["original"]), "name": entry["source"], "out": str(out)}
+            request = {"task": "read", "path": str(self._folder / entry["original"]), "name": entry["source"], "out": str(out)}
             request |= {"max_size": max_size, "max_megapixels": pixels / 1e6}
             seconds = MIN_SECONDS + SECONDS_PER_BYTE * _BYTES * pixels
-            read_in_child(self._process, request, seconds, f"The original of {entry['source']}")
+            process = self._idle.get()
+            try:
+                read_in_child(process, request, seconds, f"The original of {entry['source']}")
+            finally:
+                self._idle.put(process)
             return np.asarray(np.load(out), np.uint8)
 
     def mask(self, name: str, size: tuple[int, int]) -> Bytes | None:
@@ -75,7 +89,7 @@ class Originals:
         entry = self._entries[name]
         if entry["full_mask"] is None:
             return None
-        mask = read_grey(self._ingest / entry["full_mask"])
+        mask = read_grey(self._folder / entry["full_mask"])
         return mask if mask.shape[::-1] == size else np.asarray(cv2.resize(mask, size, interpolation=cv2.INTER_AREA), np.uint8)
 
 

@@ -7,6 +7,7 @@ import sqlite3
 from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -22,6 +23,7 @@ from gsbake.config.schema import Poses
 from gsbake.errors import BadInputError, InterruptedRun
 from gsbake.geometry.cameras import Camera, CameraSet
 from gsbake.geometry.ply import read_cloud
+from gsbake.geometry.turntable import find_turntable
 from gsbake.monitor import Monitor, PartSequence
 from gsbake.text import shortlist
 
@@ -30,6 +32,8 @@ from gsbake.text import shortlist
 SECONDS_PER_PHOTO, MIN_SECONDS = 60.0, 1800.0
 #: Share of registered photos below which the other kind of features is tried too.
 MIN_PLACED_SHARE = 0.85
+#: Share of the cameras on exact circles from which masks are not asked about them.
+MIN_TABLE_SHARE = 0.9
 _FEATURES: dict[Region, str] = {
     "whole photos": "in whole photos", "moving parts": "on what moves", "masks": "inside the masks",
     "outside the masks": "outside the masks",
@@ -39,11 +43,13 @@ _FOLDERS: dict[Region, str] = {"whole photos": "", "moving parts": "_moving", "m
 
 @dataclass(frozen=True)
 class Solved:
-    """Cameras in the input frame, the file of triangulated points (may be absent), and the figures."""
+    """Cameras in the input frame, the file of triangulated points (may be absent), and the figures; whether they stand `on_table`, before
+    the turntable that the photos' background shows, which leaves no doubt about them."""
 
     cameras: list[Camera]
     cloud: Path
     figures: dict[str, Any]
+    on_table: bool = False
 
 
 @dataclass(frozen=True)
@@ -56,6 +62,12 @@ class _Attempt:
     folder: Path
     region: Region
     turned: bool
+
+    @cached_property
+    def on_table(self) -> bool:
+        """Whether cameras stand on exact circles before an object that was `turned`: wrong ones do not."""
+        table = find_turntable(self.cameras) if self.turned else None
+        return table is not None and table.share >= MIN_TABLE_SHARE
 
     @property
     def masked(self) -> bool:
@@ -142,7 +154,7 @@ class PoseSolver:
         if found.folder != self.folder:
             shutil.rmtree(self.folder, ignore_errors=True)
             found.folder.rename(self.folder)
-        return Solved(found.cameras, self.folder / "points.ply", figures)
+        return Solved(found.cameras, self.folder / "points.ply", figures, found.on_table)
 
     def _attempt(
         self, matching: str, region: Region = "whole photos", files: Path | None = None, background: StandingBackground | None = None
@@ -186,6 +198,9 @@ class PoseSolver:
         self.monitor.decide("features", _FEATURES[first], evidence)
         attempts = [attempt(first)]
         if not masks.complete:
+            return attempts[0]
+        if attempts[0].on_table and not self._lost(attempts[0]):
+            self.monitor.decide("turntable", "found", f"{len(attempts[0].cameras)} of {len(self.entries)} photos on exact circles")
             return attempts[0]
         agreement = [self._agreement(attempts[0], masks)]
         if agreement[0] >= masks.min_agreement and not self._lost(attempts[0]):

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from gsbake.capture.posed_photos import PosedPhotos
@@ -28,7 +29,8 @@ def confirmed_share(posed: PosedPhotos, folder: Path) -> float:
             continue
         depth, _ = read_depth(path)
         _, mask = posed.mask(index, max(depth.shape))
-        inside = np.ones(depth.shape, bool) if mask is None else mask > 127
+        # Stereo may match larger photos than the working ones.
+        inside = np.ones(depth.shape, bool) if mask is None else cv2.resize(mask, depth.shape[::-1]) > 127
         confirmed += int(((depth > 0) & inside).sum())
         pixels += int(inside.sum())
     return confirmed / pixels if pixels else 0.0

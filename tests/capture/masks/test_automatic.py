@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from gsbake.capture.masks import weights
 from gsbake.capture.masks.consensus import MIN_CERTAIN_OVERLAP, intersection_over_union
 from gsbake.capture.masks.editing import export_masks
 from gsbake.capture.posed_photos import PosedPhotos
+from gsbake.capture.sfm.solve import PoseSolver
 from gsbake.errors import BadInputError, UsageError
 from gsbake.geometry.cameras import Camera
 from gsbake.geometry.ply import write_cloud
@@ -130,6 +132,25 @@ def test_guesses_that_no_camera_agrees_with_are_not_used(capture: Path, network:
     assert figures["automatic_masks"] == 0 and figures["mask_agreement"] < 0.8
     assert done.line("automatic masks").startswith("not used (the guesses of the network agree with the cameras to 0.")
     assert not (runner.root / "poses" / "masks").exists()
+
+
+@pytest.mark.parametrize("on_table", [False, True])
+def test_before_a_turntable_guesses_may_agree_less(
+    capture: Path, network: Callable[[int], None], runner: Runner, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, on_table: bool
+) -> None:
+    """Every second photo shows a part of the room above the object that looks like one of it."""
+    network(0)
+    for path in sorted((capture / "images").iterdir())[::2]:
+        photo = np.array(Image.open(path))
+        photo[20:75, 60:110] = 220
+        Image.fromarray(photo).save(path)
+    runner.ingest(capture, mask_network="auto")
+    write_cloud(runner.root / "ingest" / "poses" / "points.ply", np.zeros((1, 3)), np.zeros((1, 3), np.uint8))
+    given = PoseSolver.triangulate
+    monkeypatch.setattr(PoseSolver, "triangulate", lambda solver: replace(given(solver), on_table=on_table))
+    figures, done = runner.poses()
+    assert 0.7 < figures["mask_agreement"] < 0.88
+    assert (figures["automatic_masks"] == COUNT) == on_table == done.line("automatic masks").startswith("used")
 
 
 def test_without_weights_the_run_says_how_to_get_them(
