@@ -18,10 +18,10 @@ def run(ctx: Context) -> dict[str, Any]:
 
 STAGE = Stage(
     name="targets",
-    version=5,
+    version=6,
     title="Targets",
     run=run,
     summary="{files} files",
-    needs=("poses", "refine", "mesh", "bake", "export"),
+    needs=("ingest", "poses", "refine", "mesh", "bake", "export"),
     settings=("targets.*", "export.*", "mesh.decimator"),
 )

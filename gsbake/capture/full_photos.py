@@ -1,6 +1,6 @@
 """Posed photos at full size: the originals that the ingest stage kept, undistorted as the poses stage undistorted its working photos.
 
-A photo without an original (it is no larger than its working photo), and one whose working photo or camera was replaced by hand, is read as
+A photo without an original (it is no larger than its working photo), and one whose working photo was replaced by hand, is read as
 `PosedPhotos` reads it. So are reduced photos that are no larger than the working ones.
 """
 
@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from gsbake.capture.photos.originals import Originals, file_digest
-from gsbake.capture.photos.undistortion import undistorted
+from gsbake.capture.photos.undistortion import intrinsics_key, pinhole_camera, undistorted
 from gsbake.capture.posed_photos import DIGESTS, Bytes, PosedPhotos, View
 from gsbake.geometry.cameras import Camera, CameraSet
 
@@ -46,23 +46,26 @@ class FullPhotos:
         return len(self.posed)
 
     def _pairs(self, poses: Path) -> tuple[dict[str, Camera], dict[str, Camera]]:
-        """By name, the cameras of originals at full size: with their lens, and as the pinhole cameras in whose place training may have put
-        others."""
+        """By name, the cameras of originals at full size: with their lens, and the pinhole cameras that they were undistorted to, in whose
+        place training or the user may have put others."""
         lens_file, digest_file = poses / "photo_cameras.json", poses / DIGESTS
-        if not (lens_file.exists() and digest_file.exists()):  # cameras that the user put in their place
+        if not (lens_file.exists() and digest_file.exists()):
             return {}, {}
         digests = json.loads(digest_file.read_text(encoding="utf-8"))
         working = {camera.name: camera for camera in CameraSet.load(lens_file).cameras}
         lenses, pinholes = {}, {}
+        known: dict[tuple[float, ...], Camera] = {}
         for camera in CameraSet.load(poses / "cameras.json").cameras:
             name = camera.name
             photo = poses / "photos" / f"{name}.png"
             if name not in working or not self._originals.has(name) or file_digest(photo) != digests.get(name):
                 continue
-            lens = working[name]
-            width, height = self._originals.size(name)
+            lens, (width, height) = working[name], self._originals.size(name)
+            pinhole = known.get(intrinsics_key(lens)) or known.setdefault(intrinsics_key(lens), pinhole_camera(lens))
+            if (pinhole.width, pinhole.height) != (camera.width, camera.height):
+                continue
             lenses[name] = lens.scaled(width, height)
-            pinholes[name] = camera.scaled(round(camera.width * width / lens.width), round(camera.height * height / lens.height))
+            pinholes[name] = pinhole.scaled(round(camera.width * width / lens.width), round(camera.height * height / lens.height))
         return lenses, pinholes
 
     def size_of(self, least: int, share: float) -> int:

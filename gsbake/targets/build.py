@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsbake import __version__
-from gsbake.capture.posed_photos import PosedPhotos
+from gsbake.capture.full_photos import FullPhotos
 from gsbake.config.schema import Export, Targets
 from gsbake.config.targets import BUDGETS, SURFELS, Budget, Target, parse_target, require_packages
 from gsbake.errors import BadInputError
@@ -100,8 +100,9 @@ class _Builder:
     def __init__(self, folders: Mapping[str, Path], out: Path, options: TargetOptions, monitor: Monitor) -> None:
         self.folders, self.out, self.options, self.monitor = folders, out, options, monitor
         arrays = load_mesh_arrays(folders["bake"] / "mesh.safetensors")
-        unit = PosedPhotos.open(folders["poses"], folders["refine"]).cameras.cameras
         self.cameras = read_transforms_json(folders["export"] / "cameras.json")
+        with FullPhotos(folders.get("ingest"), folders["poses"], folders["refine"]) as photos:
+            unit, full = photos.posed.cameras.cameras, [photos.camera(index) for index in range(len(photos))]
         self.frame = frame_between(unit, self.cameras)
         self.mesh = mesh_in_frame(arrays, self.frame)
         self.maps = BakedMaps.open(folders["bake"], self.mesh)
@@ -109,7 +110,8 @@ class _Builder:
         self.extent = float(np.ptp(self.mesh.position, axis=0).max())
         self.diagonal = float(np.linalg.norm(np.ptp(self.mesh.position, axis=0)))
         self.extras = _extras_of(folders["export"] / "asset.glb")
-        self.pixels = pixels_per_texel(self.mesh, self.cameras, self.maps.edge)
+        sharp = [camera.scaled(other.width, other.height) for camera, other in zip(self.cameras, full, strict=True)]
+        self.pixels = pixels_per_texel(self.mesh, sharp, self.maps.edge)
         self._wedges: WedgeMesh | None = None
         self._dense: tuple[NDArray[Any], NDArray[Any]] | None = None
         self._bounded: dict[float, WedgeMesh] = {}

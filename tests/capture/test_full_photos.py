@@ -187,6 +187,14 @@ def test_what_was_replaced_by_hand_counts(tmp_path: Path, runner: Runner) -> Non
         assert view.mask is not None and view.rgb.shape[1] > 300
         half = view.mask.shape[1] // 2
         assert view.mask[:, : half - 3].max() == 0 and view.mask[:, half + 3 :].max() == 255
+    known = CameraSet.load(poses / "cameras.json")
+    moved = tuple(replace(c, fx=1.1 * c.fx, fy=1.1 * c.fy, t=c.t + 0.1) for c in known.cameras)
+    with FullPhotos(ingested, poses) as photos:
+        before = photos.view(2)
+    replace(known, cameras=moved).save(poses / "cameras.json")  # the photos are as they were
+    with FullPhotos(ingested, poses) as photos:
+        after = photos.view(2)
+    assert (after.rgb == before.rgb).all() and after.camera.fx == pytest.approx(1.1 * before.camera.fx)
     (poses / "photo_cameras.json").unlink()
     with FullPhotos(ingested, poses) as photos:
         assert (photos.view(2).rgb == photos.posed.view(2).rgb).all() and photos.camera(2) == photos.posed.cameras.cameras[2]

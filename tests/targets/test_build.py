@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import itertools
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 import trimesh
 
+from gsbake.capture.full_photos import FullPhotos
 from gsbake.config.schema import Export, Targets
 from gsbake.config.targets import is_target_file
 from gsbake.errors import BadInputError
@@ -22,6 +25,7 @@ from gsbake.gltf.read import read_glb
 from gsbake.gltf.scene import open_scene
 from gsbake.gltf.write import GltfMesh
 from gsbake.imaging.encoded import decode_image
+from gsbake.imaging.exr import read_exr, write_exr
 from gsbake.imaging.jpeg import encode_jpeg
 from gsbake.imaging.srgb import decode_bytes
 from gsbake.publish import INTERNAL
@@ -55,6 +59,21 @@ def test_every_target_has_its_files(built: tuple[Path, dict[str, Any]]) -> None:
     assert (out / "asset_film/base_color.exr").exists()
     written = {path.relative_to(out).as_posix() for path in out.rglob("*") if path.is_file()}
     assert all(is_target_file(name) for name in written if not name.endswith(INTERNAL))
+
+
+@pytest.mark.parametrize("factor", [1, 8])
+def test_a_finer_base_colour_stays_where_the_originals_have_its_pixels(
+    folders: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, factor: int
+) -> None:
+    """Cameras of the asset are those of the working photos; originals have `factor` times their pixels along an edge."""
+    bake = shutil.copytree(folders["bake"], tmp_path / "bake")
+    image = cv2.resize(read_exr(bake / "base_color.exr"), (512, 512), interpolation=cv2.INTER_LINEAR)
+    write_exr(bake / "base_color.exr", np.asarray(image, np.float32))
+    camera = FullPhotos.camera
+    monkeypatch.setattr(FullPhotos, "camera", lambda self, k: (c := camera(self, k)).scaled(factor * c.width, factor * c.height))
+    (tmp_path / "out").mkdir()
+    result = build_targets({**folders, "bake": bake}, tmp_path / "out", TargetOptions(Targets(files=("web",))))["targets"]
+    assert result["asset_web.glb"]["texture_size"] == (512 if factor == 8 else 256)
 
 
 def test_plain_files_pass_the_validator_without_a_message(built: tuple[Path, dict[str, Any]]) -> None:

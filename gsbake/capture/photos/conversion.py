@@ -151,8 +151,8 @@ def convert(what: Conversion) -> ConvertedPhoto:
 def keep_original(what: Conversion, photo: RawPhoto) -> str:
     """Keep a photo that is larger than its working photo; the name of its file.
 
-    It is a copy of the user's file. Linear colours (RAW, EXR, 16 bits) are kept in 8-bit sRGB, since such files are larger, and slow to
-    develop; those of telephones (HEIC, gain maps) are not, since they are much smaller.
+    It is a copy of the user's file. What is read as linear light (RAW, EXR, HDR) is kept in 8-bit sRGB, since such files are larger, and
+    slow to develop; those of telephones (HEIC, gain maps) are not, since they are much smaller.
     """
     suffix = what.path.suffix.lower()
     if photo.pixels.dtype == np.uint8 or photo.gain_map or suffix in HEIC_SUFFIXES:
