@@ -12,13 +12,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from gsbake.capture.photos.originals import Originals, file_digest
+from gsbake.capture.photos.originals import Originals, changed_pixels, file_digest
 from gsbake.capture.photos.undistortion import intrinsics_key, pinhole_camera, undistorted
 from gsbake.capture.posed_photos import DIGESTS, Bytes, PosedPhotos, View
 from gsbake.geometry.cameras import Camera, CameraSet
-
-#: Difference of a mask at full size, reduced, from the working mask (of 255) from which the working mask counts: it was changed there.
-_OTHER_MASK = 128
 
 
 class FullPhotos:
@@ -108,9 +105,9 @@ class FullPhotos:
             return enlarged
         if lens.distortion or full.shape != (pinhole.height, pinhole.width):
             full = undistorted(full, lens, pinhole, mask=True)
-        reduced = cv2.resize(full, working.shape[::-1], interpolation=cv2.INTER_AREA)
-        other = (cv2.absdiff(reduced, working) >= _OTHER_MASK).astype(np.uint8)
-        if not other.any():
+        changed = changed_pixels(full, working)
+        if not changed.any():
             return full
-        other = np.asarray(cv2.dilate(other, np.ones((3, 3), np.uint8)), np.uint8)  # with the pixels that the edge of the change shares
+        # With the pixels that the edge of the change shares.
+        other = np.asarray(cv2.dilate(changed.astype(np.uint8), np.ones((3, 3), np.uint8)), np.uint8)
         return np.asarray(np.where(cv2.resize(other, size, interpolation=cv2.INTER_NEAREST) > 0, enlarged, full), np.uint8)

@@ -20,7 +20,7 @@ from gsbake.capture.photos.conversion import FULL_MASKS, ORIGINALS, Conversion, 
 from gsbake.capture.photos.decode import UnreadablePhotoError
 from gsbake.capture.photos.exif import is_recropped
 from gsbake.capture.photos.quality import find_blurred, find_near_duplicates
-from gsbake.capture.photos.reader_pool import ReaderPool, submit_bounded
+from gsbake.capture.photos.reader_pool import MAX_READERS, ReaderPool, submit_bounded
 from gsbake.capture.photos.sharpness import detect_oversampling
 from gsbake.capture.photos.video_process import extract_frames
 from gsbake.capture.posed_photos import REGION
@@ -45,8 +45,6 @@ SUBFOLDERS = ("photos", "masks", ORIGINALS, FULL_MASKS)
 FRAMES = "frames"
 #: Share of the pixels of the largest photo of a camera below which another is taken for a crop.
 MIN_SAME_SIZE = 0.98
-#: Most processes that read photos.
-MAX_READERS = 8
 
 
 @dataclass(frozen=True)

@@ -314,7 +314,7 @@ class Export(Section):
     up_points: UpPoints = Field((), max_length=9, description="What is up, by points in the cameras' frame, before export.up: three points of the ground, or the lower and the upper end of an upright edge. --up takes them.")
     front: str = Field("", description="Photo that shows the front: the asset is turned about its up axis to face that camera. Empty: as the cameras' frame has it.")
     origin: Literal["auto", "bottom", "centre"] = Field("auto", description="Origin of the asset. bottom: the middle of its box's bottom; centre: the middle of its box; auto: that of given poses, else bottom.")
-    max_megabytes: float = Field(0.0, ge=0, le=4096, description="Maximum file size in MB: normal and material maps are reduced to meet it; the audit warns above it. 0: 5 MB for textures of up to 1024² texels, above in proportion to the base colour's texels.")
+    max_megabytes: float = Field(0.0, ge=0, le=4096, description="Maximum file size in MB: a base colour finer than the other maps is halved to meet it, then normal and material maps are reduced; the audit warns above it. 0: 5 MB for textures of up to 1024² texels, above in proportion to the base colour's texels.")
     max_triangles: int = Field(100_000, ge=100, le=10_000_000, description="Maximum triangle count; the audit fails above it.")
     copyright: str = Field("", description="Copyright line of the asset.")
 

@@ -6,7 +6,7 @@ size, first the low bits of the linear maps are dropped, then their resolution i
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
@@ -75,6 +75,15 @@ def quantise(base_color: NDArray[Any], orm: NDArray[Any], normal: NDArray[Any] |
     for row in range(0, len(colour), _ROWS):
         colour[row : row + _ROWS] = encode_bytes(np.asarray(base_color[row : row + _ROWS], np.float64))
     return TextureMaps(colour, packed, None if normal is None else _to_8bit(normal), emission, factors)
+
+
+def halved_to_fit(maps: TextureMaps, budget: int) -> TextureMaps:
+    """The maps with a base colour of at most `budget` bytes as a PNG file: one that is finer than the other maps is halved, down to their
+    size at most."""
+    colour = maps.base_color
+    while len(colour) > len(maps.orm) and colour.size > budget and len(encode_png(colour)) > budget:
+        colour = _downsample(colour, 2)
+    return replace(maps, base_color=colour)
 
 
 def encode_within_budget(maps: TextureMaps, budget: int) -> tuple[GltfTextures, PrecisionLevel]:

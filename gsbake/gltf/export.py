@@ -20,7 +20,7 @@ from gsbake.geometry.cameras import CameraSet, Similarity
 from gsbake.geometry.raycast import RayCaster
 from gsbake.gltf.audit import as_json, audit, failed
 from gsbake.gltf.baked import load_mesh_arrays, mesh_in_frame, read_texture
-from gsbake.gltf.encode import TextureMaps, encode_within_budget, quantise, size_limit
+from gsbake.gltf.encode import TextureMaps, encode_within_budget, halved_to_fit, quantise, size_limit
 from gsbake.gltf.frame import asset_frame, transforms_json
 from gsbake.gltf.write import GltfMesh, build_glb
 from gsbake.imaging.exr import write_hdr
@@ -88,7 +88,8 @@ def export_asset(
         maps = quantise(read_texture(baked / "base_color.exr"), read_texture(baked / "orm.exr"), normal, emissive)
         geometry = sum(a.nbytes for a in (mesh.position, mesh.normal, mesh.tangent, mesh.uv, mesh.faces)) + 4096
         limit = size_limit(settings.max_megabytes, len(maps.base_color), len(maps.orm))
-        images, level = encode_within_budget(maps, int(limit * 1e6) - geometry)
+        maps = halved_to_fit(maps, budget := int(limit * 1e6) - geometry)
+        images, level = encode_within_budget(maps, budget)
     monitor.check_stop()
     with monitor.part("write"):
         extras = _extras(options, cameras, mesh, maps, scale)

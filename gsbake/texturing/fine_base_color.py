@@ -79,4 +79,5 @@ def _refined(coarse: Floats, projected: Halves, observed: Flags) -> Floats:
     smooth = cv2.resize(filled, large, interpolation=cv2.INTER_LINEAR)
     ratio = (projected.astype(np.float32) + DETAIL_OFFSET) / (smooth + DETAIL_OFFSET)
     ratio[~observed] = 1
-    return np.asarray(cv2.resize(coarse, large, interpolation=cv2.INTER_LINEAR) * np.clip(ratio, 1 / MAX_RATIO, MAX_RATIO), np.float32)
+    refined = cv2.resize(coarse, large, interpolation=cv2.INTER_LINEAR) * np.clip(ratio, 1 / MAX_RATIO, MAX_RATIO)
+    return np.asarray(np.clip(refined, 0, 1), np.float32)

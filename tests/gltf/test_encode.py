@@ -7,7 +7,7 @@ import io
 import numpy as np
 from PIL import Image
 
-from gsbake.gltf.encode import PRECISION_LEVELS, encode_within_budget, quantise, size_limit
+from gsbake.gltf.encode import PRECISION_LEVELS, encode_within_budget, halved_to_fit, quantise, size_limit
 
 
 def pixels(content: bytes) -> np.ndarray:
@@ -50,6 +50,14 @@ def test_budget_lowers_the_linear_maps_only() -> None:
     assert level is PRECISION_LEVELS[-1] and pixels(least.normal or b"").shape == (32, 32, 3)
     vector = pixels(least.normal or b"") / 127.5 - 1
     assert np.abs(np.linalg.norm(vector, axis=2) - 1).max() < 0.03
+
+
+def test_a_base_colour_finer_than_the_other_maps_is_halved_first() -> None:
+    rng = np.random.default_rng(0)
+    maps = quantise(rng.random((64, 64, 3)), rng.random((16, 16, 3)), None)
+    assert len(halved_to_fit(maps, 64 * 64 * 3 + 1000).base_color) == 64
+    assert len(halved_to_fit(maps, 32 * 32 * 3 + 1000).base_color) == 32
+    assert len(halved_to_fit(maps, 0).base_color) == 16
 
 
 def test_flat_normals_and_range_ends_are_exact_at_every_level() -> None:

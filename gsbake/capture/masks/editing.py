@@ -9,9 +9,11 @@ from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
+from gsbake.capture.photos.originals import changed_pixels
 from gsbake.errors import BadInputError
-from gsbake.imaging.png import write_png
+from gsbake.imaging.png import read_grey, write_png
 from gsbake.own_files import require_own_folder
 
 
@@ -44,5 +46,14 @@ def export_masks(ingest: Path, poses: Path | None, folder: Path, only: frozenset
         if mask is None:
             raise FileNotFoundError(files[entry["name"]])
         target.parent.mkdir(parents=True, exist_ok=True)
-        write_png(target, np.asarray(cv2.resize(mask, (entry["source_width"], entry["source_height"]), interpolation=cv2.INTER_LINEAR)))
+        write_png(target, _at_full_size(ingest, entry, mask))
     return targets
+
+
+def _at_full_size(ingest: Path, entry: dict[str, Any], mask: Any) -> NDArray[np.uint8]:
+    """The `mask` of a working photo at the size of its source: the one that was given, unless this one differs from it."""
+    if entry.get("full_mask"):
+        given = read_grey(ingest / entry["full_mask"])
+        if given.shape == (entry["source_height"], entry["source_width"]) and not changed_pixels(given, mask).any():
+            return given
+    return np.asarray(cv2.resize(mask, (entry["source_width"], entry["source_height"]), interpolation=cv2.INTER_LINEAR), np.uint8)

@@ -9,21 +9,24 @@ from __future__ import annotations
 import json
 import tempfile
 from pathlib import Path
-from queue import SimpleQueue
 from typing import Any
 
 import cv2
 import numpy as np
 from blake3 import blake3
+from numpy.typing import NDArray
 
 from gsbake.capture.photos.conversion import FULL_SIZE
 from gsbake.capture.photos.decode import Bytes, working_size
-from gsbake.capture.photos.reader_pool import MIN_SECONDS, ONE_THREAD, READER, SECONDS_PER_BYTE
+from gsbake.capture.photos.reader_pool import MAX_READERS, MIN_SECONDS, SECONDS_PER_BYTE, ReaderProcesses
 from gsbake.imaging.png import read_grey
-from gsbake.limited_process import ParserProcess, read_in_child
+from gsbake.limited_process import read_in_child
+from gsbake.memory_budget import MemoryBudget
 
-#: Bytes per pixel that the time limit of a photo is computed from.
-_BYTES = 36
+#: Difference (of 255) of a mask at full size, reduced, from the working mask from which the working mask counts.
+_OTHER_MASK = 128
+#: Bytes per pixel that reading a photo may take: more are waited for, and its time limit is computed from them.
+_BYTES = 64
 
 
 class Originals:
@@ -38,10 +41,7 @@ class Originals:
         if ingest is not None:
             entries = json.loads((ingest / "photos.json").read_text(encoding="utf-8"))["photos"]
         self._entries = {entry["name"]: entry for entry in entries}
-        self._readers = [ParserProcess(READER, ONE_THREAD) for _ in range(readers)]
-        self._idle: SimpleQueue[ParserProcess] = SimpleQueue()
-        for process in self._readers:
-            self._idle.put(process)
+        self._processes, self._budget = ReaderProcesses(max(1, min(readers, MAX_READERS))), MemoryBudget()
 
     def __enter__(self) -> Originals:
         return self
@@ -51,8 +51,7 @@ class Originals:
 
     def close(self) -> None:
         """End the processes that decode; a later call starts them again."""
-        for process in self._readers:
-            process.close()
+        self._processes.close()
 
     def has(self, name: str) -> bool:
         """Whether there is more of a photo than its working photo."""
@@ -76,11 +75,8 @@ class Originals:
             request = {"task": "read", "path": str(self._folder / entry["original"]), "name": entry["source"], "out": str(out)}
             request |= {"max_size": max_size, "max_megapixels": pixels / 1e6}
             seconds = MIN_SECONDS + SECONDS_PER_BYTE * _BYTES * pixels
-            process = self._idle.get()
-            try:
+            with self._processes.idle() as process, self._budget.reserve(_BYTES * pixels):
                 read_in_child(process, request, seconds, f"The original of {entry['source']}")
-            finally:
-                self._idle.put(process)
             return np.asarray(np.load(out), np.uint8)
 
     def mask(self, name: str, size: tuple[int, int]) -> Bytes | None:
@@ -91,6 +87,12 @@ class Originals:
             return None
         mask = read_grey(self._folder / entry["full_mask"])
         return mask if mask.shape[::-1] == size else np.asarray(cv2.resize(mask, size, interpolation=cv2.INTER_AREA), np.uint8)
+
+
+def changed_pixels(full: Bytes, working: Bytes) -> NDArray[np.bool_]:
+    """Where (h, w) the `working` mask was changed: it says the other of the mask at full size that it was reduced from."""
+    reduced = cv2.resize(full, working.shape[::-1], interpolation=cv2.INTER_AREA)
+    return np.asarray(cv2.absdiff(reduced, working) >= _OTHER_MASK)
 
 
 def file_digest(path: Path) -> str:

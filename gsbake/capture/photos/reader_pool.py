@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
+from contextlib import contextmanager
 from dataclasses import replace
 from queue import SimpleQueue
 from typing import Any
@@ -24,28 +25,50 @@ from gsbake.memory_budget import MemoryBudget, too_large
 
 #: Module of the child.
 READER = "gsbake.capture.photos.reader_process"
+#: Most processes that read photos.
+MAX_READERS = 8
 #: Seconds that a photo may take: at least, and per byte that it needs (a hundred megabytes a second). Far above any measured time.
 MIN_SECONDS, SECONDS_PER_BYTE = 300.0, 1e-8
 #: Threads of the libraries in a child; the pool runs in parallel instead.
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OPENIMAGEIO_THREADS"), "1")
 
 
-class ReaderPool:
-    """`count` reader processes for as many threads of the caller; a context manager that ends them."""
+class ReaderProcesses:
+    """`count` reader processes for as many threads of the caller, started when they are needed."""
 
-    def __init__(self, count: int, budget: MemoryBudget | None = None) -> None:
-        self._budget = budget or MemoryBudget()
+    def __init__(self, count: int) -> None:
         self._all = [ParserProcess(READER, ONE_THREAD) for _ in range(count)]
         self._idle: SimpleQueue[ParserProcess] = SimpleQueue()
         for process in self._all:
             self._idle.put(process)
 
+    @contextmanager
+    def idle(self) -> Iterator[ParserProcess]:
+        """One that no other thread uses; waits for it."""
+        process = self._idle.get()
+        try:
+            yield process
+        finally:
+            self._idle.put(process)
+
+    def close(self) -> None:
+        """End them; a later request starts them again."""
+        for process in self._all:
+            process.close()
+
+
+class ReaderPool:
+    """Converts photos in `count` reader processes; a context manager that ends them."""
+
+    def __init__(self, count: int, budget: MemoryBudget | None = None) -> None:
+        self._budget = budget or MemoryBudget()
+        self._processes = ReaderProcesses(count)
+
     def __enter__(self) -> ReaderPool:
         return self
 
     def __exit__(self, *_: object) -> None:
-        for process in self._all:
-            process.close()
+        self._processes.close()
 
     def convert(self, what: Conversion) -> ConvertedPhoto:
         """Write the working files of a photo; waits for memory and for an idle process.
@@ -62,11 +85,8 @@ class ReaderPool:
         return ConvertedPhoto(found["entry"], int(found["orientation"]), quality)
 
     def _ask(self, task: str, what: Conversion, size: int) -> dict[str, Any]:
-        process = self._idle.get()
-        try:
+        with self._processes.idle() as process:
             return self._answer(process, task, what, size)
-        finally:
-            self._idle.put(process)
 
     def _answer(self, process: ParserProcess, task: str, what: Conversion, size: int) -> dict[str, Any]:
         request = {"task": task, "what": what.to_json(), "bytes": size}
