@@ -90,9 +90,9 @@ def fit_images(
 
     for step in steps(form):
         (hc, codec, quality), (hl, linear, amount) = step.colour, step.linear
-        colour_edge, linear_edge = max(MIN_EDGE, edge >> hc), max(MIN_EDGE, edge >> hl)
         check_stop()
         have = maps(edge)
+        colour_edge, linear_edge = max(MIN_EDGE, edge >> hc), max(MIN_EDGE, min(edge, len(have.orm)) >> hl)
         base = encode("base_color", colour_edge, codec, quality)
         emissive = None if have.emissive is None else encode("emissive", colour_edge, codec, quality)
         orm = encode("orm", linear_edge, linear, amount)

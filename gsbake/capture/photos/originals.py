@@ -23,6 +23,8 @@ from gsbake.imaging.png import read_grey
 from gsbake.limited_process import read_in_child
 from gsbake.memory_budget import MemoryBudget
 
+#: Largest photo in millions of pixels: ingestion has let it pass.
+MAX_MEGAPIXELS = 10_000.0
 #: Difference (of 255) of a mask at full size, reduced, from the working mask from which the working mask counts.
 _OTHER_MASK = 128
 #: Bytes per pixel that reading a photo may take: more are waited for, and its time limit is computed from them.
@@ -66,17 +68,20 @@ class Originals:
     def read(self, name: str, max_size: int = FULL_SIZE) -> Bytes:
         """The photo (h, w, 3), upright, 8-bit sRGB, the longer side at most `max_size` pixels: area filter in linear light.
 
-        For one that has an original. Raises BadInputError when it cannot be read, InterruptedRun when its process is killed.
+        For one that has an original. Raises BadInputError when it cannot be read, OSError when the disk is full, InterruptedRun when its
+        process is killed.
         """
         entry = self._entries[name]
         pixels = entry["source_width"] * entry["source_height"]
         with tempfile.TemporaryDirectory(prefix="gsbake-photo-") as folder:
             out = Path(folder) / "pixels.npy"
             request = {"task": "read", "path": str(self._folder / entry["original"]), "name": entry["source"], "out": str(out)}
-            request |= {"max_size": max_size, "max_megapixels": pixels / 1e6}
+            request |= {"max_size": max_size, "max_megapixels": MAX_MEGAPIXELS}
             seconds = MIN_SECONDS + SECONDS_PER_BYTE * _BYTES * pixels
             with self._processes.idle() as process, self._budget.reserve(_BYTES * pixels):
-                read_in_child(process, request, seconds, f"The original of {entry['source']}")
+                answer = read_in_child(process, request, seconds, f"The original of {entry['source']}")
+            if "os_error" in answer:
+                raise OSError(*answer["os_error"])
             return np.asarray(np.load(out), np.uint8)
 
     def mask(self, name: str, size: tuple[int, int]) -> Bytes | None:

@@ -51,7 +51,7 @@ def answer(request: dict[str, Any]) -> dict[str, Any]:
 def _read(request: dict[str, Any]) -> dict[str, Any]:
     """Write the pixels (h, w, 3) of the photo `path`, its longer side at most `max_size`, into the file `out` as NumPy's; {}.
 
-    Errors are those of `read_in_child`; `name` is what messages call the photo.
+    Errors are those of `read_in_child`, and "os_error" as in `answer`; `name` is what messages call the photo.
     """
     path, size, most = Path(request["path"]), int(request["max_size"]), float(request["max_megapixels"])
     limit_memory(child_limit(0, SPARE_MEMORY))
@@ -64,7 +64,7 @@ def _read(request: dict[str, Any]) -> dict[str, Any]:
     except UnreadablePhotoError as error:
         return {"error": f"The original of {request['name']} cannot be read ({error}); run `gsbake ingest` again."}
     except OSError as error:
-        return {"error": f"The original of {request['name']} cannot be read ({error.strerror}); free disk space, or run `gsbake ingest`."}
+        return {"os_error": [error.errno, error.strerror, error.filename]}
     return {}
 
 
