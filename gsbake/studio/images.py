@@ -77,7 +77,8 @@ class Images:
             for folder in ("photos", "masks"):
                 Path(scratch, folder).mkdir()
             try:
-                done = reader.convert(Conversion(path, name, "photo", Path(scratch), True, mask, invert, size, MAX_MEGAPIXELS))
+                what = Conversion(path, name, "photo", Path(scratch), True, mask, invert, size, MAX_MEGAPIXELS, keep=False)
+                done = reader.convert(what)
             except UnreadablePhotoError as error:
                 raise BadInputError(f"The photo {name} cannot be read ({error}).") from error
             pixels: Any = cv2.imread(str(Path(scratch, "photos/photo.png")), cv2.IMREAD_COLOR)

@@ -14,6 +14,7 @@ import pytest
 from hypothesis import strategies as st
 from PIL import Image, ImageCms
 
+from gsbake.capture.ingest import SUBFOLDERS
 from gsbake.capture.photos.conversion import Conversion, ConvertedPhoto
 from gsbake.capture.photos.decode import UnreadablePhotoError
 from gsbake.capture.photos.reader_pool import ReaderPool
@@ -72,7 +73,7 @@ def fuzz_photos(
     capsys: pytest.CaptureFixture[str], title: str, folder: Path, pool: ReaderPool, suffix: str, inputs: st.SearchStrategy[bytes]
 ) -> None:
     """Each photo is converted or unreadable; crashes of a decoder count as unreadable, exceptions that nothing expects do not."""
-    for sub in ("photos", "masks"):
+    for sub in SUBFOLDERS:
         (folder / "out" / sub).mkdir(parents=True, exist_ok=True)
     path = folder / f"a.{suffix}"
     what = Conversion(path, path.name, "a", folder / "out", True, None, False, MAX_SIZE, MEGAPIXELS)
