@@ -311,7 +311,8 @@ class _Baking:
             monitor.decide("base colour", f"{chosen.size}² texels", chosen.evidence)
             if chosen.size == surface.texels.size:
                 return coarse
-            return fine_base_color(surface, photos, coarse, chosen.size, gains, self.options.holdout, monitor)
+            smooth = bake.materials != "fit"
+            return fine_base_color(surface, photos, coarse, chosen.size, gains, self.options.holdout, smooth, monitor)
 
     def _write(
         self,

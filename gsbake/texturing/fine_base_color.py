@@ -1,6 +1,6 @@
 """A base colour finer than the other maps: the photos, projected at their full size, refine the colour that the coarser texture has.
 
-The result is the coarse colour, interpolated, times the ratio of the projected colours to their own coarse version: light and materials
+The result is the projected colours times the ratio of the coarse colour to their own coarse version, interpolated: light and materials
 are those of the coarse texture, the detail is that of the photos. The fine texture is projected in bands of rows, so that memory does not
 grow with its size.
 """
@@ -26,22 +26,31 @@ Flags = NDArray[np.bool_]
 
 #: Texels of the surface that are projected at once; each takes 170 bytes.
 BAND_TEXELS = 6_000_000
-#: Detail is a ratio within this factor of 1.
-MAX_RATIO = 8.0
+#: Light and materials change the photos' colours by a factor of at most so much; where it is smooth, it is averaged over so many coarse
+#: texels: the coarse texture is less sharp than the mean of the fine one, and would blur it.
+MAX_RATIO, SMOOTH_TEXELS = 8.0, 2.0
 
 
 def fine_base_color(
-    surface: UnwrappedMesh, photos: FullPhotos, coarse: Floats, size: int, gains: Floats, holdout: int, monitor: Monitor
+    surface: UnwrappedMesh,
+    photos: FullPhotos,
+    coarse: Floats,
+    size: int,
+    gains: Floats,
+    holdout: int,
+    smooth: bool,
+    monitor: Monitor,
 ) -> Floats:
     """Linear base colour (size, size, 3) with the detail of the photos, whose exposure `gains` (views, 3) are divided out.
 
-    `coarse` (s, s, 3) is the finished one of the texture of `surface`, without empty texels; `size` is s times a power of two.
+    `coarse` (s, s, 3) is the finished one of the texture of `surface`, without empty texels; `size` is s times a power of two. `smooth`: it
+    differs from the photos' colours by what varies slowly, as shading does, and not from texel to texel, as materials may.
     """
     projected, observed = _project(surface, photos, size, gains, holdout, monitor)
     out = np.empty((size, size, 3), np.float32)
     for channel in range(3):
         monitor.check_stop()
-        out[..., channel] = _refined(np.ascontiguousarray(coarse[..., channel]), projected[..., channel], observed)
+        out[..., channel] = _refined(np.ascontiguousarray(coarse[..., channel]), projected[..., channel], observed, smooth)
     return out
 
 
@@ -69,15 +78,15 @@ def _project(surface: UnwrappedMesh, photos: FullPhotos, size: int, gains: Float
     return colour.reshape(size, size, 3), observed.reshape(size, size)
 
 
-def _refined(coarse: Floats, projected: Halves, observed: Flags) -> Floats:
+def _refined(coarse: Floats, projected: Halves, observed: Flags, smooth: bool) -> Floats:
     """One channel: `coarse` (s, s) with the detail of the `projected` colours (n, n) where they are `observed` (n, n)."""
     small, large = coarse.shape, projected.shape
     known = observed.astype(np.float32)
     share = cv2.resize(known, small, interpolation=cv2.INTER_AREA)
     mean = cv2.resize(projected.astype(np.float32) * known, small, interpolation=cv2.INTER_AREA) / np.maximum(share, 1e-6)
     filled = fill_empty_texels(mean[..., None], share > 0, gutter=4)[..., 0]
-    smooth = cv2.resize(filled, large, interpolation=cv2.INTER_LINEAR)
-    ratio = (projected.astype(np.float32) + DETAIL_OFFSET) / (smooth + DETAIL_OFFSET)
-    ratio[~observed] = 1
-    refined = cv2.resize(coarse, large, interpolation=cv2.INTER_LINEAR) * np.clip(ratio, 1 / MAX_RATIO, MAX_RATIO)
-    return np.asarray(np.clip(refined, 0, 1), np.float32)
+    factor = np.clip((coarse + DETAIL_OFFSET) / (filled + DETAIL_OFFSET), 1 / MAX_RATIO, MAX_RATIO)
+    if smooth:
+        factor = cv2.GaussianBlur(factor, (0, 0), SMOOTH_TEXELS)
+    detailed = (projected.astype(np.float32) + DETAIL_OFFSET) * cv2.resize(factor, large, interpolation=cv2.INTER_LINEAR) - DETAIL_OFFSET
+    return np.asarray(np.clip(np.where(observed, detailed, cv2.resize(coarse, large, interpolation=cv2.INTER_LINEAR)), 0, 1), np.float32)

@@ -70,9 +70,9 @@ class Photos:
         return View(camera, rgb, (seen * 255).astype(np.uint8).reshape(PHOTO, PHOTO))
 
 
-def refined(surface: UnwrappedMesh, coarse: np.ndarray, size: int = 4 * COARSE) -> np.ndarray:
+def refined(surface: UnwrappedMesh, coarse: np.ndarray, size: int = 4 * COARSE, smooth: bool = False) -> np.ndarray:
     photos: Any = Photos()
-    return fine_base_color(surface, photos, coarse, size, np.ones((len(AXES), 3), np.float32), 0, SILENT)
+    return fine_base_color(surface, photos, coarse, size, np.ones((len(AXES), 3), np.float32), 0, smooth, SILENT)
 
 
 def test_texels_are_as_fine_as_the_photos_pixels(surface: UnwrappedMesh) -> None:
@@ -100,6 +100,19 @@ def test_the_detail_is_the_photos_and_the_colour_that_of_the_coarse_texture(surf
     whole = cv2.resize(fine.covered().astype(np.float32), (COARSE, COARSE), interpolation=cv2.INTER_AREA) == 1
     assert np.abs(reduced - 0.2)[whole].mean() < 0.03
     assert (image[~cv2.dilate(fine.covered().astype(np.uint8), np.ones((9, 9))).astype(bool)] == np.float32(0.2)).all()
+
+
+def test_a_smooth_factor_keeps_detail_that_the_coarse_texture_blurs() -> None:
+    """The coarse texture is half as bright, and less sharp than the mean of the fine one."""
+    rng, n = np.random.default_rng(0), 64
+    fine = cv2.resize(0.3 + 0.4 * rng.random((n, n)).astype(np.float32), (4 * n, 4 * n), interpolation=cv2.INTER_CUBIC)
+    mean = cv2.resize(fine, (n, n), interpolation=cv2.INTER_AREA)
+    coarse = np.asarray(0.5 * cv2.GaussianBlur(mean, (0, 0), 0.7), np.float32)
+    errors = [
+        np.abs(module._refined(coarse, fine.astype(np.float16), np.ones(fine.shape, np.bool_), smooth) - 0.5 * fine).mean()
+        for smooth in (False, True)
+    ]
+    assert errors[1] < 0.5 * errors[0]
 
 
 def test_bands_of_rows_give_the_same_colour(surface: UnwrappedMesh, monkeypatch: pytest.MonkeyPatch) -> None:
