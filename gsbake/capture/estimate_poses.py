@@ -21,7 +21,7 @@ from gsbake.capture.masks.completion import complete_masks
 from gsbake.capture.masks.consensus import MIN_CERTAIN_OVERLAP, MIN_OVERLAP, MIN_USED_AGREEMENT, correct_mask, distorted, find_consensus
 from gsbake.capture.masks.hull_correction import apply_correction, correct_by_hull
 from gsbake.capture.masks.support_plane import plane_masks
-from gsbake.capture.photos.originals import file_digest
+from gsbake.capture.photos.conversion import file_digest
 from gsbake.capture.photos.redundancy import find_redundant_photos
 from gsbake.capture.photos.undistortion import intrinsics_key, pinhole_camera, remap_tables, resample
 from gsbake.capture.posed_photos import DIGESTS, REGION, PosedPhotos

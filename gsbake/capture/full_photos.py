@@ -12,7 +12,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from gsbake.capture.photos.originals import Originals, changed_pixels, file_digest
+from gsbake.capture.photos.conversion import file_digest
+from gsbake.capture.photos.originals import Originals, changed_pixels
 from gsbake.capture.photos.undistortion import intrinsics_key, pinhole_camera, undistorted
 from gsbake.capture.posed_photos import DIGESTS, Bytes, PosedPhotos, View
 from gsbake.geometry.cameras import Camera, CameraSet
@@ -33,10 +34,6 @@ class FullPhotos:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self.close()
-
-    def close(self) -> None:
-        """End the processes that decode; a later call starts them again."""
         self._originals.close()
 
     def __len__(self) -> int:
@@ -99,15 +96,15 @@ class FullPhotos:
         if working is None:
             return None
         size = pinhole.width, pinhole.height
-        enlarged = np.asarray(cv2.resize(working, size, interpolation=cv2.INTER_LINEAR), np.uint8)
         full = self._originals.mask(pinhole.name, (lens.width, lens.height))
         if full is None:
-            return enlarged
+            return np.asarray(cv2.resize(working, size, interpolation=cv2.INTER_LINEAR), np.uint8)
         if lens.distortion or full.shape != (pinhole.height, pinhole.width):
             full = undistorted(full, lens, pinhole, mask=True)
         changed = changed_pixels(full, working)
         if not changed.any():
             return full
         # With the pixels that the edge of the change shares.
+        enlarged = cv2.resize(working, size, interpolation=cv2.INTER_LINEAR)
         other = np.asarray(cv2.dilate(changed.astype(np.uint8), np.ones((3, 3), np.uint8)), np.uint8)
         return np.asarray(np.where(cv2.resize(other, size, interpolation=cv2.INTER_NEAREST) > 0, enlarged, full), np.uint8)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from gsbake.capture.full_photos import FullPhotos
 from gsbake.monitor import Monitor
 from gsbake.texturing.inpainting import fill_empty_texels
-from gsbake.texturing.photo_projection import PhotoReader
+from gsbake.texturing.photo_projection import PhotoProjector
 from gsbake.texturing.projection import ProjectionBlender
 from gsbake.texturing.resampling import DETAIL_OFFSET
 from gsbake.texturing.texels import rasterise
@@ -56,7 +56,7 @@ def fine_base_color(
 
 def _project(surface: UnwrappedMesh, photos: FullPhotos, size: int, gains: Floats, holdout: int, monitor: Monitor) -> tuple[Halves, Flags]:
     """Linear colours of the photos on a texture of `size`, and where there are some."""
-    reader, atlas = PhotoReader(photos, holdout), surface.atlas
+    reader, atlas = PhotoProjector(photos, holdout), surface.atlas
     edge = surface.texel_size * surface.texels.size / size
     colour, observed = np.zeros((size * size, 3), np.float16), np.zeros(size * size, np.bool_)
     bands = max(1, -(-len(surface.texels) * size**2 // surface.texels.size**2 // BAND_TEXELS))

@@ -30,7 +30,7 @@ MASK_MARGIN = 0.008
 MIN_ALPHA = 0.8
 
 
-class PhotoReader:
+class PhotoProjector:
     """Reads photos at the size that a texture needs, with the weights of their pixels.
 
     `holdout` is that of training.
@@ -60,7 +60,7 @@ def project_photos(surface: UnwrappedMesh, photos: FullPhotos, holdout: int, equ
     """
     posed = photos.posed
     blender = ProjectionBlender(surface.texel_position, surface.texel_normal, surface.caster, 3, surface.texel_size)
-    reader, measured = PhotoReader(photos, holdout), equalisation != "skip"
+    reader, measured = PhotoProjector(photos, holdout), equalisation != "skip"
     tie_points = TiePointExposure.from_model(posed.folder / "sparse", posed.cameras.to_world.inverse()) if measured else None
     for index in range(len(posed)):
         monitor.check_stop()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import shutil
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -146,7 +147,7 @@ def test_originals_of_every_kind(tmp_path: Path, runner: Runner) -> None:
     write_dng(folder / "raw.dng", decode_bytes(picture(4)).astype(np.float64))
     runner.ingest(folder, max_size=SMALL, resolution="keep")
     listed = {e["name"]: e for e in json.loads((runner.root / "ingest/photos.json").read_text())["photos"]}
-    with Originals(runner.root / "ingest") as originals:
+    with closing(Originals(runner.root / "ingest")) as originals:
         assert originals.size("turned") == (300, 400) and originals.read("turned").shape == (400, 300, 3)
         upright = np.rot90(picture(1), -1)
         assert np.abs(originals.read("turned").astype(int) - upright).mean() < 8

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from gsbake.capture.hull.visual_hull import Hull, visual_hull
-from gsbake.capture.photos.originals import file_digest
+from gsbake.capture.photos.conversion import file_digest
 from gsbake.capture.posed_photos import PosedPhotos
 from gsbake.config.schema import Profile, Stereo
 from gsbake.errors import InterruptedRun

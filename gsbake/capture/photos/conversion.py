@@ -179,7 +179,7 @@ def halve(out: Path, entry: dict[str, Any]) -> None:
     before = max(entry["width"], entry["height"])
     rgb, mask = to_working_size(RawPhoto(full, None, 1, {}), mask, before // 2)
     write_png(out / entry["file"], rgb)
-    entry["digest"] = blake3((out / entry["file"]).read_bytes()).hexdigest()
+    entry["digest"] = file_digest(out / entry["file"])
     for larger in ("original", "full_mask"):
         if entry[larger] is not None:
             (out / entry[larger]).unlink()
@@ -189,3 +189,8 @@ def halve(out: Path, entry: dict[str, Any]) -> None:
     entry["height"], entry["width"] = rgb.shape[:2]
     if entry["focal_px"] is not None:
         entry["focal_px"] *= max(rgb.shape[:2]) / before
+
+
+def file_digest(path: Path) -> str:
+    """BLAKE3 digest of a working photo; none of one that is missing."""
+    return blake3(path.read_bytes()).hexdigest() if path.exists() else ""

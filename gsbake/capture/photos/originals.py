@@ -13,10 +13,9 @@ from typing import Any
 
 import cv2
 import numpy as np
-from blake3 import blake3
 from numpy.typing import NDArray
 
-from gsbake.capture.photos.conversion import FULL_SIZE
+from gsbake.capture.photos.conversion import FULL_SIZE, file_digest
 from gsbake.capture.photos.decode import Bytes, working_size
 from gsbake.capture.photos.reader_pool import MAX_READERS, MIN_SECONDS, SECONDS_PER_BYTE, ReaderProcesses
 from gsbake.imaging.png import read_grey
@@ -24,7 +23,7 @@ from gsbake.limited_process import read_in_child
 from gsbake.memory_budget import MemoryBudget
 
 #: Largest photo in millions of pixels: ingestion has let it pass.
-MAX_MEGAPIXELS = 10_000.0
+_MEGAPIXELS = 10_000.0
 #: Difference (of 255) of a mask at full size, reduced, from the working mask from which the working mask counts.
 _OTHER_MASK = 128
 #: Bytes per pixel that reading a photo may take: more are waited for, and its time limit is computed from them.
@@ -32,7 +31,7 @@ _BYTES = 64
 
 
 class Originals:
-    """Photos by name, from the artifact folder of the ingest stage, or none; a context manager that ends the processes that decode.
+    """Photos by name, from the artifact folder of the ingest stage, or none; `close` it at the end.
 
     Threads may read at the same time: `readers` do, the others wait.
     """
@@ -44,12 +43,6 @@ class Originals:
             entries = json.loads((ingest / "photos.json").read_text(encoding="utf-8"))["photos"]
         self._entries = {entry["name"]: entry for entry in entries}
         self._processes, self._budget = ReaderProcesses(max(1, min(readers, MAX_READERS))), MemoryBudget()
-
-    def __enter__(self) -> Originals:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def close(self) -> None:
         """End the processes that decode; a later call starts them again."""
@@ -76,7 +69,7 @@ class Originals:
         with tempfile.TemporaryDirectory(prefix="gsbake-photo-") as folder:
             out = Path(folder) / "pixels.npy"
             request = {"task": "read", "path": str(self._folder / entry["original"]), "name": entry["source"], "out": str(out)}
-            request |= {"max_size": max_size, "max_megapixels": MAX_MEGAPIXELS}
+            request |= {"max_size": max_size, "max_megapixels": _MEGAPIXELS}
             seconds = MIN_SECONDS + SECONDS_PER_BYTE * _BYTES * pixels
             with self._processes.idle() as process, self._budget.reserve(_BYTES * pixels):
                 answer = read_in_child(process, request, seconds, f"The original of {entry['source']}")
@@ -98,8 +91,3 @@ def changed_pixels(full: Bytes, working: Bytes) -> NDArray[np.bool_]:
     """Where (h, w) the `working` mask was changed: it says the other of the mask at full size that it was reduced from."""
     reduced = cv2.resize(full, working.shape[::-1], interpolation=cv2.INTER_AREA)
     return np.asarray(cv2.absdiff(reduced, working) >= _OTHER_MASK)
-
-
-def file_digest(path: Path) -> str:
-    """BLAKE3 digest of a working photo; none of one that is missing."""
-    return blake3(path.read_bytes()).hexdigest() if path.exists() else ""
