@@ -64,6 +64,7 @@ def test_maps_and_points_lie_on_the_sphere(scene, tmp_path) -> None:
     maps[2].save(tmp_path / "one.npz")
     depth, sure = read_depth(tmp_path / "one.npz")
     assert ((depth > 0) == (sure > 0)).all() and np.abs(depth - sphere_depth(cameras[2]))[depth > 0].mean() < 0.005
+    assert (tmp_path / "one.npz").stat().st_size < 0.5 * (depth.nbytes + sure.nbytes / 2)  # what has no depth takes no room
 
 
 def test_averaging_consistent_views_reduces_the_error(scene) -> None:
