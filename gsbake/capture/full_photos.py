@@ -18,6 +18,9 @@ from gsbake.capture.photos.undistortion import intrinsics_key, pinhole_camera, u
 from gsbake.capture.posed_photos import DIGESTS, Bytes, PosedPhotos, View
 from gsbake.geometry.cameras import Camera, CameraSet
 
+#: Pixels of all photos together at a size above the least one: memory and time of stereo grow with them.
+MAX_TOTAL_PIXELS = 100e6
+
 
 class FullPhotos:
     """Photos of the poses stage by index, with the cameras of `posed`, read from the originals of the ingest stage; a context manager that
@@ -63,8 +66,12 @@ class FullPhotos:
         return lenses, pinholes
 
     def size_of(self, least: int, share: float) -> int:
-        """Longer side in pixels of this `share` of the photos' full size, in the median; at least `least`."""
-        return max(least, round(share * float(np.median([max(c.width, c.height) for c in map(self.camera, range(len(self)))]))))
+        """Longer side in pixels of this `share` of the photos' full size, in the median; less where all together would have more than
+        MAX_TOTAL_PIXELS; at least `least`."""
+        cameras = [self.camera(index) for index in range(len(self))]
+        shared = share * float(np.median([max(c.width, c.height) for c in cameras]))
+        area = sum(min(c.width, c.height) / max(c.width, c.height) for c in cameras)
+        return max(least, round(min(shared, (MAX_TOTAL_PIXELS / area) ** 0.5)))
 
     def camera(self, index: int, max_size: int | None = None) -> Camera:
         """Pinhole camera `index` of the photo at full size, or with the longer side at most `max_size` pixels."""

@@ -58,7 +58,7 @@ _STARTS = StartComparison(coarsest(TRIAL), coarsest(COARSE))
 #: The fit.
 FIT = (
     # On the coarsest level.
-    Pass("light-motion", MotionComparison(coarsest(MOTION_TRIAL))),
+    Pass("light-motion", MotionComparison(coarsest(MOTION_TRIAL), coarsest(COARSE))),
     Pass("starts", _STARTS, instead=replace(_STARTS, dielectric_starts=((0.05, 0.45),), metal_starts=())),
     # On the coarse level.
     Pass("coarse-level", ChosenStart()),

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsbake.capture.hull.visual_hull import Hull
-from gsbake.geometry.cameras import Camera
+from gsbake.geometry.cameras import Array, Camera
 from gsbake.mvs.consistency import Consistency
 
 Floats = NDArray[np.float32]
@@ -33,21 +33,53 @@ HULL_MARGIN = 1.5
 
 @dataclass(frozen=True)
 class DepthMap:
-    """One photo's depth map: `camera`, `plane` (h, w, 3), `confidence` (h, w) in 0..1 (0 = no depth), consistent `views` (h, w)."""
+    """One photo's depth map, as a list of its pixels with a depth, as most have none: `camera`, `pixels` (n,), the flat indices in
+    ascending order, `plane` (n, 3), `confidence` (n,) in 0..1, consistent `views` (n,)."""
 
     camera: Camera
+    pixels: NDArray[np.int64]
     plane: Floats
     confidence: Floats
     views: NDArray[np.uint8]
 
+    @staticmethod
+    def of(camera: Camera, plane: Floats, confidence: Floats, views: NDArray[np.uint8]) -> DepthMap:
+        """The depth map of images: `plane` (h, w, 3), `confidence` (h, w), 0 = no depth, `views` (h, w)."""
+        pixels = np.flatnonzero(z_depth(camera, plane, confidence > 0))
+        return DepthMap(camera, pixels, plane.reshape(-1, 3)[pixels], confidence.ravel()[pixels], views.ravel()[pixels])
+
+    def __len__(self) -> int:
+        return len(self.pixels)
+
+    def select(self, keep: NDArray[np.bool_]) -> DepthMap:
+        """The pixels in `keep` (n,)."""
+        return DepthMap(self.camera, self.pixels[keep], self.plane[keep], self.confidence[keep], self.views[keep])
+
     def depth(self) -> Floats:
         """z-depth (h, w), 0 = none."""
-        return z_depth(self.camera, self.plane, self.confidence > 0)
+        return self._image(self._z())
+
+    def camera_points(self) -> Array:
+        """Points (n, 3) of the pixels in the frame of the camera."""
+        camera, z = self.camera, self._z().astype(np.float64)
+        row, column = np.divmod(self.pixels, camera.width)
+        return np.stack([(column + 0.5 - camera.cx) / camera.fx * z, (row + 0.5 - camera.cy) / camera.fy * z, z], 1)
+
+    def _z(self) -> Floats:
+        row, column = np.divmod(self.pixels, self.camera.width)
+        x = ((column + 0.5 - self.camera.cx) / self.camera.fx).astype(np.float32)
+        y = ((row + 0.5 - self.camera.cy) / self.camera.fy).astype(np.float32)
+        return np.asarray(1 / (self.plane[:, 0] * x + self.plane[:, 1] * y + self.plane[:, 2]), np.float32)
+
+    def _image(self, values: Floats) -> Floats:
+        image = np.zeros((self.camera.height, self.camera.width), np.float32)
+        image.ravel()[self.pixels] = values
+        return image
 
     def save(self, path: Path) -> None:
         """Write depth and confidence as a NumPy archive, compressed at the fastest level: most pixels of a masked photo have no depth."""
         with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
-            for name, values in (("depth", self.depth()), ("confidence", self.confidence.astype(np.float16))):
+            for name, values in (("depth", self.depth()), ("confidence", self._image(self.confidence).astype(np.float16))):
                 with archive.open(f"{name}.npy", "w", force_zip64=True) as file:
                     np.lib.format.write_array(file, values, allow_pickle=False)
 
@@ -96,7 +128,7 @@ def filter_depth_map(camera: Camera, cost: Floats, found: Consistency, min_views
     views = np.where(keep, found.consistent, 0).astype(np.uint8)
     agreement = np.minimum(found.consistent / FULL_CONFIDENCE_VIEWS, 1)
     confidence = agreement * np.clip(1 - cost, 0, 1) / (1 + (found.scatter / SCATTER_SCALE) ** 2)
-    return DepthMap(camera, found.plane, np.where(keep, np.maximum(confidence, 1e-3), 0).astype(np.float32), views)
+    return DepthMap.of(camera, found.plane, np.where(keep, np.maximum(confidence, 1e-3), 0).astype(np.float32), views)
 
 
 def _without_speckles(rho: Floats, keep: NDArray[np.bool_]) -> NDArray[np.bool_]:

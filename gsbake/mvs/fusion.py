@@ -53,13 +53,10 @@ def fuse(
     depths = [m.depth() for m in maps]
     used = [np.zeros(d.shape, np.uint8) for d in depths]
     parts: list[tuple[NDArray[Any], ...]] = []
-    for i, (one, depth) in enumerate(zip(maps, depths, strict=True)):
+    for i, one in enumerate(maps):
         camera = one.camera
-        row, column = np.nonzero((depth > 0) & (used[i] == 0))
-        z = depth[row, column].astype(np.float64)
-        x, y = (column + 0.5 - camera.cx) / camera.fx, (row + 0.5 - camera.cy) / camera.fy
-        local = np.stack([x * z, y * z, z], 1)
-        plane = one.plane[row, column].astype(np.float64)
+        one = one.select(used[i].ravel()[one.pixels] == 0)
+        local, plane = one.camera_points(), one.plane.astype(np.float64)
         normal = -plane / np.maximum(np.linalg.norm(plane, axis=1, keepdims=True), 1e-12)
         points = local.astype(np.float32)
         for j in neighbours[i]:
@@ -73,10 +70,10 @@ def fuse(
             (
                 (local - camera.t) @ camera.R,
                 normal @ camera.R,
-                colour(i)[row, column] if len(row) else np.zeros((0, 3), np.uint8),
-                z / camera.fx,
-                one.confidence[row, column].astype(np.float64),
-                one.views[row, column],
+                colour(i).reshape(-1, 3)[one.pixels] if len(one) else np.zeros((0, 3), np.uint8),
+                local[:, 2] / camera.fx,
+                one.confidence.astype(np.float64),
+                one.views,
             )
         )
         tick(i)

@@ -16,7 +16,7 @@ from gsbake.capture.full_photos import FullPhotos
 from gsbake.capture.hull.visual_hull import Hull
 from gsbake.capture.posed_photos import Bytes, PosedPhotos
 from gsbake.checkpoint import is_sealed, seal_file
-from gsbake.geometry.cameras import Array
+from gsbake.geometry.cameras import Array, Camera
 from gsbake.mvs.carving import CarvedHull, carve_hull
 from gsbake.mvs.coarse_to_fine import Planes, find_planes
 from gsbake.mvs.consistency import check_consistency
@@ -42,8 +42,9 @@ class StereoRun:
     """State of one run. `size` is the longer side of the matched photos in pixels; `settings` is the section [stereo]; matched planes go
     into the folder `planes_folder`.
 
-    `report(i, text)` is called in the main thread after each photo and may raise to stop. Per photo: the image pyramid, the source views,
-    the views of the consistency check, and the depths (h, w; 0 = none) that were consistent in the first check.
+    `report(i, text)` is called in the main thread after each photo and may raise to stop. Per photo: the camera of the largest size and its
+    number of `pixels` inside, the image pyramid (until all are matched), the source views, the views of the consistency check, and, where
+    there is a hull to carve, the depths (h, w; 0 = none) that were consistent in the first check.
     """
 
     photos: FullPhotos
@@ -54,6 +55,8 @@ class StereoRun:
     threads: int
     planes_folder: Path
     report: Callable[[int, str], None]
+    cameras: list[Camera] = field(default_factory=list)
+    pixels: list[int] = field(default_factory=list)
     pyramids: list[list[Photo]] = field(default_factory=list)
     sources: list[list[int]] = field(default_factory=list)
     consistency_views: list[list[int]] = field(default_factory=list)
@@ -67,6 +70,8 @@ class StereoRun:
     def prepare(self) -> None:
         """Load the photos and select their views."""
         self.pyramids = self.parallel(lambda i: image_pyramid(load_photo(self.photos, i, self.size)), "photos")
+        self.cameras = [sizes[-1].camera for sizes in self.pyramids]
+        self.pixels = [int(sizes[-1].inside.sum()) for sizes in self.pyramids]
         points, normals = self._surface_samples()
         cameras, settings = self.posed.cameras.cameras, self.settings
         self.sources, self.consistency_views = select_views(cameras, points, normals, settings.neighbours, settings.consistency_views)
@@ -121,6 +126,7 @@ class StereoRun:
             seal_file(target)
 
         self.parallel(match_photo, "matching")
+        self.pyramids = []  # they take gigabytes for hundreds of photos
 
     def _pyramid(self, index: int, count: int) -> list[Photo]:
         """Photo `index` at `count` sizes; where its own pyramid is shorter (other proportions), the coarsest size is halved further."""
@@ -142,22 +148,24 @@ class StereoRun:
         min_views = self.settings.min_consistent_views
 
         def check(index: int, valid: Sequence[NDArray[np.uint8]]) -> Any:
-            others = [(self.pyramids[j][-1].camera, self._planes(j).plane, valid[j]) for j in self.consistency_views[index]]
+            others = [(self.cameras[j], self._planes(j).plane, valid[j]) for j in self.consistency_views[index]]
             own = np.ascontiguousarray(self._planes(index).plane)
-            return check_consistency(self.pyramids[index][-1].camera, own, valid[index], others)
+            return check_consistency(self.cameras[index], own, valid[index], others)
 
         matched = self.parallel(lambda i: matched_pixels(self._planes(i).cost), "consistency")
 
         def first_check(index: int) -> Any:
             found = check(index, matched)
-            depth = z_depth(self.pyramids[index][-1].camera, self._planes(index).plane, found.consistent >= min_views)
+            kept = found.consistent >= min_views
+            depth = None if self.hull is None else z_depth(self.cameras[index], self._planes(index).plane, kept)
             return consistent_pixels(found, min_views), depth
 
         checked = self.parallel(first_check, "consistency", MAX_CONSISTENCY_THREADS)
-        consistent, self.consistent_depths = [pixels for pixels, _ in checked], [depth for _, depth in checked]
+        consistent = [pixels for pixels, _ in checked]
+        self.consistent_depths = [depth for _, depth in checked if depth is not None]
 
         def final_check(index: int) -> DepthMap:
-            camera, cost = self.pyramids[index][-1].camera, self._planes(index).cost
+            camera, cost = self.cameras[index], self._planes(index).cost
             return filter_depth_map(camera, cost, check(index, consistent), min_views, self.hull)
 
         return self.parallel(final_check, "consistency", MAX_CONSISTENCY_THREADS)
@@ -169,7 +177,7 @@ class StereoRun:
         """
         if self.hull is None:
             raise ValueError("there is no hull")
-        return carve_hull(self.hull, [sizes[-1].camera for sizes in self.pyramids], self.consistent_depths, softness)
+        return carve_hull(self.hull, self.cameras, self.consistent_depths, softness)
 
     def fuse(self, maps: Sequence[DepthMap]) -> StereoCloud:
         """Fuse the depth maps."""
@@ -177,6 +185,6 @@ class StereoRun:
 
     def _colours(self, index: int) -> Bytes:
         """The working photo (h, w, 3) at the size of the matched one."""
-        camera, rgb = self.pyramids[index][-1].camera, self.posed.view(index, self.size).rgb
+        camera, rgb = self.cameras[index], self.posed.view(index, self.size).rgb
         size = camera.width, camera.height
         return rgb if rgb.shape[1::-1] == size else np.asarray(cv2.resize(rgb, size, interpolation=cv2.INTER_LINEAR), np.uint8)

@@ -6,8 +6,7 @@ A specular surface shows its surroundings at a place behind itself, and stereo m
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
 import numba as nb
@@ -75,29 +74,24 @@ def _behind_hard(
                 here += step
 
 
-def behind_hard_parts(hull: Hull, softness: Floats, cameras: Sequence[Camera], depths: Sequence[Floats]) -> list[NDArray[np.bool_]]:
+def behind_hard_parts(hull: Hull, softness: Floats, cameras: Sequence[Camera], depths: Iterable[Floats]) -> Iterator[NDArray[np.bool_]]:
     """Which z-depths (h, w; 0 = none) of the `cameras` lie MIN_DEPTH cells or more below the hull's surface, on rays that enter the hull
-    through a hard part.
+    through a hard part, one by one.
 
     `softness` (n, n, n) as from `surface_softness`.
     """
     hard = ndimage.maximum_filter(softness, 2 * SOFT_BORDER + 1) < SOFT
     lower, cell = np.asarray(hull.lower, float), float(hull.cell)
-    found = []
     for depth, *camera in zip((np.asarray(d, np.float32) for d in depths), *camera_arrays(cameras)[1:], strict=True):
         out = np.zeros(depth.shape, np.bool_)
         args = (depth, *camera, hull.field, hard, lower, cell, -MIN_DEPTH * cell, out)
         run_chunks(lambda lo, hi, args=args: _behind_hard(lo, hi, *args), len(depth))  # type: ignore[misc]
-        found.append(out)
-    return found
+        yield out
 
 
 def without_mirror_images(maps: Sequence[DepthMap], hull: Hull, softness: Floats) -> tuple[list[DepthMap], float]:
     """The depth maps without depths behind hard parts, and the share of the depths that these were."""
-    behind = behind_hard_parts(hull, softness, [one.camera for one in maps], [one.depth() for one in maps])
-    kept = [
-        replace(one, confidence=np.where(mirrored, 0, one.confidence), views=np.where(mirrored, 0, one.views))
-        for one, mirrored in zip(maps, behind, strict=True)
-    ]
-    depths = sum(int((one.confidence > 0).sum()) for one in maps)
-    return kept, sum(int(mirrored.sum()) for mirrored in behind) / max(depths, 1)
+    behind = behind_hard_parts(hull, softness, [one.camera for one in maps], (one.depth() for one in maps))
+    kept = [one.select(~mirrored.ravel()[one.pixels]) for one, mirrored in zip(maps, behind, strict=True)]
+    depths = sum(map(len, maps))
+    return kept, (depths - sum(map(len, kept))) / max(depths, 1)

@@ -7,7 +7,7 @@ hull, while a true concavity is connected to its boundary. Tiny isolated compone
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -67,14 +67,4 @@ def find_outliers(cloud: StereoCloud, hull: Hull | None) -> OutlierComponents:
 
 def without_points(one: DepthMap, wrong: Callable[[Array], NDArray[np.bool_]]) -> DepthMap:
     """The depth map without the pixels whose points are `wrong`."""
-    depth = one.depth()
-    row, column = np.nonzero(depth > 0)
-    if not len(row):
-        return one
-    camera, z = one.camera, depth[row, column].astype(np.float64)
-    local = np.stack([(column + 0.5 - camera.cx) / camera.fx * z, (row + 0.5 - camera.cy) / camera.fy * z, z], 1)
-    bad = wrong((local - camera.t) @ camera.R)
-    confidence, views = one.confidence.copy(), one.views.copy()
-    confidence[row[bad], column[bad]] = 0
-    views[row[bad], column[bad]] = 0
-    return replace(one, confidence=confidence, views=views)
+    return one.select(~wrong((one.camera_points() - one.camera.t) @ one.camera.R))

@@ -70,6 +70,8 @@ def _run(
 ) -> dict[str, Any]:
     """See `run_stereo`."""
     posed, size = photos.posed, photos.size_of(options.max_size, options.min_scale)
+    if size > options.max_size:
+        monitor.decide("stereo size", f"{size} pixels", f"originals are larger; {1e-6 * _pixels(photos, size):.0f} megapixels together")
 
     def report(done: int, text: str) -> None:
         monitor.check_stop()
@@ -99,6 +101,11 @@ def _run(
         one.save(out / "depth" / f"{one.camera.name}.npz")
     cloud.save(out / "points.ply")
     return _figures(run, maps, cloud, options, monitor)
+
+
+def _pixels(photos: FullPhotos, size: int) -> int:
+    """Pixels of all photos together with the longer side at most `size`."""
+    return sum(camera.width * camera.height for camera in (photos.camera(index, size) for index in range(len(photos))))
 
 
 def _skip_reason(posed: PosedPhotos, options: Stereo) -> str | None:
@@ -195,8 +202,8 @@ def _thin_parts(posed: PosedPhotos, hull: Hull, out: Path, seed: int, monitor: M
 
 def _figures(run: StereoRun, maps: list[DepthMap], cloud: StereoCloud, options: Stereo, monitor: Monitor) -> dict[str, Any]:
     """The figures for the manifest."""
-    inside = sum(int(sizes[-1].inside.sum()) for sizes in run.pyramids)
-    confirmed = sum(int((one.confidence > 0).sum()) for one in maps) / max(inside, 1)
+    inside = sum(run.pixels)
+    confirmed = sum(map(len, maps)) / max(inside, 1)
     unmatched = sum(not n for n in run.sources)
     views = options.min_consistent_views
     evidence = f"{100 * confirmed:.0f} % of the object's pixels are confirmed by {views} or more other photos"

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from gsbake.capture import full_photos
 from gsbake.capture.full_photos import FullPhotos
 from gsbake.capture.photos.originals import Originals
 from gsbake.capture.posed_photos import PosedPhotos
@@ -106,6 +107,18 @@ def test_a_level_in_between(tmp_path: Path, runner: Runner) -> None:
         assert np.abs(reduced(full.rgb, level.rgb.shape[1::-1]).astype(int) - level.rgb).mean() < 1.5
         assert level.mask is not None and level.mask.shape == level.rgb.shape[:2]
         assert (photos.view(1, 100).rgb == photos.posed.view(1, 100).rgb).all()
+
+
+def test_a_share_of_the_full_size_within_the_pixels_of_all_photos(tmp_path: Path, runner: Runner, monkeypatch: pytest.MonkeyPatch) -> None:
+    capture(tmp_path)
+    with FullPhotos(*prepared(tmp_path, runner)) as photos:
+        full = max(photos.camera(0).width, photos.camera(0).height)
+        assert photos.size_of(50, 0.5) == round(0.5 * full) and photos.size_of(300, 0.5) == 300
+        monkeypatch.setattr(full_photos, "MAX_TOTAL_PIXELS", 20_000 * len(photos))
+        limited = photos.size_of(50, 0.5)
+        reduced_cameras = [photos.camera(k, limited) for k in range(len(photos))]
+        assert 0.95 < sum(c.width * c.height for c in reduced_cameras) / (20_000 * len(photos)) < 1.05
+        assert photos.size_of(300, 0.5) == 300
 
 
 def test_a_photo_without_distortion_is_the_original_itself(tmp_path: Path, runner: Runner) -> None:

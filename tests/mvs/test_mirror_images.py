@@ -46,9 +46,9 @@ def test_mirror_images_leave_the_depth_maps() -> None:
     inverse = np.where(depth > 0, 1 / np.maximum(depth, 1e-6), 0)
     plane = np.stack([0 * inverse, 0 * inverse, inverse], -1).astype(np.float32)
     covered = surface > 0
-    one = DepthMap(camera, plane, covered.astype(np.float32), 2 * covered.astype(np.uint8))
+    one = DepthMap.of(camera, plane, covered.astype(np.float32), 2 * covered.astype(np.uint8))
     (kept,), share = without_mirror_images([one], hull, softness())
     assert share == wrong.sum() / covered.sum()
-    assert (kept.confidence[wrong] == 0).all() and (kept.views[wrong] == 0).all()
-    assert (kept.confidence[covered & ~wrong] == 1).all() and kept.views.dtype == np.uint8
-    assert behind_hard_parts(hull, softness(), [], []) == []
+    np.testing.assert_array_equal(kept.pixels, np.flatnonzero(covered & ~wrong))
+    assert (kept.confidence == 1).all() and (kept.views == 2).all()
+    assert list(behind_hard_parts(hull, softness(), [], [])) == []
