@@ -20,6 +20,7 @@ from gsbake.config.load import DEFAULT, LoadedProfile, fields, load_profile
 from gsbake.config.renamed import present_override
 from gsbake.config.schema import Profile
 from gsbake.config.targets import parse_target, require_packages
+from gsbake.config.white import parse_white
 from gsbake.errors import BadInputError, GsbakeError, UsageError
 from gsbake.meshing.decimator_choice import resolve_decimator
 from gsbake.output_folder import check_output_folder, check_same_photos
@@ -95,7 +96,7 @@ class Session:
         """
         if until == TARGETS and TARGETS not in self.engine.registry.names:
             raise UsageError("No target is set: name them, as in --target web,ar:usdz (settings: targets.files).")
-        self._require_front()
+        self._require_named_photos()
         self.engine.shared = open_shared_store(self.store)
         try:
             with self.engine.uses:  # until the results are copied
@@ -113,8 +114,8 @@ class Session:
 
     def store_settings(self) -> None:
         """Store the options in the output folder, for its next run. Raises BadInputError where it cannot be written, or for a
-        front that no photo shows."""
-        self._require_front()
+        photo that a setting names and that is none."""
+        self._require_named_photos()
         try:
             ensure_output_folder(self.out)
             self.project.save(self.out)
@@ -123,11 +124,14 @@ class Session:
                 f"The output folder '{self.out}' cannot be written ({error.strerror}); choose another with --out."
             ) from error
 
-    def _require_front(self) -> None:
-        """Refuse the name of a front that is no photo, which else the last stage would find."""
-        front = self.profile.profile.export.front
-        if front and self.project.photos is not None:
-            require_photo(Path(self.project.photos), front, "export.front")
+    def _require_named_photos(self) -> None:
+        """Refuse names of photos that are none, which else a late stage would find."""
+        profile = self.profile.profile
+        named = [("bake.white", parse_white(text).position.photo) for text in profile.bake.white]
+        named += [("export.front", profile.export.front)] if profile.export.front else []
+        if self.project.photos is not None:
+            for setting, photo in named:
+                require_photo(Path(self.project.photos), photo, setting)
 
     def _publish(self, states: Sequence[StageState]) -> tuple[dict[str, Path], tuple[str, ...]]:
         """Copy the results of these stages to the output folder; returns {file: path} and what needs a word."""

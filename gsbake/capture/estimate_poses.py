@@ -23,6 +23,7 @@ from gsbake.capture.masks.hull_correction import apply_correction, correct_by_hu
 from gsbake.capture.masks.support_plane import plane_masks
 from gsbake.capture.photos.conversion import file_digest
 from gsbake.capture.photos.redundancy import find_redundant_photos
+from gsbake.capture.photos.replaced import require_sizes
 from gsbake.capture.photos.undistortion import intrinsics_key, pinhole_camera, remap_tables, resample
 from gsbake.capture.posed_photos import DIGESTS, REGION, PosedPhotos
 from gsbake.capture.poses.normalisation import BoundingSphere, bounding_sphere_from_masks, bounding_sphere_from_views
@@ -104,6 +105,7 @@ class _Estimation:
         """Execute all steps; returns the figures."""
         monitor = self.monitor
         entries: list[dict[str, Any]] = json.loads((self.ingest / "photos.json").read_text(encoding="utf-8"))["photos"]
+        require_sizes(self.ingest, {entry["name"]: (entry["width"], entry["height"]) for entry in entries}, "ingest")
         solver = PoseSolver(self.ingest, entries, self.scratch, self.options.poses, self.seed, self.threads, monitor, self.cache)
         given = self._use_given(len(entries))
         solved = solver.triangulate() if given else solver.solve()

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from gsbake.capture.photos.replaced import require_sizes
 from gsbake.geometry.cameras import Camera, CameraSet
 from gsbake.geometry.region import Region
 
@@ -43,10 +44,13 @@ class PosedPhotos:
         """Open the artifact folder of the poses stage.
 
         Cameras are read from `trained`, the folder of the train or refine stage, if training refined them, else from `folder`. Every stage
-        after training has to pass `trained`, so that all of them use the same cameras.
+        after training has to pass `trained`, so that all of them use the same cameras. Raises BadInputError for photos and masks that were
+        replaced by those of another size.
         """
         refined = None if trained is None else trained / "cameras.json"
-        return PosedPhotos(folder, CameraSet.load(folder / "cameras.json" if refined is None or not refined.exists() else refined))
+        cameras = CameraSet.load(folder / "cameras.json" if refined is None or not refined.exists() else refined)
+        require_sizes(folder, {camera.name: (camera.width, camera.height) for camera in cameras.cameras}, "poses")
+        return PosedPhotos(folder, cameras)
 
     def __len__(self) -> int:
         return len(self.cameras.cameras)

@@ -44,11 +44,12 @@ from gsbake.cli.options import (
     UpOption,
     VerboseOption,
     ViewOption,
+    WhiteOption,
     complete_profile,
     complete_stage,
     given_path,
     mask_settings,
-    placement_settings,
+    photo_settings,
     scale_settings,
     target_settings,
 )
@@ -121,6 +122,7 @@ def _pipeline_command(until: str | None) -> Callable[..., None]:
         region: RegionOption = None,
         known_distances: KnownDistanceOption = None,
         marker_size: MarkerSizeOption = None,
+        white: WhiteOption = None,
         device: DeviceOption = Device.auto,
         threads: ThreadsOption = 0,
         seed: SeedOption = None,
@@ -133,7 +135,7 @@ def _pipeline_command(until: str | None) -> Callable[..., None]:
 
         settings = [
             *(overrides or []), *mask_settings(masks, invert_masks), *(region or ()), *scale_settings(known_distances, marker_size),
-            *(up or ()), *placement_settings(leave_out, front, origin), *target_settings(targets, levels),
+            *(up or ()), *photo_settings(leave_out, white, front, origin), *target_settings(targets, levels),
         ]  # fmt: skip
         options = Options(
             photos=photos, out=out, profile=profile, overrides=settings,
@@ -194,6 +196,7 @@ def settings_command(
     region: RegionOption = None,
     known_distances: KnownDistanceOption = None,
     marker_size: MarkerSizeOption = None,
+    white: WhiteOption = None,
     seed: SeedOption = None,
     quiet: QuietOption = False,
     as_json: JsonOption = False,
@@ -201,7 +204,7 @@ def settings_command(
     """Store settings in the output folder for its next run; nothing is run."""
     from gsbake.cli.settings import settings
 
-    where = [*(region or ()), *(up or ()), *placement_settings(leave_out, front, origin)]
+    where = [*(region or ()), *(up or ()), *photo_settings(leave_out, white, front, origin)]
     given = [*(overrides or []), *mask_settings(masks, invert_masks), *where, *scale_settings(known_distances, marker_size)]
     given += target_settings(targets, levels)
     settings(

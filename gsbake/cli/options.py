@@ -121,6 +121,16 @@ def given_region(text: str) -> tuple[str, ...]:
     return ("poses.region=auto", f"poses.region_box={json.dumps(Region.read(given_path(text)).numbers)}")
 
 
+def given_white(text: str) -> str:
+    """A patch of known reflectance that can be parsed."""
+    from gsbake.config.white import parse_white
+
+    try:
+        return parse_white(text).text
+    except ValueError as error:
+        raise typer.BadParameter(f"{error}.") from error
+
+
 def given_up(text: str) -> tuple[str, ...]:
     """Settings of the up axis that an argument names: by what is level, or by two or three points "X,Y,Z"."""
     if text in ("cameras", "markers", "ground"):
@@ -134,11 +144,11 @@ def given_up(text: str) -> tuple[str, ...]:
     return (f"export.up_points={json.dumps([number for point in points for number in point])}",)
 
 
-def placement_settings(leave_out: list[str] | None, front: str | None, origin: Origin | None) -> tuple[str, ...]:
-    """Settings of `--leave-out`, `--front` and `--origin`."""
-    left = (f"ingest.leave_out={json.dumps(leave_out, ensure_ascii=False)}",) if leave_out else ()
+def photo_settings(leave_out: list[str] | None, white: list[str] | None, front: str | None, origin: Origin | None) -> tuple[str, ...]:
+    """Settings of `--leave-out`, `--white`, `--front` and `--origin`."""
+    lists = {"ingest.leave_out": leave_out, "bake.white": white}
     return (
-        *left,
+        *(f"{name}={json.dumps(texts, ensure_ascii=False)}" for name, texts in lists.items() if texts),
         *(() if front is None else (f"export.front={front}",)),
         *(() if origin is None else (f"export.origin={origin.value}",)),
     )
@@ -238,6 +248,13 @@ LeaveOutOption = Annotated[
     typer.Option(
         "--leave-out", metavar="PHOTO", show_default=False, rich_help_panel=PHOTO_OPTIONS,
         help="Photo that is not used, by the name of its file. Repeatable.",
+    ),
+]  # fmt: skip
+WhiteOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--white", parser=given_white, metavar="PHOTO:X,Y[:R]", show_default=False, rich_help_panel=PHOTO_OPTIONS,
+        help="Patch of the object with the known reflectance R, of white paper without (0.9): it gives the light's intensity. Repeatable.",
     ),
 ]  # fmt: skip
 UpOption = Annotated[

@@ -14,6 +14,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
 from gsbake.config.lengths import parse_known_distance
 from gsbake.config.targets import parse_target
+from gsbake.config.white import parse_white
 from gsbake.monitor import Rule
 
 Fraction = Annotated[float, Field(ge=0, le=1)]
@@ -37,6 +38,10 @@ HeldOut = Annotated[int, Field(ge=0, le=1000), AfterValidator(_not_every_photo)]
 def _known_distance(text: str) -> str:
     parse_known_distance(text)
     return text
+
+
+def _white(text: str) -> str:
+    return parse_white(text).text
 
 
 def _target(text: str) -> str:
@@ -79,6 +84,8 @@ UpPoints = Annotated[tuple[float, ...], AfterValidator(_up_points)]
 TargetText = Annotated[str, AfterValidator(_target)]
 #: A known distance that can be parsed.
 KnownDistanceText = Annotated[str, AfterValidator(_known_distance)]
+#: A patch of known reflectance that can be parsed.
+WhiteText = Annotated[str, AfterValidator(_white)]
 Pruning = Literal["visibility", "sdf", "gsdf", "gaussianroom", "gs-ror2"]
 
 
@@ -290,6 +297,7 @@ class Bake(Section):
     neutral_light: Weight = Field(0.0005, description="Regularisation of the environment map towards grey.")
     sparsity: Weight = Field(0.03, description="Reflectance sparsity prior: an object has few materials. Scaled by the mean residual.")
     light_motion: Literal["auto", "static", "turntable", "camera"] = Field("auto", description="How the light moves, as the object sees it. static: it stands; turntable: the object was turned under it; camera: it is on the camera (flash); auto: what explains validation photos best.")
+    white: tuple[WhiteText, ...] = Field((), max_length=100, description="Patches of the object whose reflectance is known, in grey or white: they give intensity and colour of the light, and base colour inversely. Photo, pixel and reflectance, as in \"A.jpg:120,80:0.18\"; without a reflectance white paper (0.9). --white adds one.")
     default_roughness: Fraction = Field(0.8, description="Roughness where none is fitted (bake.materials = none or delight).")
 
     @property

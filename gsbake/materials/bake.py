@@ -13,6 +13,7 @@ from safetensors.numpy import save_file
 
 from gsbake.capture.full_photos import FullPhotos
 from gsbake.config.schema import Bake
+from gsbake.config.white import parse_white
 from gsbake.errors import BadInputError
 from gsbake.geometry.ply import read_textured_mesh
 from gsbake.geometry.raycast import RayCaster
@@ -20,6 +21,7 @@ from gsbake.imaging.exr import write_exr
 from gsbake.kernels.threads import configure
 from gsbake.materials.fitting import RAY_OFFSET, SMOOTHING_RADIUS, FitSettings, fit_materials
 from gsbake.materials.remaining_shading import find_irradiance, remove_shading
+from gsbake.materials.white import WhiteTexels, divide_light, find_white, white_factor, with_factor
 from gsbake.meshing.repair import repair_foreign
 from gsbake.monitor import SILENT, Monitor, Rule, decide_skip
 from gsbake.text import number
@@ -97,7 +99,7 @@ def bake_textures(
     when the mesh is damaged, has too many triangles, does not fit the atlas, or is visible in no photo.
     """
     with FullPhotos(ingest, poses, surfels) as photos:
-        return _Baking(photos, surfels, mesh, out, options or BakeOptions(), seed, threads, monitor).run()
+        return _Baking(ingest, photos, surfels, mesh, out, options or BakeOptions(), seed, threads, monitor).run()
 
 
 @dataclass(frozen=True)
@@ -114,6 +116,7 @@ class Textures:
 class _Baking:
     """One run."""
 
+    ingest: Path
     photos: FullPhotos
     surfels: Path
     mesh: Path
@@ -143,7 +146,8 @@ class _Baking:
         monitor.check_stop()
         with monitor.part("occlusion"):
             occlusion = self._occlusion(surface, dense, detail)
-        textures = self._materials(surface, detail, occlusion)
+        white = self._find_white(surface)
+        textures = self._with_white(self._materials(surface, detail, occlusion), white)
         if not textures.projected.observed.any():
             raise BadInputError("bake: the mesh is visible in no photo; poses and mesh do not match. Run again from the poses stage.")
         coded = self._normal_map(surface, textures)
@@ -251,6 +255,26 @@ class _Baking:
             textures = replace(projected, values=values, views=np.where(fitted.observed, projected.views, 0))
             return Textures(textures, replace(detail, normal=fitted.normal), fitted.figures)
         return Textures(projected, detail, {})
+
+    def _find_white(self, surface: UnwrappedMesh) -> list[WhiteTexels]:
+        """The patches of known reflectance, before any material is fitted."""
+        bake = self.options.bake
+        if bake.white and bake.materials == "none":
+            self.monitor.warn("bake: bake.white is not used: bake.materials is none, and colours contain the light; use --profile relight.")
+            return []
+        posed = self.photos.posed
+        return find_white([parse_white(text) for text in bake.white], self.ingest, posed.folder, posed.cameras.to_world, surface)
+
+    def _with_white(self, textures: Textures, white: list[WhiteTexels]) -> Textures:
+        """The textures with the brightness and colour that patches of known reflectance give, and the light with what follows for it."""
+        if not white:
+            return textures
+        projected = textures.projected
+        factor = white_factor(projected.values[:, :3], projected.observed, white, self.monitor)
+        divide_light(self.out / "light.safetensors", factor)
+        values = projected.values.copy()
+        values[:, :3] = with_factor(values[:, :3], factor, self.monitor)
+        return replace(textures, projected=replace(projected, values=values), figures=textures.figures | {"white_factor": factor.tolist()})
 
     def _delight(self, surface: UnwrappedMesh, projected: ProjectedTexture, detail: DenseSamples, occlusion: Floats) -> ProjectedTexture:
         """Base colour (n, 3): projected colours divided by their shading."""

@@ -57,8 +57,7 @@ def measure_scale(
     if options.marker_size:
         found += _measure_markers(cameras, ingest, options, monitor)
     if options.known_distances:
-        entries = json.loads((ingest / "photos.json").read_text(encoding="utf-8"))["photos"]
-        picked = PickedPhotos({camera.name: camera for camera in cameras}, entries)
+        picked = PickedPhotos.open(ingest, poses, "a known distance")
         for text in options.known_distances:
             found.append(_measure_distance(parse_known_distance(text), picked, surface, to_world or Similarity()))
     if not found:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,7 +13,7 @@ import numpy as np
 from gsbake.capture.photos.undistortion import image_plane
 from gsbake.config.lengths import PixelPosition
 from gsbake.errors import BadInputError
-from gsbake.geometry.cameras import Array, Camera
+from gsbake.geometry.cameras import Array, Camera, CameraSet
 from gsbake.text import shortlist
 
 #: Assumed standard deviation of a pixel position that a person picked, in pixels of the working photo.
@@ -54,22 +56,37 @@ def camera_rays(camera: Camera, pixels: Array) -> list[Ray]:
 
 @dataclass(frozen=True)
 class PickedPhotos:
-    """Cameras of the working photos by name, with distortion, and the `entries` of photos.json, which know the user's files."""
+    """Cameras of the working photos by name, with distortion, and the `entries` of photos.json, which know the user's files; `what` is
+    picked in them."""
 
     cameras: Mapping[str, Camera]
     entries: Sequence[Mapping[str, Any]]
+    what: str = "a known distance"
+
+    @classmethod
+    def open(cls, ingest: Path, poses: Path, what: str) -> PickedPhotos:
+        """Those of the artifact folders `ingest` and `poses`, in the world frame."""
+        cameras = CameraSet.load(poses / "photo_cameras.json").cameras
+        entries = json.loads((ingest / "photos.json").read_text(encoding="utf-8"))["photos"]
+        return cls({camera.name: camera for camera in cameras}, entries, what)
 
     def ray(self, position: PixelPosition) -> Ray:
-        """The ray of a pixel position in the user's file. Raises BadInputError for a photo without a camera or a pixel outside of it."""
-        entry = find_entry(self.entries, position.photo, "A known distance")
+        """The ray of a pixel position in the user's file."""
+        return self.rays(position, np.zeros((1, 2)))[0]
+
+    def rays(self, position: PixelPosition, offsets: Array) -> list[Ray]:
+        """The rays of a pixel position in the user's file with `offsets` (n, 2), in shares of the photo's longer side. Raises BadInputError
+        for a photo without a camera or a pixel outside of it."""
+        entry = find_entry(self.entries, position.photo, self.what.capitalize())
         width, height = entry["source_width"], entry["source_height"]
         if not (0 <= position.x <= width and 0 <= position.y <= height):
             pixel, pixels = f"{position.x:g},{position.y:g}", f"{width} × {height} pixels"
-            raise BadInputError(f"The pixel {pixel} of a known distance lies outside the photo {position.photo} ({pixels}).")
+            raise BadInputError(f"The pixel {pixel} of {self.what} lies outside the photo {position.photo} ({pixels}).")
         camera = self.cameras.get(entry["name"])
         if camera is None:
-            raise BadInputError(f"The photo {position.photo} of a known distance was not registered and has no camera; use another photo.")
-        return camera_rays(camera, np.array([[position.x * camera.width / width, position.y * camera.height / height]]))[0]
+            raise BadInputError(f"The photo {position.photo} of {self.what} was not registered and has no camera; use another photo.")
+        at = np.array([position.x * camera.width / width, position.y * camera.height / height])
+        return camera_rays(camera, at + max(camera.width, camera.height) * offsets)
 
 
 def find_entry(entries: Sequence[Mapping[str, Any]], photo: str, what: str) -> Mapping[str, Any]:
