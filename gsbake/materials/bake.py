@@ -151,7 +151,9 @@ class _Baking:
         white = self._find_white(surface)
         textures = self._with_white(surface, self._materials(surface, detail, occlusion), white)
         if not textures.projected.observed.any():
-            raise BadInputError("bake: the mesh is visible in no photo; poses and mesh do not match. Run again from the poses stage.")
+            raise BadInputError(
+                "bake: the mesh is visible in no photo; turn its faces outwards if it is your own, else run from the poses stage on."
+            )
         coded = self._normal_map(surface, textures)
         with monitor.part("inpainting"):
             image, emissive = self._image(surface, textures.projected, occlusion, coded, faces, len(vertices))
