@@ -20,7 +20,7 @@ from gsbake.config.load import DEFAULT, LoadedProfile, fields, load_profile
 from gsbake.config.renamed import present_override
 from gsbake.config.schema import Profile
 from gsbake.config.targets import parse_target, require_packages
-from gsbake.config.white import parse_white
+from gsbake.config.white import WhitePatch, parse_white
 from gsbake.errors import BadInputError, GsbakeError, UsageError
 from gsbake.meshing.decimator_choice import resolve_decimator
 from gsbake.output_folder import check_output_folder, check_same_photos
@@ -127,7 +127,8 @@ class Session:
     def _require_named_photos(self) -> None:
         """Refuse names of photos that are none, which else a late stage would find."""
         profile = self.profile.profile
-        named = [("bake.white", parse_white(text).position.photo) for text in profile.bake.white]
+        patches = map(parse_white, profile.bake.white)
+        named = [("bake.white", patch.position.photo) for patch in patches if isinstance(patch, WhitePatch)]
         named += [("export.front", profile.export.front)] if profile.export.front else []
         if self.project.photos is not None:
             for setting, photo in named:

@@ -27,7 +27,7 @@ KERNELS = (
 
 STAGE = Stage(
     name="poses",
-    version=17,
+    version=18,
     title="Camera poses",
     run=run,
     summary="{registered} photos registered, {points} tie points, {reprojection_px:px} reprojection error",

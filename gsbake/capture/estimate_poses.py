@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from gsbake.capture.hull.visual_hull import visual_hull
 from gsbake.capture.masks.completion import complete_masks
 from gsbake.capture.masks.consensus import MIN_CERTAIN_OVERLAP, MIN_OVERLAP, MIN_USED_AGREEMENT, correct_mask, distorted, find_consensus
+from gsbake.capture.masks.grab_cut import border_by_colour
 from gsbake.capture.masks.hull_correction import apply_correction, correct_by_hull
 from gsbake.capture.masks.support_plane import plane_masks
 from gsbake.capture.photos.conversion import file_digest
@@ -217,14 +218,20 @@ class _Estimation:
             self.monitor.decide("automatic masks", "not used", evidence)
             return {"automatic_masks": 0, "mask_agreement": agreement}
         (self.out / "photo_masks").mkdir()
-        overlaps = {}
-        for camera, silhouette, overlap in zip(cameras, found.silhouettes, found.overlap.tolist(), strict=True):
-            if camera.name not in guessed:
-                continue
-            overlaps[camera.name] = overlap
+
+        def write(camera: Camera, silhouette: NDArray[np.bool_], overlap: float) -> None:
             full = cv2.resize(read_grey(files[camera.name]), (camera.width, camera.height), interpolation=cv2.INTER_CUBIC)
             mask = correct_mask(np.asarray(full, np.uint8), distorted(silhouette, camera), overlap)
-            write_png(self.out / "photo_masks" / f"{camera.name}.png", np.where(mask > 127, 255, 0).astype(np.uint8))
+            mask = np.where(mask > 127, 255, 0).astype(np.uint8)
+            if agreement < MIN_USED_AGREEMENT:  # most guesses err at the same places, so that their border is no border
+                mask = border_by_colour(_read_rgb(photos[camera.name]), mask)
+            write_png(self.out / "photo_masks" / f"{camera.name}.png", mask)
+
+        votes = zip(cameras, found.silhouettes, found.overlap.tolist(), strict=True)
+        chosen = [vote for vote in votes if vote[0].name in guessed]
+        with ThreadPoolExecutor(max(1, min(self.threads, 8))) as pool:
+            list(pool.map(lambda vote: write(*vote), chosen))
+        overlaps = {camera.name: overlap for camera, _, overlap in chosen}
         made = {name: self.out / "photo_masks" / f"{name}.png" for name in overlaps}
         self._correct_by_hull(cameras, photos, {**files, **made}, sorted(overlaps))
         doubtful = sorted((name for name in overlaps if overlaps[name] < MIN_CERTAIN_OVERLAP), key=lambda name: overlaps[name])

@@ -253,8 +253,9 @@ LeaveOutOption = Annotated[
 WhiteOption = Annotated[
     list[str] | None,
     typer.Option(
-        "--white", parser=given_white, metavar="PHOTO:X,Y[:R]", show_default=False, rich_help_panel=PHOTO_OPTIONS,
-        help="Patch of the object with the known reflectance R, of white paper without (0.9): it gives the light's intensity. Repeatable.",
+        "--white", parser=given_white, metavar="PHOTO:X,Y[:R]|markers|card", show_default=False, rich_help_panel=PHOTO_OPTIONS,
+        help="Patch of the object with the known reflectance R, of white paper without (0.9), which gives the light's intensity; "
+        "or printed markers or a colour card beside the object. Repeatable.",
     ),
 ]  # fmt: skip
 UpOption = Annotated[

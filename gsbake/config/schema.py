@@ -297,7 +297,7 @@ class Bake(Section):
     neutral_light: Weight = Field(0.0005, description="Regularisation of the environment map towards grey.")
     sparsity: Weight = Field(0.03, description="Reflectance sparsity prior: an object has few materials. Scaled by the mean residual.")
     light_motion: Literal["auto", "static", "turntable", "camera"] = Field("auto", description="How the light moves, as the object sees it. static: it stands; turntable: the object was turned under it; camera: it is on the camera (flash); auto: what explains validation photos best.")
-    white: tuple[WhiteText, ...] = Field((), max_length=100, description="Patches of the object whose reflectance is known, in grey or white: they give intensity and colour of the light, and base colour inversely. Photo, pixel and reflectance, as in \"A.jpg:120,80:0.18\"; without a reflectance white paper (0.9). --white adds one.")
+    white: tuple[WhiteText, ...] = Field((), max_length=100, description="Patches of the object whose reflectance is known, in grey or white: they give intensity and colour of the light, and base colour inversely. Photo, pixel and reflectance, as in \"A.jpg:120,80:0.18\"; without a reflectance white paper (0.9). markers: the paper of printed markers beside the object; card: a colour card of 24 patches there. --white adds one.")
     default_roughness: Fraction = Field(0.8, description="Roughness where none is fitted (bake.materials = none or delight).")
 
     @property

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from gsbake.errors import BadInputError
 from gsbake.geometry.cameras import Similarity
@@ -20,6 +21,7 @@ from gsbake.geometry.ply import read_mesh
 from gsbake.geometry.surface_distance import surface_distances
 from gsbake.gltf.frame import Y_UP
 from gsbake.gltf.scene import open_scene
+from gsbake.texturing.atlas import islands
 from gsbake.texturing.given_uvs import GivenUVs, given_uvs
 
 #: Suffixes of the formats.
@@ -79,8 +81,13 @@ def read_lowpoly(path: Path, dense: Path, asset: Similarity | None) -> LowPoly:
         raise BadInputError(f"'{path}' has vertices far from the object: it is {reach:.3g} times as large; remove them.")
     triangles = f"{len(found.faces)} triangles in {frame}"
     kept = "their UVs are kept" if given is not None else "they have no UVs and are unwrapped"
-    notes = triangles, kept, *found.notes, *found.faults
-    return LowPoly(placed, found.faces, None if given is None else found.uv, notes)
+    faces, uv, inside_out = found.faces.copy(), found.uv.copy(), _inside_out(placed, found.faces, surface)
+    faces[inside_out] = faces[inside_out, ::-1]
+    if given is not None:
+        uv[inside_out] = uv[inside_out, ::-1]
+    turned = (f"{int(inside_out.sum())} of them were inside out and are turned",) if inside_out.any() else ()
+    notes = triangles, kept, *turned, *found.notes, *found.faults
+    return LowPoly(placed, faces, None if given is None else uv, notes)
 
 
 def _read(path: Path) -> ForeignMesh:
@@ -111,6 +118,22 @@ def _frame(
         )
     name = next(name for name, far in away.items() if far <= max(TIE_FACTOR * nearest, TIE_DISTANCE * diagonal))
     return name, frames[name]
+
+
+def _inside_out(
+    vertices: NDArray[np.float64], faces: NDArray[np.int64], dense: tuple[NDArray[np.float64], NDArray[np.int64]]
+) -> NDArray[np.bool_]:
+    """Which of the `faces` (f, 3) belong to pieces most of whose area looks against the dense surface nearest to it."""
+    (middle, normal), (near, outwards) = (_middles(*mesh) for mesh in ((vertices, faces), dense))
+    along = np.einsum("nk,nk->n", normal, outwards[cKDTree(near).query(middle)[1]])
+    piece = islands(len(vertices), faces)
+    return np.asarray(np.bincount(piece, along)[piece] < 0)
+
+
+def _middles(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """The middles (f, 3) of triangles, and their normals, as long as their areas."""
+    corner = np.asarray(vertices, np.float64)[faces]
+    return corner.mean(1), np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]) / 2
 
 
 def _frames(path: Path, asset: Similarity | None) -> Mapping[str, Similarity]:

@@ -13,17 +13,19 @@ from safetensors.numpy import save_file
 
 from gsbake.capture.full_photos import FullPhotos
 from gsbake.config.schema import Bake
-from gsbake.config.white import parse_white
 from gsbake.errors import BadInputError
 from gsbake.geometry.ply import read_textured_mesh
 from gsbake.geometry.raycast import RayCaster
 from gsbake.imaging.exr import write_exr
 from gsbake.kernels.threads import configure
 from gsbake.materials.fitting import RAY_OFFSET, SMOOTHING_RADIUS, FitSettings, fit_materials
+from gsbake.materials.printed_light import printed_factors
 from gsbake.materials.remaining_shading import find_irradiance, remove_shading
-from gsbake.materials.white import WhiteTexels, divide_light, find_white, white_factor, with_factor
+from gsbake.materials.white import Evidence, KnownWhite, common_factor, divide_light, find_white, on_object, with_factor
 from gsbake.meshing.repair import repair_foreign
 from gsbake.monitor import SILENT, Monitor, Rule, decide_skip
+from gsbake.shading.environment import EnvironmentLight
+from gsbake.shading.light_motion import LightMotion
 from gsbake.text import number
 from gsbake.texturing.atlas import make_atlas
 from gsbake.texturing.fine_base_color import fine_base_color
@@ -147,9 +149,11 @@ class _Baking:
         with monitor.part("occlusion"):
             occlusion = self._occlusion(surface, dense, detail)
         white = self._find_white(surface)
-        textures = self._with_white(self._materials(surface, detail, occlusion), white)
+        textures = self._with_white(surface, self._materials(surface, detail, occlusion), white)
         if not textures.projected.observed.any():
-            raise BadInputError("bake: the mesh is visible in no photo; poses and mesh do not match. Run again from the poses stage.")
+            raise BadInputError(
+                "bake: the mesh is visible in no photo; turn its faces outwards if it is your own, else run from the poses stage on."
+            )
         coded = self._normal_map(surface, textures)
         with monitor.part("inpainting"):
             image, emissive = self._image(surface, textures.projected, occlusion, coded, faces, len(vertices))
@@ -256,22 +260,27 @@ class _Baking:
             return Textures(textures, replace(detail, normal=fitted.normal), fitted.figures)
         return Textures(projected, detail, {})
 
-    def _find_white(self, surface: UnwrappedMesh) -> list[WhiteTexels]:
-        """The patches of known reflectance, before any material is fitted."""
+    def _find_white(self, surface: UnwrappedMesh) -> KnownWhite:
+        """What has a known reflectance, before any material is fitted."""
         bake = self.options.bake
         if bake.white and bake.materials == "none":
             self.monitor.warn("bake: bake.white is not used: bake.materials is none, and colours contain the light; use --profile relight.")
-            return []
-        posed = self.photos.posed
-        return find_white([parse_white(text) for text in bake.white], self.ingest, posed.folder, posed.cameras.to_world, surface)
+            return KnownWhite([], [])
+        return find_white(bake.white, self.ingest, self.photos.posed, surface)
 
-    def _with_white(self, textures: Textures, white: list[WhiteTexels]) -> Textures:
-        """The textures with the brightness and colour that patches of known reflectance give, and the light with what follows for it."""
+    def _with_white(self, surface: UnwrappedMesh, textures: Textures, white: KnownWhite) -> Textures:
+        """The textures with the brightness and colour that known reflectances give, and the light with what follows for it."""
         if not white:
             return textures
-        projected = textures.projected
-        factor = white_factor(projected.values[:, :3], projected.observed, white, self.monitor)
-        divide_light(self.out / "light.safetensors", factor)
+        projected, light = textures.projected, self.out / "light.safetensors"
+        found = on_object(projected.values[:, :3], projected.observed, white.on_object)
+        if white.printed:
+            lit = LightMotion.load(self.out / "light_motion.json").rotations
+            radiance = EnvironmentLight.load(light).radiance().detach().numpy()
+            factors = printed_factors(white.printed, self.photos.posed, projected.gains, surface.caster, radiance, lit)
+            found += [Evidence(patch.name, factor) for patch, factor in zip(white.printed, factors, strict=True)]
+        factor = common_factor(found, self.monitor)
+        divide_light(light, factor)
         values = projected.values.copy()
         values[:, :3] = with_factor(values[:, :3], factor, self.monitor)
         return replace(textures, projected=replace(projected, values=values), figures=textures.figures | {"white_factor": factor.tolist()})

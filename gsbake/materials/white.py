@@ -14,10 +14,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from gsbake.config.white import WhitePatch
+from gsbake.capture.posed_photos import PosedPhotos
+from gsbake.config.white import PrintedWhite, WhitePatch, parse_white
 from gsbake.errors import BadInputError
-from gsbake.geometry.cameras import Similarity
 from gsbake.monitor import Monitor
+from gsbake.scale.printed_white import PrintedPatches, find_printed
 from gsbake.scale.triangulation import PickedPhotos
 from gsbake.shading.environment import EnvironmentLight
 from gsbake.texturing.unwrapped_mesh import UnwrappedMesh
@@ -41,12 +42,42 @@ class WhiteTexels:
     texel: NDArray[np.int64]
 
 
-def find_white(patches: Sequence[WhitePatch], ingest: Path, poses: Path, to_world: Similarity, surface: UnwrappedMesh) -> list[WhiteTexels]:
-    """The texels of `patches`, seen in the photos of the artifact folders `ingest` and `poses`; `to_world` maps the frame of the `surface`
-    to that of the cameras. Raises BadInputError for a patch that is in no photo, or not on the surface."""
-    if not patches:
-        return []
-    photos = PickedPhotos.open(ingest, poses, "a white patch")
+@dataclass(frozen=True)
+class KnownWhite:
+    """What has a known reflectance: patches on the object and, beside it, printed markers and cards."""
+
+    on_object: list[WhiteTexels]
+    printed: list[PrintedPatches]
+
+    def __bool__(self) -> bool:
+        return bool(self.on_object or self.printed)
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """The factor (3,) on base colour that one patch asks for, None where it cannot be used; what it is called, and what it showed."""
+
+    name: str
+    factor: Doubles | None
+    shown: str = ""
+
+
+def find_white(texts: Sequence[str], ingest: Path, posed: PosedPhotos, surface: UnwrappedMesh) -> KnownWhite:
+    """What `texts` name (`bake.white`), in the photos of the artifact folder `ingest` and in `posed`, which has the frame of the `surface`.
+    Raises BadInputError for a patch that is in no photo or not on the surface, and for markers or a card that no photo shows."""
+    wanted = [parse_white(text) for text in texts]
+    patches = [patch for patch in wanted if isinstance(patch, WhitePatch)]
+    printed = [white for white in wanted if isinstance(white, PrintedWhite)]
+    cameras, photos = posed.cameras.cameras, posed.folder / "photos"
+    return KnownWhite(
+        _texels(patches, ingest, posed, surface) if patches else [],
+        [patch for white in printed for patch in find_printed(white, cameras, photos)],
+    )
+
+
+def _texels(patches: Sequence[WhitePatch], ingest: Path, posed: PosedPhotos, surface: UnwrappedMesh) -> list[WhiteTexels]:
+    """The texels of each patch."""
+    photos, to_world = PickedPhotos.open(ingest, posed.folder, "a white patch"), posed.cameras.to_world
     side = PATCH_SIZE * np.linspace(-0.5, 0.5, PATCH_RAYS)
     offsets = np.concatenate([np.zeros((1, 2)), np.stack(np.meshgrid(side, side), -1).reshape(-1, 2)])
     found = []
@@ -62,27 +93,36 @@ def find_white(patches: Sequence[WhitePatch], ingest: Path, poses: Path, to_worl
     return found
 
 
-def white_factor(base_color: Floats, observed: NDArray[np.bool_], patches: Sequence[WhiteTexels], monitor: Monitor) -> Doubles:
-    """The factor (3,) on the linear `base_color` (n, 3) that the `patches` ask for, the geometric mean over them; only `observed` texels
-    (n,) count. One where no patch can be used, which is warned of, as is a contradiction between them."""
-    factors, evidence = [], []
+def on_object(base_color: Floats, observed: NDArray[np.bool_], patches: Sequence[WhiteTexels]) -> list[Evidence]:
+    """What the `patches` ask for, by the fitted linear `base_color` (n, 3) of their `observed` texels (n,)."""
+    found = []
     for white in patches:
-        texel = white.texel[observed[white.texel]]
+        texel, known = white.texel[observed[white.texel]], white.patch.reflectance
         colour = np.median(base_color[texel], axis=0).astype(np.float64) if len(texel) else np.zeros(3)
-        if colour.min() < MIN_BASE_COLOR:
-            monitor.warn(f"bake: the white patch '{white.patch.text}' is black or unseen in the base colour, and is not used.")
-            continue
-        factors.append(white.patch.reflectance / colour)
-        shown = " ".join(f"{value:.3f}" for value in colour)
-        evidence.append(f"{white.patch.text}: {shown} where {white.patch.reflectance:g} is known")
+        factor = known / colour if colour.min() >= MIN_BASE_COLOR else None
+        found.append(Evidence(f"patch '{white.patch.text}'", factor, f"{_three(colour)} where {known:g} is known"))
+    return found
+
+
+def common_factor(found: Sequence[Evidence], monitor: Monitor) -> Doubles:
+    """The factor (3,) on base colour, the geometric mean of all; one where nothing can be used. Warns of that and of contradictions."""
+    for one in found:
+        if one.factor is None:
+            monitor.warn(f"bake: the white {one.name} is black, clipped or hardly seen, and is not used.")
+    used = [one for one in found if one.factor is not None]
+    factors = [one.factor for one in used if one.factor is not None]
     if not factors:
         return np.ones(3)
     factor = np.exp(np.log(factors).mean(0))
     ratio = float((np.max(factors, axis=0) / np.min(factors, axis=0)).max())
     if ratio > MAX_RATIO:
-        monitor.warn(f"bake: the white patches contradict each other by a factor of {ratio:.2f}; check their places and reflectances.")
-    monitor.decide("white", "base colour × " + " ".join(f"{value:.2f}" for value in factor), "; ".join(evidence))
+        monitor.warn(f"bake: known whites contradict each other by a factor of {ratio:.2f}; check their places and reflectances.")
+    monitor.decide("white", f"base colour × {_three(factor)}", "; ".join(f"{one.name}: {one.shown or _three(factor)}" for one in used))
     return np.asarray(factor, np.float64)
+
+
+def _three(values: Doubles) -> str:
+    return " ".join(f"{value:.2f}" for value in values)
 
 
 def with_factor(base_color: Floats, factor: Doubles, monitor: Monitor) -> Floats:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from gsbake.geometry.cameras import Array, Camera
 from gsbake.imaging.srgb import decode
-from gsbake.scale.triangulation import Ray, camera_rays, triangulate
+from gsbake.scale.triangulation import Ray, camera_rays, triangulate_together
 
 #: OpenCV's dictionaries by name; each holds the smaller ones of its kind.
 DICTIONARIES = {
@@ -111,15 +111,8 @@ def _read(path: Path) -> NDArray[np.uint8]:
 
 def _marker(number: int, views: list[list[Ray]]) -> Marker | None:
     """The marker that all `views` but outliers agree on; None where there is none."""
-    kept = views
-    while len(kept) >= MIN_PHOTOS:
-        points = [triangulate([view[k] for view in kept], CORNER_NOISE) for k in range(4)]
-        if any(point is None for point in points):
-            return None
-        worst = np.max([point.residuals for point in points if point is not None], axis=0)
-        if worst.max() <= MAX_RESIDUAL:
-            corners = np.stack([point.position for point in points if point is not None])
-            return Marker(number, corners, np.linalg.norm(corners - np.roll(corners, 1, 0), axis=1), len(kept))
-        limit = max(MAX_RESIDUAL, 0.5 * float(worst.max()))
-        kept = [view for view, residual in zip(kept, worst.tolist(), strict=True) if residual <= limit]
-    return None
+    found = triangulate_together(views, CORNER_NOISE, MAX_RESIDUAL, MIN_PHOTOS)
+    if found is None:
+        return None
+    corners, photos = found
+    return Marker(number, corners, np.linalg.norm(corners - np.roll(corners, 1, 0), axis=1), photos)

@@ -100,6 +100,23 @@ def find_entry(entries: Sequence[Mapping[str, Any]], photo: str, what: str) -> M
     raise BadInputError(f"{what} names the photo '{photo}', which is none of the photos ({names}).")
 
 
+def triangulate_together(views: Sequence[Sequence[Ray]], noise: float, most: float, least: int) -> tuple[Array, int] | None:
+    """The points (k, 3) that the k rays of each view meet, and the number of views that agree: those are left out whose residuals exceed
+    `most` pixels. None where fewer than `least` agree, or a point is not determined. `noise` as in `triangulate`."""
+    kept = list(views)
+    while len(kept) >= least:
+        points = [triangulate([view[k] for view in kept], noise) for k in range(len(kept[0]))]
+        found = [point for point in points if point is not None]
+        if len(found) < len(points):
+            return None
+        worst = np.max([point.residuals for point in found], axis=0)
+        if worst.max() <= most:
+            return np.stack([point.position for point in found]), len(kept)
+        limit = max(most, 0.5 * float(worst.max()))
+        kept = [view for view, residual in zip(kept, worst.tolist(), strict=True) if residual <= limit]
+    return None
+
+
 def triangulate(rays: Sequence[Ray], noise: float = PICK_NOISE) -> Point | None:
     """The point nearest to `rays` in angle, weighted by their pixels; None where their directions differ by less than MIN_ANGLE.
 

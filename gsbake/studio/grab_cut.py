@@ -6,13 +6,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from gsbake.capture.masks.grab_cut import cut_by_colour
 from gsbake.errors import UsageError
 
 Bytes = NDArray[np.uint8]
 
-#: Longer side in pixels at which GrabCut works, its iterations, and how far beyond a stroke it looks: a share of the stroke's longer side,
-#: and one of the picture's.
-CUT_SIZE, CUT_STEPS, CUT_MARGIN, CUT_ROOM = 640, 4, 1.0, 0.12
+#: Longer side in pixels at which GrabCut works, and how far beyond a stroke it looks: a share of the stroke's longer side, and one of the
+#: picture's.
+CUT_SIZE, CUT_MARGIN, CUT_ROOM = 640, 1.0, 0.12
 
 
 def grab_cut(photo: Bytes, mask: Bytes, inside: NDArray[np.bool_], outside: NDArray[np.bool_]) -> Bytes:
@@ -33,9 +34,7 @@ def grab_cut(photo: Bytes, mask: Bytes, inside: NDArray[np.bool_], outside: NDAr
     if not np.isin(labels, (cv2.GC_BGD, cv2.GC_PR_BGD)).any() or not np.isin(labels, (cv2.GC_FGD, cv2.GC_PR_FGD)).any():
         raise UsageError("The stroke covers everything around it; draw a thinner one.")
     small = cv2.resize(photo[window], size, interpolation=cv2.INTER_AREA)
-    cv2.setRNGSeed(0)
-    cv2.grabCut(small, labels, (0, 0, 0, 0), np.zeros((1, 65)), np.zeros((1, 65)), CUT_STEPS, cv2.GC_INIT_WITH_MASK)
-    found = np.asarray(np.where((labels == cv2.GC_FGD) | (labels == cv2.GC_PR_FGD), 255, 0), np.uint8)
+    found = np.asarray(np.where(cut_by_colour(small, labels), 255, 0), np.uint8)
     out = mask.copy()
     out[window] = np.where(cv2.resize(found, (width, height), interpolation=cv2.INTER_LINEAR) > 127, 255, 0)
     out[inside], out[outside] = 255, 0

@@ -13,7 +13,7 @@ from gsbake.errors import BadInputError
 from gsbake.geometry.cameras import Similarity
 from gsbake.geometry.ply import has_texture_coordinates, read_textured_mesh, write_mesh
 from gsbake.gltf.frame import Y_UP
-from gsbake.gltf.lowpoly import read_lowpoly
+from gsbake.gltf.lowpoly import LowPoly, read_lowpoly
 
 ASSET = Similarity(0.2, Y_UP, np.array([0.0, 0.3, 0.0]))
 
@@ -66,6 +66,25 @@ def test_the_frame_is_found(folder: Path, tmp_path: Path, suffix: str, frame: Si
         for values, triangles in ((uv, faces), (mine.visual.uv, mine.faces))
     )
     assert made == given
+
+
+def test_pieces_that_are_inside_out_are_turned(folder: Path, tmp_path: Path) -> None:
+    """One of two, in the frame of the asset: its triangles are those of the mesh that is right, and keep the UVs of their corners."""
+    mine = unwrapped(ASSET)
+    mine.export(tmp_path / "mine.obj")
+    right = read_lowpoly(tmp_path / "mine.obj", folder / "dense.ply", ASSET)
+    second = ASSET.inverse().apply(mine.triangles.mean(1))[:, 2] > -0.25
+    assert 0 < second.sum() < len(second)
+    mine.faces = np.where(second[:, None], mine.faces[:, ::-1], mine.faces)
+    mine.export(tmp_path / "turned.obj")
+    found = read_lowpoly(tmp_path / "turned.obj", folder / "dense.ply", ASSET)
+    assert found.notes == (*right.notes, f"{second.sum()} of them were inside out and are turned")
+
+    def corners(mesh: LowPoly) -> set[tuple[tuple[float, ...], ...]]:
+        rows = np.concatenate([mesh.vertices[mesh.faces], mesh.uv], 2).round(4) + 0.0  # type: ignore[list-item]
+        return {min(tuple(map(tuple, np.roll(triangle, k, 0).tolist())) for k in range(3)) for triangle in rows}
+
+    assert corners(found) == corners(right)
 
 
 def test_nodes_are_placed_and_materials_joined(folder: Path, tmp_path: Path) -> None:

@@ -13,14 +13,14 @@ import trimesh
 
 from gsbake.config.load import load_profile
 from gsbake.config.schema import Bake
-from gsbake.config.white import parse_white
+from gsbake.config.white import PrintedWhite, WhitePatch, parse_white
 from gsbake.errors import BadInputError
 from gsbake.geometry.cameras import CameraSet, Similarity
 from gsbake.geometry.ply import write_mesh
 from gsbake.imaging.exr import read_exr
 from gsbake.imaging.srgb import encode_bytes
 from gsbake.materials.bake import BakeOptions, bake_textures
-from gsbake.materials.white import WhiteTexels, white_factor
+from gsbake.materials.white import WhiteTexels, common_factor, on_object
 from gsbake.shading.environment import EnvironmentLight
 from tests.support.cameras import look_at
 from tests.support.recorder import Recorder
@@ -85,7 +85,7 @@ def test_base_colour_is_right_there_and_the_light_inversely(run: Path, tmp_path:
     assert np.allclose(light(tmp_path / "white") * factor, light(tmp_path / "plain"), rtol=1e-3, atol=1e-5)
     paper = after[(after > 0.3).all(2)]
     assert len(paper) > 100 and np.allclose(np.median(paper, 0), 0.5, atol=0.03)
-    assert f"{middle}:0.5: " in monitor.decisions["white"][1] and "where 0.5 is known" in monitor.decisions["white"][1]
+    assert f"patch '{middle}:0.5': " in monitor.decisions["white"][1] and "where 0.5 is known" in monitor.decisions["white"][1]
 
 
 @pytest.mark.parametrize(
@@ -114,23 +114,27 @@ def test_several_patches() -> None:
 
     def factor(*patches: tuple[str, int]) -> tuple[list[float], list[str]]:
         monitor = Recorder()
-        found = white_factor(colour, seen, [WhiteTexels(parse_white(t), np.array([k])) for t, k in patches], monitor)
-        return found.round(4).tolist(), monitor.warnings
+        named = [(parse_white(text), np.array([k])) for text, k in patches]
+        whites = [WhiteTexels(patch, texel) for patch, texel in named if isinstance(patch, WhitePatch)]
+        return common_factor(on_object(colour, seen, whites), monitor).round(4).tolist(), monitor.warnings
 
     assert factor(("a:1,1", 0)) == ([3, 2, 1], [])
     mean, warnings = factor(("a:1,1", 0), ("a:2,2:0.2", 1))
     assert mean == pytest.approx(np.sqrt([3, 2, 1]), abs=1e-3) and ["contradict each other by a factor of 3.00" in warnings[0]] == [True]
     for k in (2, 3):
         mean, warnings = factor(("a:1,1", k), ("a:2,2:0.2", 1))
-        assert mean == [1, 1, 1] and "'a:1,1' is black or unseen" in warnings[0]
+        assert mean == [1, 1, 1] and "patch 'a:1,1' is black, clipped or hardly seen" in warnings[0]
         assert factor(("a:1,1", k))[0] == [1, 1, 1]
 
 
 def test_how_patches_are_written() -> None:
     paper, grey = parse_white("my photo.jpg:12,30.5"), parse_white("a:b.jpg:1,2:.18")
+    assert isinstance(paper, WhitePatch) and isinstance(grey, WhitePatch)
     assert (paper.position.photo, paper.position.x, paper.position.y, paper.reflectance) == ("my photo.jpg", 12, 30.5, 0.9)
     assert (grey.position.photo, grey.reflectance) == ("a:b.jpg", 0.18)
-    for text in ("a.jpg", "a.jpg:1", ":1,2", "a.jpg:-1,2"):
+    assert parse_white("markers") == PrintedWhite("markers", 0.9, "markers") and parse_white(" card ") == PrintedWhite("card", None, "card")
+    assert parse_white("markers:.8") == PrintedWhite("markers", 0.8, "markers:.8")
+    for text in ("card:1", "a.jpg", "a.jpg:1", ":1,2", "a.jpg:-1,2"):
         with pytest.raises(ValueError, match="no patch of known reflectance"):
             parse_white(text)
     with pytest.raises(ValueError, match="reflectance of 'a.jpg:1,2:9' must be from 0.02 to 1"):
