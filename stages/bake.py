@@ -28,7 +28,7 @@ FIT_KERNELS = (
 
 STAGE = Stage(
     name="bake",
-    version=56,
+    version=57,
     title="Textures",
     run=run,
     summary="{charts} charts, {texels} texels, {fit_psnr:dB} on test photos",

@@ -1,8 +1,8 @@
 """A base colour finer than the other maps: the photos, projected at their full size, refine the colour that the coarser texture has.
 
 The result is the projected colours times the ratio of the coarse colour to their own coarse version, interpolated: light and materials
-are those of the coarse texture, the detail is that of the photos. The fine texture is projected in bands of rows, so that memory does not
-grow with its size.
+are those of the coarse texture, the detail is that of the photos, with the energy that averaging took from it (`detail_gain`). The fine
+texture is projected in bands of rows, so that memory does not grow with its size.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from gsbake.capture.full_photos import FullPhotos
 from gsbake.monitor import Monitor
+from gsbake.texturing.detail_gain import PATCHES, DetailEnergy, amplified
 from gsbake.texturing.inpainting import fill_empty_texels
 from gsbake.texturing.photo_projection import PhotoProjector
 from gsbake.texturing.projection import ProjectionBlender
@@ -56,13 +57,14 @@ def fine_base_color(
 
 def _project(surface: UnwrappedMesh, photos: FullPhotos, size: int, gains: Floats, holdout: int, monitor: Monitor) -> tuple[Halves, Flags]:
     """Linear colours of the photos on a texture of `size`, and where there are some."""
-    reader, atlas = PhotoProjector(photos, holdout), surface.atlas
+    reader, atlas, energy = PhotoProjector(photos, holdout), surface.atlas, DetailEnergy()
     edge = surface.texel_size * surface.texels.size / size
     colour, observed = np.zeros((size * size, 3), np.float16), np.zeros(size * size, np.bool_)
     bands = max(1, -(-len(surface.texels) * size**2 // surface.texels.size**2 // BAND_TEXELS))
     rows = np.linspace(0, size, bands + 1).round().astype(int)
     for band in range(bands):
-        texels = rasterise(atlas.uv, atlas.faces, size, (int(rows[band]), int(rows[band + 1])))
+        part = int(rows[band]), int(rows[band + 1])
+        texels = rasterise(atlas.uv, atlas.faces, size, part)
         if not len(texels):
             continue
         normal = texels.interpolate(surface.normal, atlas.faces)
@@ -75,7 +77,10 @@ def _project(surface: UnwrappedMesh, photos: FullPhotos, size: int, gains: Float
             monitor.progress(band * len(photos) + index + 1, bands * len(photos), "base colour")
         fused = blender.result(known_gains=gains)
         colour[texels.index], observed[texels.index] = fused.values, fused.observed
-    return colour.reshape(size, size, 3), observed.reshape(size, size)
+        energy.add(blender, texels, part, PATCHES // bands, gains)
+    image, seen = colour.reshape(size, size, 3), observed.reshape(size, size)
+    monitor.decide("detail", ", ".join(f"{gain:.2f}x" for gain in energy.gains), energy.evidence)
+    return amplified(image, seen, energy.gains), seen
 
 
 def _refined(coarse: Floats, projected: Halves, observed: Flags, smooth: bool) -> Floats:
