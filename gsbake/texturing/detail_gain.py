@@ -12,14 +12,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from gsbake.texturing.projection import ProjectionBlender
-from gsbake.texturing.resampling import DETAIL_OFFSET
 from gsbake.texturing.texels import Texels
 
 Floats = NDArray[np.float32]
@@ -33,8 +31,8 @@ SIGMAS = (1.0, 2.0, 4.0)
 PATCH, MARGIN, PATCHES = 32, 8, 600
 #: Least views that show a patch, and least weight of one beside the best.
 MIN_VIEWS, MIN_WEIGHT = 3, 0.05
-#: Fewer patches are no evidence; largest gain; largest factor of a texel's luminance.
-MIN_PATCHES, MAX_GAIN, MAX_FACTOR = 20, 1.5, 2.5
+#: Fewer patches are no evidence; largest gain; largest factor of a texel's coded luminance, which counts as at least `DARKEST`.
+MIN_PATCHES, MAX_GAIN, MAX_FACTOR, DARKEST = 20, 1.5, 2.5, np.float32(0.02)
 #: Luminance of linear RGB.
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)
 
@@ -102,15 +100,15 @@ class DetailEnergy:
         return f"the mean keeps {kept} % of the photos' energy in bands of 1, 2 and 4 texels; {common} % is common to the photos"
 
 
-def amplified(colour: Halves, observed: Flags, gains: Sequence[float]) -> Halves:
-    """Linear `colour` (n, n, 3) with its bands of luminance amplified by `gains`; only where `observed` (n, n), and by nothing else."""
+def detail_factor(colour: Halves, observed: Flags, gains: Sequence[float]) -> Floats:
+    """Factors (n, n) on linear `colour` (n, n, 3) that amplify its bands of luminance by `gains`; 1 where it is not `observed` (n, n)."""
     known = observed.astype(np.float32)
-    root = np.sqrt(np.maximum(colour.astype(np.float32) @ LUMINANCE, 0)) * known
+    root = sum(weight * colour[..., channel].astype(np.float32) for channel, weight in enumerate(LUMINANCE))
+    root = np.sqrt(np.maximum(root, 0)) * known
     finer, change = root, np.zeros_like(root)
     for sigma, gain in zip(SIGMAS, gains, strict=True):
-        share = np.maximum(cv2.GaussianBlur(known, (0, 0), sigma), 1e-6)
-        low: NDArray[Any] = cv2.GaussianBlur(root, (0, 0), sigma) / share
+        low = cv2.GaussianBlur(root, (0, 0), sigma) / np.maximum(cv2.GaussianBlur(known, (0, 0), sigma), 1e-6)
         change += np.float32(gain - 1) * (finer - low)
         finer = low
-    factor = np.clip(1 + change / (root + np.float32(np.sqrt(DETAIL_OFFSET))), 1 / MAX_FACTOR, MAX_FACTOR)
-    return np.where(observed[..., None], colour * (factor**2)[..., None], colour).astype(np.float16)
+    change /= np.maximum(root, DARKEST)
+    return np.where(observed, np.clip(1 + change, 1 / MAX_FACTOR, MAX_FACTOR) ** 2, np.float32(1))

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from gsbake.capture.full_photos import FullPhotos
 from gsbake.monitor import Monitor
-from gsbake.texturing.detail_gain import PATCHES, DetailEnergy, amplified
+from gsbake.texturing.detail_gain import PATCHES, DetailEnergy, detail_factor
 from gsbake.texturing.inpainting import fill_empty_texels
 from gsbake.texturing.photo_projection import PhotoProjector
 from gsbake.texturing.projection import ProjectionBlender
@@ -47,16 +47,21 @@ def fine_base_color(
     `coarse` (s, s, 3) is the finished one of the texture of `surface`, without empty texels; `size` is s times a power of two. `smooth`: it
     differs from the photos' colours by what varies slowly, as shading does, and not from texel to texel, as materials may.
     """
-    projected, observed = _project(surface, photos, size, gains, holdout, monitor)
+    projected, observed, energy = _project(surface, photos, size, gains, holdout, monitor)
+    monitor.decide("detail", ", ".join(f"{gain:.2f}x" for gain in energy.gains), energy.evidence)
+    sharpened = detail_factor(projected, observed, energy.gains)
     out = np.empty((size, size, 3), np.float32)
     for channel in range(3):
         monitor.check_stop()
-        out[..., channel] = _refined(np.ascontiguousarray(coarse[..., channel]), projected[..., channel], observed, smooth)
+        colour = projected[..., channel].astype(np.float32) * sharpened
+        out[..., channel] = _refined(np.ascontiguousarray(coarse[..., channel]), colour, observed, smooth)
     return out
 
 
-def _project(surface: UnwrappedMesh, photos: FullPhotos, size: int, gains: Floats, holdout: int, monitor: Monitor) -> tuple[Halves, Flags]:
-    """Linear colours of the photos on a texture of `size`, and where there are some."""
+def _project(
+    surface: UnwrappedMesh, photos: FullPhotos, size: int, gains: Floats, holdout: int, monitor: Monitor
+) -> tuple[Halves, Flags, DetailEnergy]:
+    """Linear colours of the photos on a texture of `size`, where there are some, and the energies of their detail."""
     reader, atlas, energy = PhotoProjector(photos, holdout), surface.atlas, DetailEnergy()
     edge = surface.texel_size * surface.texels.size / size
     colour, observed = np.zeros((size * size, 3), np.float16), np.zeros(size * size, np.bool_)
@@ -78,20 +83,18 @@ def _project(surface: UnwrappedMesh, photos: FullPhotos, size: int, gains: Float
         fused = blender.result(known_gains=gains)
         colour[texels.index], observed[texels.index] = fused.values, fused.observed
         energy.add(blender, texels, part, PATCHES // bands, gains)
-    image, seen = colour.reshape(size, size, 3), observed.reshape(size, size)
-    monitor.decide("detail", ", ".join(f"{gain:.2f}x" for gain in energy.gains), energy.evidence)
-    return amplified(image, seen, energy.gains), seen
+    return colour.reshape(size, size, 3), observed.reshape(size, size), energy
 
 
-def _refined(coarse: Floats, projected: Halves, observed: Flags, smooth: bool) -> Floats:
+def _refined(coarse: Floats, projected: Floats, observed: Flags, smooth: bool) -> Floats:
     """One channel: `coarse` (s, s) with the detail of the `projected` colours (n, n) where they are `observed` (n, n)."""
     small, large = coarse.shape, projected.shape
     known = observed.astype(np.float32)
     share = cv2.resize(known, small, interpolation=cv2.INTER_AREA)
-    mean = cv2.resize(projected.astype(np.float32) * known, small, interpolation=cv2.INTER_AREA) / np.maximum(share, 1e-6)
+    mean = cv2.resize(projected * known, small, interpolation=cv2.INTER_AREA) / np.maximum(share, 1e-6)
     filled = fill_empty_texels(mean[..., None], share > 0, gutter=4)[..., 0]
     factor = np.clip((coarse + DETAIL_OFFSET) / (filled + DETAIL_OFFSET), 1 / MAX_RATIO, MAX_RATIO)
     if smooth:
         factor = cv2.GaussianBlur(factor, (0, 0), SMOOTH_TEXELS)
-    detailed = (projected.astype(np.float32) + DETAIL_OFFSET) * cv2.resize(factor, large, interpolation=cv2.INTER_LINEAR) - DETAIL_OFFSET
+    detailed = (projected + DETAIL_OFFSET) * cv2.resize(factor, large, interpolation=cv2.INTER_LINEAR) - DETAIL_OFFSET
     return np.asarray(np.clip(np.where(observed, detailed, cv2.resize(coarse, large, interpolation=cv2.INTER_LINEAR)), 0, 1), np.float32)
