@@ -25,8 +25,8 @@ Floats = NDArray[np.float32]
 Halves = NDArray[np.float16]
 Flags = NDArray[np.bool_]
 
-#: Texels of the surface that are projected at once; each takes 170 bytes.
-BAND_TEXELS = 6_000_000
+#: Texels of the surface that are projected at once; bytes of each, and of one of the texture that holds the result.
+BAND_TEXELS, BAND_BYTES, RESULT_BYTES = 6_000_000, 170, 7
 #: Light and materials change the photos' colours by a factor of at most so much; where it is smooth, it is averaged over so many coarse
 #: texels: the coarse texture is less sharp than the mean of the fine one, and would blur it.
 MAX_RATIO, SMOOTH_TEXELS = 8.0, 2.0
@@ -56,6 +56,12 @@ def fine_base_color(
         colour = projected[..., channel].astype(np.float32) * sharpened
         out[..., channel] = _refined(np.ascontiguousarray(coarse[..., channel]), colour, observed, smooth)
     return out
+
+
+def needed_bytes(surface: UnwrappedMesh, size: int) -> int:
+    """Memory that a texture of `size` takes, beside the photo that is projected."""
+    covered = len(surface.texels) * size**2 // surface.texels.size**2
+    return BAND_BYTES * min(covered, BAND_TEXELS) + RESULT_BYTES * size**2
 
 
 def _project(
