@@ -17,7 +17,7 @@ def run(ctx: Context) -> dict[str, Any]:
 
 STAGE = Stage(
     name="report",
-    version=11,
+    version=12,
     title="Report",
     run=run,
     summary="{psnr:dB} and SSIM {ssim} over {compared} photos",

@@ -28,7 +28,7 @@ from gsbake.shading.environment import EnvironmentLight
 from gsbake.shading.light_motion import LightMotion
 from gsbake.text import number
 from gsbake.texturing.atlas import make_atlas
-from gsbake.texturing.fine_base_color import fine_base_color
+from gsbake.texturing.fine_base_color import fine_base_color, needed_bytes
 from gsbake.texturing.given_uvs import given_atlas, given_uvs
 from gsbake.texturing.inpainting import fill_empty_texels, inpaint_surface
 from gsbake.texturing.normal_map import DenseSamples, normal_map, sample_dense_mesh, vertex_normals
@@ -341,8 +341,10 @@ class _Baking:
             return coarse
         with monitor.part("base colour"):
             chosen = texture_size([photos.camera(index) for index in range(len(photos))], surface)
-            monitor.decide("base colour", f"{chosen.size}² texels", chosen.evidence)
-            if chosen.size == surface.texels.size:
+            finer = chosen.size > surface.texels.size
+            memory = f", baking it takes {1e-6 * needed_bytes(surface, chosen.size):.0f} MB of memory" if finer else ""
+            monitor.decide("base colour", f"{chosen.size}² texels", chosen.evidence + memory)
+            if not finer:
                 return coarse
             smooth = bake.materials != "fit"
             return fine_base_color(surface, photos, coarse, chosen.size, gains, self.options.holdout, smooth, monitor)

@@ -162,7 +162,9 @@ def mean(values: Sequence[float]) -> float | None:
     return sum(values) / len(values) if values else None
 
 
-def headline(manifests: Manifests, asset: Asset, bytes_: int, scored: Sequence[ViewScore], photos: tuple[int, int]) -> tuple[Figure, ...]:
+def headline(
+    manifests: Manifests, asset: Asset, bytes_: int, scored: Sequence[ViewScore], photos: tuple[int, int], density: Figure
+) -> tuple[Figure, ...]:
     """Figures at the top of the page; `photos` = number of registered and of ingested photos."""
     kind = "test photos" if scored and scored[0].held_out else "training photos"
     psnr, ssim = mean([s.metrics.psnr for s in scored]), mean([s.metrics.ssim for s in scored])
@@ -178,6 +180,7 @@ def headline(manifests: Manifests, asset: Asset, bytes_: int, scored: Sequence[V
         Figure("Photos", f"{photos[0]} of {photos[1]}", "registered"),
         Figure("Triangles", number(len(asset.faces))),
         Figure("Textures", f"{width}²" if width == height else f"{width} × {height}"),
+        density,
         Figure("GLB", size(bytes_)),
         Figure("Time", duration(total_seconds(manifests)), "all stages"),
     ]

@@ -113,7 +113,8 @@ class StageRow:
 @dataclass(frozen=True)
 class Page:
     """Contents of the page. Charts are SVG from `gsbake.report.charts`; `model` is the GLB in base64, empty for no 3D view; `map` is
-    the JSON of `gsbake.report.coverage.map_json`, empty for no map; `places` say from where to photograph what no photo saw."""
+    the JSON of `gsbake.report.coverage.map_json`, empty for no map; `places` say from where to photograph what no photo saw; `close_up`
+    are a part of a photo and of the asset, pixel for pixel."""
 
     title: str
     lead: str
@@ -142,6 +143,7 @@ class Page:
     panoramas: tuple[Panel, ...] = ()
     map: str = ""
     places: tuple[str, ...] = ()
+    close_up: tuple[Panel, ...] = ()
 
 
 #: Scripts of the page, which are one: what is on every page, the map of cameras, the views of the asset.

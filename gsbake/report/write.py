@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from gsbake import __version__
+from gsbake.capture.full_photos import FullPhotos
 from gsbake.capture.photos.roles import test_photos
 from gsbake.capture.posed_photos import PosedPhotos
 from gsbake.config.schema import Report
@@ -19,11 +20,12 @@ from gsbake.monitor import SILENT, Monitor
 from gsbake.report import compose, coverage, manifests
 from gsbake.report.advice import advice
 from gsbake.report.asset import open_asset
-from gsbake.report.html import Light, Page, Panel, render_page
+from gsbake.report.html import Figure, Light, Page, Panel, render_page
 from gsbake.report.masks import mask_panels
 from gsbake.report.page_model import page_model
 from gsbake.report.quality import select_views
 from gsbake.report.render import Asset, Renderer
+from gsbake.report.sharpness import close_up, texel_density
 from gsbake.report.sheets import map_panels, missed_panel
 from gsbake.shading.light_motion import LightMotion
 from gsbake.text import number
@@ -67,6 +69,8 @@ class _Renders:
     panoramas: tuple[Panel, ...]
     map: str
     places: tuple[str, ...]
+    close_up: tuple[Panel, ...]
+    density: Figure
 
 
 @dataclass
@@ -123,6 +127,13 @@ class _ReportWriter:
             scored = compose.score_views(
                 renderer, shader, posed, cameras, indices, held, settings.view_size, lambda k, n: monitor.progress(k, 2 * n, "comparison")
             )
+        with monitor.part("close-up"), FullPhotos(self.folders["ingest"], self.folders["poses"], self.folders["refine"]) as photos:
+            shown = indices[len(indices) // 2]
+            beside = close_up(renderer, shader(shown), photos, cameras[shown], shown)
+            full = [photos.camera(k) for k in range(len(photos))]
+            sized = [camera.scaled(own.width, own.height) for camera, own in zip(cameras, full, strict=True)]
+            metric = (self.manifests["export"].get("results") or {}).get("scale") == "metres"
+            density = texel_density(asset, sized, metric)
         monitor.check_stop()
         with monitor.part("relight"):
             directions = compose.viewpoints(asset, cameras, 2 if learnt else 3)
@@ -138,7 +149,7 @@ class _ReportWriter:
             drawn = coverage.map_json(asset, named, points, by_name, proposed, region)
             places = tuple(f"{coverage.in_words(d)} ({share:.0%} of it)" for d, share in proposed)
         panoramas = () if learnt is None else (compose.panorama(learnt),)
-        return _Renders(asset, posed, scored, held, learnt is not None, relit, lights, panoramas, drawn, places)
+        return _Renders(asset, posed, scored, held, learnt is not None, relit, lights, panoramas, drawn, places, beside, density)
 
     def _figures(self, renders: _Renders) -> dict[str, Any]:
         """The figures of `report.json`."""
@@ -165,7 +176,7 @@ class _ReportWriter:
         return Page(
             title=manifests.capture_name(found),
             lead=_lead(count, _kind(lit, found), posed.cameras.poses),
-            figures=compose.headline(found, renders.asset, self.glb.stat().st_size, scored, (len(posed), count)),
+            figures=compose.headline(found, renders.asset, self.glb.stat().st_size, scored, (len(posed), count), renders.density),
             warnings=tuple(replace(w, advice=advice(w.text, renders.places)) for w in manifests.warnings(found)),
             model="",
             lights=renders.lights,
@@ -191,6 +202,7 @@ class _ReportWriter:
             panoramas=renders.panoramas,
             map=renders.map,
             places=renders.places,
+            close_up=renders.close_up,
             masks=mask_panels(self.folders["poses"], found["poses"].get("results") or {}),
         )
 

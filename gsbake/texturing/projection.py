@@ -119,6 +119,12 @@ class ProjectionBlender:
         values, views, confidence = fuse(self._values, self._weights, self._view, gains)
         return ProjectedTexture(values, views, confidence, gains, explained)
 
+    def samples(self, rows: NDArray[np.int64], gains: Floats) -> tuple[NDArray[np.float64], Floats, NDArray[np.int16]]:
+        """Linear samples (m, keep, c) of the texels `rows` (m,), the views' `gains` (views, c) divided out, with their weights (m, keep)
+        and views (m, keep; -1: none)."""
+        view = self._view[rows]
+        return (self._values[rows] / 65535.0) ** 2 / gains[view], self._weights[rows], view
+
     def useful_size(self, camera: Camera) -> int:
         """Longer side in pixels at which pixels are as fine as texels, rounded up; that of `camera` where they are not much finer:
         a filter would blur them."""

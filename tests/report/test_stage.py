@@ -50,6 +50,7 @@ def test_page_shows_the_run(make_run: MakeRun) -> None:
     found = done.report()
     html = (done.out / "report.html").read_text()
     triangles = f"{found['triangles']:,}".replace(",", " ")
+    assert "64 × 64 of 64 × 64 pixels" in html and "per pixel <small>of a photo</small>" in html
     for words in ("grey_ball", "One photo is blurred &amp; dark.", "structure from motion", "8 of 9", "Learnt light", "Sunset", triangles):
         assert words in html
     assert html.count("<span>training photo</span>") == 0

@@ -108,10 +108,7 @@ def test_a_smooth_factor_keeps_detail_that_the_coarse_texture_blurs() -> None:
     fine = cv2.resize(0.3 + 0.4 * rng.random((n, n)).astype(np.float32), (4 * n, 4 * n), interpolation=cv2.INTER_CUBIC)
     mean = cv2.resize(fine, (n, n), interpolation=cv2.INTER_AREA)
     coarse = np.asarray(0.5 * cv2.GaussianBlur(mean, (0, 0), 0.7), np.float32)
-    errors = [
-        np.abs(module._refined(coarse, fine.astype(np.float16), np.ones(fine.shape, np.bool_), smooth) - 0.5 * fine).mean()
-        for smooth in (False, True)
-    ]
+    errors = [np.abs(module._refined(coarse, fine, np.ones(fine.shape, np.bool_), smooth) - 0.5 * fine).mean() for smooth in (False, True)]
     assert errors[1] < 0.5 * errors[0]
 
 
@@ -120,6 +117,13 @@ def test_bands_of_rows_give_the_same_colour(surface: UnwrappedMesh, monkeypatch:
     whole = refined(surface, coarse)
     monkeypatch.setattr(module, "BAND_TEXELS", len(surface.texels) * 4)
     assert np.array_equal(refined(surface, coarse), whole)
+
+
+def test_memory_grows_with_the_texture_but_not_beyond_a_band(surface: UnwrappedMesh, monkeypatch: pytest.MonkeyPatch) -> None:
+    fill = len(surface.texels) / COARSE**2
+    assert module.needed_bytes(surface, 256) == pytest.approx(256**2 * (7 + 170 * fill), rel=1e-3)
+    monkeypatch.setattr(module, "BAND_TEXELS", 1000)
+    assert module.needed_bytes(surface, 256) == 256**2 * 7 + 1000 * 170
 
 
 def test_rows_of_a_texture_are_those_of_the_whole(surface: UnwrappedMesh) -> None:
