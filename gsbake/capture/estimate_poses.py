@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from gsbake.capture.hull.region import holds_object
 from gsbake.capture.hull.visual_hull import visual_hull
 from gsbake.capture.masks.completion import complete_masks
 from gsbake.capture.masks.consensus import MIN_CERTAIN_OVERLAP, MIN_OVERLAP, MIN_USED_AGREEMENT, correct_mask, distorted, find_consensus
@@ -49,6 +50,10 @@ MIN_POINTS = 30
 SURFACE_POINTS = 1000
 #: Share of a mask's area whose correction by the visual hull is worth a line.
 LARGE_CORRECTION = 0.01
+#: What is wrong with a region outside of which the whole object lies.
+REGION_MISSES = (
+    "poses: the region lies in no photo, or beside the object in the masks; its box is in the frame of the cameras (photo_cameras.json)."
+)
 #: Longer side in pixels of the masks that visual hulls are carved from.
 HULL_MASK_SIZE = 512
 
@@ -181,10 +186,7 @@ class _Estimation:
                 write_png(path, box)
             shown += bool(box.any())
         if not shown:
-            raise BadInputError(
-                "poses: the region lies in no photo, or beside the object in all masks; its box is in the frame of the cameras "
-                "(photo_cameras.json)."
-            )
+            raise BadInputError(REGION_MISSES)
         inside = None if points is None else region.contains(points)
         return (None, None) if inside is None else (points[inside], None if colours is None else colours[inside])
 
@@ -327,6 +329,8 @@ class _Estimation:
             sphere = bounding_sphere_from_masks([c for c, _ in masked], [m for _, m in masked])
             if sphere is not None:
                 return sphere
+            if region is not None and not holds_object(region, masked):
+                raise BadInputError(REGION_MISSES)
             self.monitor.warn("The visual hull of the masks is empty; check that white is the object (else set ingest.invert_masks).")
         if region is not None:
             return BoundingSphere(region.centre, float(np.linalg.norm(region.size)) / 2, "the region")

@@ -163,7 +163,7 @@ def test_only_the_region_is_kept(tmp_path: Path, runner: Runner, masked: bool) -
     if masked:
         for path in (runner.root / "ingest" / "masks").iterdir():  # the object is at the left edge of all photos
             write_png(path, np.where(np.arange(320) < 4, read_grey(path), 0).astype(np.uint8))
-        with pytest.raises(BadInputError, match="beside the object in all masks"):
+        with pytest.raises(BadInputError, match="beside the object in the masks"):
             runner.poses(out="off", **settings, region_box=(0.6, 0.0, 0.4, 0.1, 0.1, 0.1, *box[6:]))
 
 
