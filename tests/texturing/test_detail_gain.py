@@ -41,22 +41,22 @@ def energy_of(planes: np.ndarray) -> DetailEnergy:
 
 
 @pytest.fixture(scope="module")
-def paint() -> np.ndarray:
+def pattern() -> np.ndarray:
     """A texture with detail of about three texels."""
     noise = np.random.default_rng(0).normal(size=(SIZE, SIZE)).astype(np.float32)
     return np.asarray(0.5 + 0.25 * cv2.GaussianBlur(noise, (0, 0), 1.0), np.float32)
 
 
-def shifted(paint: np.ndarray, pixels: float) -> np.ndarray:
+def shifted(pattern: np.ndarray, pixels: float) -> np.ndarray:
     """Views of the texture, each beside its place by up to so many texels."""
     moves = np.random.default_rng(1).uniform(-pixels, pixels, (VIEWS, 2))
     return np.stack(
-        [cv2.warpAffine(paint, np.float32([[1, 0, x], [0, 1, y]]), (SIZE, SIZE), borderMode=cv2.BORDER_REFLECT) for x, y in moves]
+        [cv2.warpAffine(pattern, np.float32([[1, 0, x], [0, 1, y]]), (SIZE, SIZE), borderMode=cv2.BORDER_REFLECT) for x, y in moves]
     )
 
 
-def test_views_in_place_keep_their_detail(paint: np.ndarray) -> None:
-    assert energy_of(np.stack([paint] * VIEWS)).gains == pytest.approx((1,) * len(SIGMAS), abs=1e-4)
+def test_views_in_place_keep_their_detail(pattern: np.ndarray) -> None:
+    assert energy_of(np.stack([pattern] * VIEWS)).gains == pytest.approx((1,) * len(SIGMAS), abs=1e-4)
 
 
 def test_noise_is_not_amplified() -> None:
@@ -66,8 +66,8 @@ def test_noise_is_not_amplified() -> None:
     assert np.abs(energy.common / energy.views).max() < 0.05
 
 
-def test_detail_of_views_beside_each_other_comes_nearer_to_theirs(paint: np.ndarray) -> None:
-    views = shifted(paint, 0.9)
+def test_detail_of_views_beside_each_other_comes_nearer_to_theirs(pattern: np.ndarray) -> None:
+    views = shifted(pattern, 0.9)
     mean = views.mean(0)
     energy = energy_of(views)
     assert all(1.02 < gain < module.MAX_GAIN for gain in energy.gains[:2])
@@ -77,18 +77,18 @@ def test_detail_of_views_beside_each_other_comes_nearer_to_theirs(paint: np.ndar
     def detail(plane: np.ndarray) -> float:
         return float((cv2.Laplacian(plane, cv2.CV_32F) ** 2).mean())
 
-    assert detail(mean) < 0.8 * detail(paint)
-    assert 1.1 * detail(mean) < detail(found) < detail(paint)
-    assert np.corrcoef(found.ravel(), paint.ravel())[0, 1] > np.corrcoef(mean.ravel(), paint.ravel())[0, 1] - 0.003
+    assert detail(mean) < 0.8 * detail(pattern)
+    assert 1.1 * detail(mean) < detail(found) < detail(pattern)
+    assert np.corrcoef(found.ravel(), pattern.ravel())[0, 1] > np.corrcoef(mean.ravel(), pattern.ravel())[0, 1] - 0.003
 
 
-def test_few_patches_are_no_evidence(paint: np.ndarray) -> None:
-    energy = energy_of(shifted(paint, 0.9)[:2])
+def test_few_patches_are_no_evidence(pattern: np.ndarray) -> None:
+    energy = energy_of(shifted(pattern, 0.9)[:2])
     assert energy.patches == 0 and energy.gains == (1.0,) * len(SIGMAS) and "0 patches" in energy.evidence
 
 
-def test_only_detail_of_what_is_observed_is_amplified(paint: np.ndarray) -> None:
-    colour = np.stack([paint, 0.5 * paint, 0.25 * paint], 2).astype(np.float16)
+def test_only_detail_of_what_is_observed_is_amplified(pattern: np.ndarray) -> None:
+    colour = np.stack([pattern, 0.5 * pattern, 0.25 * pattern], 2).astype(np.float16)
     colour[:, :64] = 0.3
     observed = np.ones((SIZE, SIZE), np.bool_)
     observed[:, 200:] = False
