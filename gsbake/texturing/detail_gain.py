@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from gsbake.texturing.projection import ProjectionBlender
 from gsbake.texturing.texels import Texels
+from gsbake.texturing.view_fusion import SHARPNESS
 
 Floats = NDArray[np.float32]
 Doubles = NDArray[np.float64]
@@ -68,7 +69,7 @@ class DetailEnergy:
         usable = weight > MIN_WEIGHT * weight.max()
         if usable.sum() < MIN_VIEWS:
             return
-        weight = weight[usable] ** 2 / (weight[usable] ** 2).sum()
+        weight = weight[usable] ** SHARPNESS / (weight[usable] ** SHARPNESS).sum()
         finer = [plane.reshape(PATCH, PATCH).astype(np.float32) for plane in root[usable]]
         alone = float((weight**2).sum())
         for band, sigma in enumerate(SIGMAS):
