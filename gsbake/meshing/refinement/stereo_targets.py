@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from gsbake.geometry.cameras import Camera
 from gsbake.geometry.raycast import RayCaster
 from gsbake.meshing.cleanup import Vertices
-from gsbake.shape_refinement.surface import Surface
+from gsbake.shape_refinement.surface import Surface, surface_area
 from gsbake.shape_refinement.targets import Targets, vertex_rows
 
 Floats = NDArray[np.float32]
@@ -43,6 +43,8 @@ class StereoTargets:
 
     def __call__(self, surface: Surface, vertices: Vertices) -> tuple[Targets, float]:
         """Targets at the vertices, and the share of those that a photo sees that most photos confirm."""
+        if surface_area(vertices, surface.faces) == 0:
+            return Targets.none(surface.count), 0.0
         count, normals = len(vertices), surface.normals(vertices)
         caster, ray_offset = RayCaster(vertices, surface.faces, self.threads), 0.5 * surface.mean_edge(vertices)
         seen, found = np.zeros(count), np.zeros(count)

@@ -86,6 +86,7 @@ def test_depths_count_by_majority_and_near_the_surface() -> None:
     targets, share = measured(far, vertices, surface)
     assert share == 0 and len(targets.target) == 0
     assert measured([None] * len(CAMERAS), vertices, surface)[1] == 0
+    assert measured(maps, 0 * vertices, surface)[1] == 0  # a collapsed mesh
 
 
 @pytest.mark.parametrize(("finer", "confirmed", "sizes"), [(480, 0.9, [480]), (1500, 0.9, [1500]), (1500, 0.1, [1500, 480])])
