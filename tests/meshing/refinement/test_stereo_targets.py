@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -87,6 +88,20 @@ def test_depths_count_by_majority_and_near_the_surface() -> None:
     assert share == 0 and len(targets.target) == 0
     assert measured([None] * len(CAMERAS), vertices, surface)[1] == 0
     assert measured(maps, 0 * vertices, surface)[1] == 0  # a collapsed mesh
+
+
+def test_a_mesh_is_refined_by_the_depths_on_the_disk(tmp_path: Path) -> None:
+    vertices, faces = sphere(0.8)
+    (tmp_path / "depth").mkdir()
+    for camera, depth in zip(CAMERAS, depths(), strict=True):
+        np.savez(tmp_path / "depth" / f"{camera.name}.npz", depth=depth, confidence=np.ones(depth.shape, np.float16))
+    masks = [np.where(depth > 0, 255, 0).astype(np.uint8) for depth in depths()]
+    posed = SimpleNamespace(has_masks=True, mask=lambda index: (CAMERAS[index], masks[index]))
+    photos: Any = SimpleNamespace(posed=posed, camera=lambda index, size: CAMERAS[index])
+    run = ShapeRefinement(photos, range(len(CAMERAS)), tmp_path, 6 * PIXEL, 5000, "fast-simplification", 0, 1, SILENT)
+    moved, figures = run.refine(vertices, faces, 100, 200)
+    assert figures["refinement_confirmed"] > 0.95
+    assert np.median(np.abs(np.linalg.norm(moved, axis=1) - RADIUS)) < 0.15 * PIXEL
 
 
 @pytest.mark.parametrize(("finer", "confirmed", "sizes"), [(480, 0.9, [480]), (1500, 0.9, [1500]), (1500, 0.1, [1500, 480])])
