@@ -49,7 +49,7 @@ def kernels(settings: Any) -> tuple[str, ...]:
 
 STAGE = Stage(
     name="mesh",
-    version=12,
+    version=13,
     title="Mesh",
     run=run,
     summary="{faces} triangles, {dense_faces} before decimation",
