@@ -27,7 +27,7 @@ KERNELS = (
 
 STAGE = Stage(
     name="stereo",
-    version=14,
+    version=15,
     title="Multi-view stereo",
     run=run,
     summary="{points} points, {confirmed_share:%} of the object confirmed",

@@ -35,6 +35,9 @@ MAX_DISTANCE = 0.02
 MAX_REACH = 10.0
 #: A frame is preferred to others up to this many times as far, and up to this share of the diagonal.
 TIE_FACTOR, TIE_DISTANCE = 2.0, 1e-3
+#: Faces of the dense mesh that are looked at, those beside each face of the low-poly mesh, and their distance as a share of the diagonal;
+#: share of an open piece's area beside which none may look as it does for it to be inside out.
+DENSE_FACES, NEIGHBOURS, NEIGHBOUR_DISTANCE, MIN_AGAINST = 20_000, 64, 0.03, 0.9
 
 
 @dataclass(frozen=True)
@@ -123,11 +126,30 @@ def _frame(
 def _inside_out(
     vertices: NDArray[np.float64], faces: NDArray[np.int64], dense: tuple[NDArray[np.float64], NDArray[np.int64]]
 ) -> NDArray[np.bool_]:
-    """Which of the `faces` (f, 3) belong to pieces most of whose area looks against the dense surface nearest to it."""
-    (middle, normal), (near, outwards) = (_middles(*mesh) for mesh in ((vertices, faces), dense))
-    along = np.einsum("nk,nk->n", normal, outwards[cKDTree(near).query(middle)[1]])
-    piece = islands(len(vertices), faces)
-    return np.asarray(np.bincount(piece, along)[piece] < 0)
+    """Which of the `faces` (f, 3) belong to pieces that are inside out: closed ones of negative volume, but for hollows in others; open
+    ones if the dense surface beside most of their area looks the other way only. Beside thin walls it looks both ways."""
+    joined = np.unique(vertices, axis=0, return_inverse=True)[1].reshape(-1)[faces]
+    middle, normal = _middles(vertices, faces)
+    piece = islands(int(joined.max()) + 1, joined)
+    near, outwards = (values[:: max(1, len(dense[1]) // DENSE_FACES)] for values in _middles(*dense))
+    far, beside = (found.reshape(len(faces), -1) for found in cKDTree(near).query(middle, min(NEIGHBOURS, len(near))))
+    close = far <= np.maximum(far[:, :1], NEIGHBOUR_DISTANCE * np.linalg.norm(np.ptp(near, axis=0)))
+    agrees = (close & (np.einsum("nk,nmk->nm", normal, outwards[beside]) > 0)).any(1)
+    area = np.linalg.norm(normal, axis=1)
+    against = np.bincount(piece, area * ~agrees) > MIN_AGAINST * np.bincount(piece, area)
+    volume = np.bincount(piece, np.einsum("nk,nk->n", middle - middle.mean(0), normal))
+    closed = _closed(joined, piece)
+    largest = np.abs(volume) == np.abs(volume[closed]).max(initial=0)
+    return np.asarray(np.where(closed, (volume < 0) & (against | largest), against)[piece])
+
+
+def _closed(faces: NDArray[np.int64], piece: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Which pieces (k,) of the `faces` (f, 3) have each edge twice, once in each direction."""
+    start, end = faces.reshape(-1), np.roll(faces, -1, 1).reshape(-1)
+    count = int(faces.max()) + 1
+    edge, back = np.sort(start * count + end), end * count + start
+    alone = (np.searchsorted(edge, back, "right") - np.searchsorted(edge, back, "left")) != 1
+    return np.bincount(np.repeat(piece, 3), alone) == 0
 
 
 def _middles(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

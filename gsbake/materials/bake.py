@@ -112,6 +112,8 @@ class Textures:
     projected: ProjectedTexture
     normal: DenseSamples
     figures: dict[str, Any]
+    #: Factor on the base colour that known reflectances gave, one or three numbers.
+    white: NDArray[np.float64] | float = 1.0
 
 
 @dataclass
@@ -157,7 +159,7 @@ class _Baking:
         coded = self._normal_map(surface, textures)
         with monitor.part("inpainting"):
             image, emissive = self._image(surface, textures.projected, occlusion, coded, faces, len(vertices))
-        colour = self._base_color(surface, image[..., :3], textures.projected.gains)
+        colour = self._base_color(surface, image[..., :3], textures.projected.gains[:, :3] / textures.white)
         with monitor.part("write"):
             self._write(surface, textures.projected, detail, image, colour, coded is not None, emissive)
         return self._figures(surface, detail, textures, len(colour))
@@ -273,17 +275,18 @@ class _Baking:
         if not white:
             return textures
         projected, light = textures.projected, self.out / "light.safetensors"
-        found = on_object(projected.values[:, :3], projected.observed, white.on_object)
+        found = on_object(projected.values, projected.observed, white.on_object)
         if white.printed:
             lit = LightMotion.load(self.out / "light_motion.json").rotations
             radiance = EnvironmentLight.load(light).radiance().detach().numpy()
-            factors = printed_factors(white.printed, self.photos.posed, projected.gains, surface.caster, radiance, lit)
+            factors = printed_factors(white.printed, self.photos.posed, projected.gains[:, :3], surface.caster, radiance, lit)
             found += [Evidence(patch.name, factor) for patch, factor in zip(white.printed, factors, strict=True)]
         factor = common_factor(found, self.monitor)
         divide_light(light, factor)
         values = projected.values.copy()
         values[:, :3] = with_factor(values[:, :3], factor, self.monitor)
-        return replace(textures, projected=replace(projected, values=values), figures=textures.figures | {"white_factor": factor.tolist()})
+        figures = textures.figures | {"white_factor": factor.tolist()}
+        return replace(textures, projected=replace(projected, values=values), figures=figures, white=factor)
 
     def _delight(self, surface: UnwrappedMesh, projected: ProjectedTexture, detail: DenseSamples, occlusion: Floats) -> ProjectedTexture:
         """Base colour (n, 3): projected colours divided by their shading."""

@@ -67,7 +67,13 @@ def printed_factors(
             turned = rays[k] if rotations is None else rays[k] @ rotations[index].T
             arriving = free[k][chosen].astype(np.float64) @ cubemap.sample(radiance, turned) / RAYS
             found[k].extend(patch.reflectance[chosen, None] * arriving / seen[bright])
-    return [np.median(factors, axis=0) if factors else None for factors in found]
+    return [_factor(factors) for factors in found]
+
+
+def _factor(factors: list[Doubles]) -> Doubles | None:
+    """The median of the factors (3,); None without any, or where the fitted light is black."""
+    factor = np.median(factors, axis=0) if factors else np.zeros(3)
+    return factor if (factor > 0).all() else None
 
 
 def _hemisphere(normal: Array) -> Array:

@@ -19,7 +19,7 @@ from gsbake.config.white import PrintedWhite, WhitePatch, parse_white
 from gsbake.errors import BadInputError
 from gsbake.monitor import Monitor
 from gsbake.scale.printed_white import PrintedPatches, find_printed
-from gsbake.scale.triangulation import PickedPhotos
+from gsbake.scale.triangulation import PickedPhotos, find_entry
 from gsbake.shading.environment import EnvironmentLight
 from gsbake.texturing.unwrapped_mesh import UnwrappedMesh
 
@@ -30,16 +30,19 @@ Floats = NDArray[np.float32]
 PATCH_SIZE, PATCH_RAYS = 0.01, 9
 #: Base colour below this cannot be that of a patch of known reflectance: it would multiply noise.
 MIN_BASE_COLOR = 0.01
+#: The brightest 8-bit value that is not clipped.
+MAX_VALUE = 250
 #: Share of the texels whose base colour may exceed 1, and ratio of two patches, from which on a warning is given.
 MAX_CLIPPED, MAX_RATIO = 0.01, 1.15
 
 
 @dataclass(frozen=True)
 class WhiteTexels:
-    """A patch and the texels (m,) that it shows."""
+    """A patch and the texels (m,) that it shows; `clipped`: its photo is overexposed there."""
 
     patch: WhitePatch
     texel: NDArray[np.int64]
+    clipped: bool = False
 
 
 @dataclass(frozen=True)
@@ -89,17 +92,29 @@ def _texels(patches: Sequence[WhitePatch], ingest: Path, posed: PosedPhotos, sur
             raise BadInputError(f"bake: the white patch '{patch.text}' is not on the object; name a pixel where the photo shows it.")
         corners = surface.atlas.uv[surface.atlas.faces[hits.face[hits.hit]]]
         texel = surface.texels.containing(np.einsum("nk,nkd->nd", hits.bary[hits.hit], corners))
-        found.append(WhiteTexels(patch, np.unique(texel[texel >= 0])))
+        texel = np.unique(texel[texel >= 0])
+        name = find_entry(photos.entries, patch.position.photo, "A white patch")["name"]
+        found.append(WhiteTexels(patch, texel, _clipped(posed, name, surface.texel_position[texel].astype(np.float64))))
     return found
 
 
-def on_object(base_color: Floats, observed: NDArray[np.bool_], patches: Sequence[WhiteTexels]) -> list[Evidence]:
-    """What the `patches` ask for, by the fitted linear `base_color` (n, 3) of their `observed` texels (n,)."""
+def _clipped(posed: PosedPhotos, name: str, points: Doubles) -> bool:
+    """Whether most of the `points` (m, 3) are overexposed in the photo `name`."""
+    view = posed.view(next(index for index, camera in enumerate(posed.cameras.cameras) if camera.name == name))
+    pixel, depth = view.camera.project(points)
+    column, row = np.floor(pixel[view.camera.in_view(pixel, depth)]).astype(np.int64).T
+    return bool(len(row)) and float((view.rgb[row, column] > MAX_VALUE).any(1).mean()) > 0.5
+
+
+def on_object(values: Floats, observed: NDArray[np.bool_], patches: Sequence[WhiteTexels]) -> list[Evidence]:
+    """What the `patches` ask for, by the fitted `values` (n, 3, 5 or 8) of their `observed` texels (n,): linear base colour, then roughness
+    and metallic, then emission. Texels that emit light do not count."""
+    emits = np.asarray((values[:, 5:] > MIN_BASE_COLOR).any(1))
     found = []
     for white in patches:
-        texel, known = white.texel[observed[white.texel]], white.patch.reflectance
-        colour = np.median(base_color[texel], axis=0).astype(np.float64) if len(texel) else np.zeros(3)
-        factor = known / colour if colour.min() >= MIN_BASE_COLOR else None
+        texel, known = white.texel[observed[white.texel] & ~emits[white.texel]], white.patch.reflectance
+        colour = np.median(values[texel, :3], axis=0).astype(np.float64) if len(texel) else np.zeros(3)
+        factor = known / colour if colour.min() >= MIN_BASE_COLOR and not white.clipped else None
         found.append(Evidence(f"patch '{white.patch.text}'", factor, f"{_three(colour)} where {known:g} is known"))
     return found
 
@@ -108,7 +123,7 @@ def common_factor(found: Sequence[Evidence], monitor: Monitor) -> Doubles:
     """The factor (3,) on base colour, the geometric mean of all; one where nothing can be used. Warns of that and of contradictions."""
     for one in found:
         if one.factor is None:
-            monitor.warn(f"bake: the white {one.name} is black, clipped or hardly seen, and is not used.")
+            monitor.warn(f"bake: the white {one.name} is black, clipped, taken for a lamp or hardly seen, and is not used.")
     used = [one for one in found if one.factor is not None]
     factors = [one.factor for one in used if one.factor is not None]
     if not factors:

@@ -22,7 +22,7 @@ from gsbake.shading.prefilter import Layout, PrefilterOperator, irradiance_opera
 
 
 def _sparse_tensor(matrix: scipy.sparse.csr_matrix, dtype: torch.dtype, device: torch.device) -> torch.Tensor:
-    csr = matrix.tocsr()
+    csr = matrix.tocsr(copy=True)  # the matrices are shared by fits that run at the same time
     csr.sort_indices()
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Sparse CSR tensor support is in beta")

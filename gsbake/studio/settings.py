@@ -18,7 +18,7 @@ FIRST = (
 #: Settings that other tabs show.
 ELSEWHERE = frozenset({
     "ingest.leave_out", "poses.region", "poses.region_box", "scale.known_distances", "export.up", "export.up_points", "export.front",
-    "export.origin", "targets.files",
+    "export.origin", "bake.white", "targets.files",
 })  # fmt: skip
 
 

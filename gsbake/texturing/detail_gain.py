@@ -97,7 +97,9 @@ class DetailEnergy:
         """What the gains were chosen by."""
         if self.patches < MIN_PATCHES:
             return f"{self.patches} patches of the texture are shown whole by {MIN_VIEWS} photos, at least {MIN_PATCHES} are needed"
-        kept, common = (", ".join(f"{100 * max(0.0, x):.0f}" for x in part / self.views) for part in (self.mean, self.common))
+        kept, common = (
+            ", ".join(f"{100 * max(0.0, x):.0f}" for x in part / np.maximum(self.views, 1e-12)) for part in (self.mean, self.common)
+        )
         return f"the mean keeps {kept} % of the photos' energy in bands of 1, 2 and 4 texels; {common} % is common to the photos"
 
 

@@ -26,7 +26,7 @@ Halves = NDArray[np.float16]
 Flags = NDArray[np.bool_]
 
 #: Texels of the surface that are projected at once; bytes of each, and of one of the texture that holds the result.
-BAND_TEXELS, BAND_BYTES, RESULT_BYTES = 6_000_000, 170, 7
+BAND_TEXELS, BAND_BYTES, RESULT_BYTES = 6_000_000, 170, 22
 #: Light and materials change the photos' colours by a factor of at most so much; where it is smooth, it is averaged over so many coarse
 #: texels: the coarse texture is less sharp than the mean of the fine one, and would blur it.
 MAX_RATIO, SMOOTH_TEXELS = 8.0, 2.0

@@ -87,6 +87,41 @@ def test_pieces_that_are_inside_out_are_turned(folder: Path, tmp_path: Path) -> 
     assert corners(found) == corners(right)
 
 
+@pytest.mark.parametrize("suffix", [".ply", ".glb"])
+@pytest.mark.parametrize("sections", [8, 12, 24])
+@pytest.mark.parametrize("reverse", [False, True])
+def test_thin_walls_are_turned_as_a_whole_or_not_at_all(tmp_path: Path, sections: int, suffix: str, reverse: bool) -> None:
+    """A tube whose chords lie nearer to the inner wall than to the outer one; triangles of a GLB share no vertices."""
+    dense = trimesh.creation.annulus(0.45, 0.5, 0.9, sections=400).subdivide()
+    write_mesh(tmp_path / "dense.ply", dense.vertices, dense.faces)
+    mine = trimesh.creation.annulus(0.45, 0.5, 0.9, sections=sections)
+    assert mine.is_watertight and mine.volume > 0
+    if reverse:
+        mine.invert()
+    if suffix == ".glb":
+        mine.unmerge_vertices()
+        mine.apply_transform(np.block([[Y_UP, np.zeros((3, 1))], [np.zeros((1, 3)), 1]]))
+    mine.export(tmp_path / f"mine{suffix}")
+    found = read_lowpoly(tmp_path / f"mine{suffix}", tmp_path / "dense.ply", None)
+    assert any("inside out" in note for note in found.notes) == reverse
+    assert trimesh.Trimesh(found.vertices, found.faces).volume > 0
+
+
+def test_an_open_sheet_that_is_inside_out_is_turned(tmp_path: Path) -> None:
+    """Half of a ball; beside a thin wall a sheet stays as it is."""
+    ball = trimesh.creation.icosphere(subdivisions=5)
+    write_mesh(tmp_path / "dense.ply", ball.vertices, ball.faces)
+    sheet = trimesh.creation.icosphere(subdivisions=3)
+    sheet.update_faces(sheet.triangles_center[:, 2] > 0)
+    for reverse in (False, True):
+        mine = trimesh.Trimesh(sheet.vertices, sheet.faces[:, ::-1] if reverse else sheet.faces, process=False)
+        mine.export(tmp_path / "mine.ply")
+        found = read_lowpoly(tmp_path / "mine.ply", tmp_path / "dense.ply", None)
+        assert any("inside out" in note for note in found.notes) == reverse
+        corner = found.vertices[found.faces]
+        assert (np.einsum("nk,nk->n", np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), corner.mean(1)) > 0).all()
+
+
 def test_nodes_are_placed_and_materials_joined(folder: Path, tmp_path: Path) -> None:
     """Two boxes of one atlas as two nodes of two materials, one of them mirrored by its node."""
     whole = unwrapped(Similarity(1.0, Y_UP))

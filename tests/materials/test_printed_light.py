@@ -77,6 +77,13 @@ def test_a_light_that_moves(tmp_path: Path) -> None:
     assert still is not None and moved is not None and (moved > 2 * still).all()
 
 
+def test_a_black_light_tells_nothing(tmp_path: Path) -> None:
+    cameras = ring()
+    photograph(tmp_path / "photos", cameras, "aruco-4x4", 7)
+    tint(tmp_path, SENT)
+    assert factors(tmp_path, cameras, "markers", ball(), radiance=np.zeros((6, 8, 8, 3), np.float32)) == [None]
+
+
 def test_clipped_paper_tells_nothing(tmp_path: Path) -> None:
     cameras = ring()
     photograph(tmp_path / "photos", cameras, "aruco-4x4", 7)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -19,9 +20,11 @@ from gsbake.geometry.cameras import CameraSet, Similarity
 from gsbake.geometry.ply import write_mesh
 from gsbake.imaging.exr import read_exr
 from gsbake.imaging.srgb import encode_bytes
+from gsbake.materials import bake as bake_module
 from gsbake.materials.bake import BakeOptions, bake_textures
 from gsbake.materials.white import WhiteTexels, common_factor, on_object
 from gsbake.shading.environment import EnvironmentLight
+from gsbake.texturing.texture_size import TextureSize
 from tests.support.cameras import look_at
 from tests.support.recorder import Recorder
 
@@ -109,22 +112,50 @@ def test_colours_that_contain_the_light_have_none_to_divide(run: Path, tmp_path:
 
 
 def test_several_patches() -> None:
-    colour = np.array([[0.3, 0.45, 0.9], [0.2, 0.2, 0.2], [0.004, 0.5, 0.5], [0.5, 0.5, 0.5]], np.float32)
-    seen = np.array([True, True, True, False])
+    colour = np.array([[0.3, 0.45, 0.9], [0.2, 0.2, 0.2], [0.004, 0.5, 0.5], [0.5, 0.5, 0.5], [0.5, 0.5, 0.5]], np.float32)
+    emission = np.float32(0.8) * (np.arange(5)[:, None] == 4) * np.ones((1, 3), np.float32)
+    values = np.column_stack([colour, np.full(5, 0.5), np.zeros(5), emission]).astype(np.float32)
+    seen = np.array([True, True, True, False, True])
 
     def factor(*patches: tuple[str, int]) -> tuple[list[float], list[str]]:
         monitor = Recorder()
         named = [(parse_white(text), np.array([k])) for text, k in patches]
         whites = [WhiteTexels(patch, texel) for patch, texel in named if isinstance(patch, WhitePatch)]
-        return common_factor(on_object(colour, seen, whites), monitor).round(4).tolist(), monitor.warnings
+        return common_factor(on_object(values, seen, whites), monitor).round(4).tolist(), monitor.warnings
 
     assert factor(("a:1,1", 0)) == ([3, 2, 1], [])
     mean, warnings = factor(("a:1,1", 0), ("a:2,2:0.2", 1))
     assert mean == pytest.approx(np.sqrt([3, 2, 1]), abs=1e-3) and ["contradict each other by a factor of 3.00" in warnings[0]] == [True]
-    for k in (2, 3):
+    for k in (2, 3, 4):  # black, unseen, taken for a lamp
         mean, warnings = factor(("a:1,1", k), ("a:2,2:0.2", 1))
-        assert mean == [1, 1, 1] and "patch 'a:1,1' is black, clipped or hardly seen" in warnings[0]
+        assert mean == [1, 1, 1] and "patch 'a:1,1' is black, clipped, taken for a lamp or hardly seen" in warnings[0]
         assert factor(("a:1,1", k))[0] == [1, 1, 1]
+
+
+def test_an_overexposed_patch_is_not_used(run: Path, tmp_path: Path) -> None:
+    bright = tmp_path / "run"
+    shutil.copytree(run, bright)
+    photo = bright / "poses/photos/p0.png"
+    image = cv2.imread(str(photo))
+    image[PHOTO // 2 - 6 : PHOTO // 2 + 6, PHOTO // 2 - 6 : PHOTO // 2 + 6] = 255
+    cv2.imwrite(str(photo), image)
+    results, monitor = bake(bright, tmp_path / "out", f"p0.jpg:{PHOTO:g},{PHOTO:g}:0.5")
+    assert results["white_factor"] == [1, 1, 1] and any("is black, clipped" in text for text in monitor.warnings)
+
+
+def test_a_finer_base_colour_has_the_same_factor(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its photos are divided by gains that contain it."""
+    given: list[np.ndarray] = []
+
+    def fine(surface: object, photos: object, coarse: np.ndarray, size: int, gains: np.ndarray, *_: object) -> np.ndarray:
+        given.append(gains)
+        return coarse
+
+    monkeypatch.setattr(bake_module, "fine_base_color", fine)
+    monkeypatch.setattr(bake_module, "texture_size", lambda *_: TextureSize(4096, 4096.0))
+    bake(run, tmp_path / "plain", size="auto")
+    results, _ = bake(run, tmp_path / "white", f"p0.jpg:{PHOTO:g},{PHOTO:g}:0.5", size="auto")
+    np.testing.assert_allclose(given[1], given[0] / np.array(results["white_factor"]), rtol=1e-6)
 
 
 def test_how_patches_are_written() -> None:

@@ -6,12 +6,13 @@ import math
 
 import numpy as np
 import pytest
+import scipy.sparse
 import torch
 
 from gsbake.geometry.vectors import unit
 from gsbake.shading import cubemap, prefilter
 from gsbake.shading.environment import EnvironmentLight
-from gsbake.shading.light_tables import LightTables, irradiance, prefilter_cube_map
+from gsbake.shading.light_tables import LightTables, _sparse_tensor, irradiance, prefilter_cube_map
 
 
 def random_directions(count: int, seed: int = 0) -> np.ndarray:
@@ -29,6 +30,17 @@ def room(dirs: np.ndarray) -> np.ndarray:
     window = np.exp(25.0 * (dirs @ unit(np.array([0.5, -0.6, 0.6])) - 1.0))
     sky = 0.4 + 0.25 * dirs[:, 2] + 0.1 * np.sin(5 * dirs[:, 0])
     return sky[:, None] * np.array([0.8, 0.9, 1.0]) + 12.0 * window[:, None] * np.array([1.0, 0.8, 0.5])
+
+
+def test_shared_matrices_stay_as_they_are() -> None:
+    """Fits in several threads read them at the same time."""
+    rows, columns = np.array([0, 0, 1, 1]), np.array([3, 1, 2, 0])
+    matrix = scipy.sparse.csr_matrix((np.arange(1.0, 5), columns, np.array([0, 2, 4])), shape=(2, 4))
+    found = _sparse_tensor(matrix, torch.float64, torch.device("cpu"))
+    assert (matrix.indices == columns).all() and not matrix.has_sorted_indices
+    expected = np.zeros((2, 4))
+    expected[rows, columns] = np.arange(1.0, 5)
+    np.testing.assert_array_equal(found.to_dense().numpy(), expected)
 
 
 @pytest.mark.parametrize("size", [4, 10, 16, 32])

@@ -10,6 +10,9 @@ from PIL import Image
 from gsbake.errors import BadInputError
 from gsbake.text import missing_list
 
+#: The chunk that ends a PNG file, and in how many of its last bytes it is looked for.
+PNG_END, PNG_TAIL = b"IEND\xaeB`\x82", 1024
+
 
 def require_sizes(folder: Path, sizes: Mapping[str, tuple[int, int]], stage: str) -> None:
     """Raise BadInputError, which lists them, where photos and masks in the artifact folder of a `stage` cannot be read or have other sizes
@@ -28,9 +31,12 @@ def require_sizes(folder: Path, sizes: Mapping[str, tuple[int, int]], stage: str
 
 
 def _size(path: Path) -> tuple[int, int] | None:
-    """Width and height that the header of an image states; None where there is none."""
+    """Width and height that the header of an image states; None where there is none, or the end of a PNG is missing."""
     try:
-        with Image.open(path) as image:
-            return image.size
+        with path.open("rb") as file, Image.open(file) as image:
+            if image.format != "PNG":
+                return image.size
+            file.seek(max(0, path.stat().st_size - PNG_TAIL))
+            return image.size if PNG_END in file.read() else None
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):
         return None

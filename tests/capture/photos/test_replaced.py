@@ -27,10 +27,13 @@ def test_all_are_named_with_what_to_do(tmp_path: Path) -> None:
     photo(tmp_path / "photos", "b.png", 30, 40)
     photo(tmp_path / "masks", "a.png", 80, 60)
     (tmp_path / "photos/c.png").write_bytes(b"no picture")
-    sizes = dict.fromkeys("abcd", (40, 30))
+    photo(tmp_path / "photos", "d.png", 40, 30)
+    (tmp_path / "photos/d.png").write_bytes((tmp_path / "photos/d.png").read_bytes()[:-20])
+    sizes = dict.fromkeys("abcde", (40, 30))
     with pytest.raises(BadInputError) as found:
         require_sizes(tmp_path, sizes, "ingest")
-    listed = "masks/a.png is 80 × 60, not 40 × 30, photos/b.png is 30 × 40, not 40 × 30, photos/c.png cannot be read; give"
+    wrong = "masks/a.png is 80 × 60, not 40 × 30", "photos/b.png is 30 × 40, not 40 × 30"
+    listed = ", ".join((*wrong, "photos/c.png cannot be read", "photos/d.png cannot be read")) + "; give"
     assert listed in str(found.value)
     assert "`gsbake replace ingest --undo`" in str(found.value)
     require_sizes(tmp_path, {"b": (30, 40)}, "ingest")
