@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from gsbake.capture.posed_photos import PosedPhotos
 from gsbake.config.white import PrintedWhite, WhitePatch, parse_white
 from gsbake.errors import BadInputError
+from gsbake.materials.printed_light import MAX_VALUE
 from gsbake.monitor import Monitor
 from gsbake.scale.printed_white import PrintedPatches, find_printed
 from gsbake.scale.triangulation import PickedPhotos, find_entry
@@ -30,8 +31,6 @@ Floats = NDArray[np.float32]
 PATCH_SIZE, PATCH_RAYS = 0.01, 9
 #: Base colour below this cannot be that of a patch of known reflectance: it would multiply noise.
 MIN_BASE_COLOR = 0.01
-#: The brightest 8-bit value that is not clipped.
-MAX_VALUE = 250
 #: Share of the texels whose base colour may exceed 1, and ratio of two patches, from which on a warning is given.
 MAX_CLIPPED, MAX_RATIO = 0.01, 1.15
 
