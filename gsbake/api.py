@@ -132,6 +132,8 @@ class Session:
         named += [("export.front", profile.export.front)] if profile.export.front else []
         if self.project.photos is not None:
             for setting, photo in named:
+                if photo in profile.ingest.leave_out:
+                    raise BadInputError(f"{setting} names the photo '{photo}', which ingest.leave_out leaves out; name another.")
                 require_photo(Path(self.project.photos), photo, setting)
 
     def _publish(self, states: Sequence[StageState]) -> tuple[dict[str, Path], tuple[str, ...]]:

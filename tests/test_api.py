@@ -51,6 +51,8 @@ def test_errors_are_single_sentences(photos: Path) -> None:
         gsbake.run(photos, out="front", settings={"export.front": "d.jpg"})
     with pytest.raises(BadInputError, match=r"bake\.white names the photo 'd\.jpg', which is none of the photos"):
         gsbake.run(photos, out="front", settings={"bake.white": ["a.jpg:1,1", "d.jpg:2,2:0.5"]})
+    with pytest.raises(BadInputError, match=r"bake\.white names the photo 'a\.jpg', which ingest\.leave_out leaves out"):
+        gsbake.run(photos, out="front", settings={"bake.white": ["a.jpg:1,1"], "ingest.leave_out": ["a.jpg"]})
     assert not Path("front").exists()
     with pytest.raises(UsageError, match="The seed must be a whole number from 0"):
         gsbake.run(photos, seed=2**31)

@@ -60,11 +60,15 @@ def source_files(source: Path) -> list[str]:
 
 def require_photo(source: Path, photo: str, what: str) -> None:
     """Raise BadInputError, which says `what` names it, where `photo` is none of the photos of the folder: neither a path, nor a file's
-    name, nor the name that it gets. Frames of a video have names once they are read; a folder that is gone has none to compare with."""
+    name, nor the name that it gets; or where files of several folders have the name. Frames of a video have names once they are read; a
+    folder that is gone has none to compare with."""
     if source.is_dir():
         files = source_files(source)
         if not any(photo in (name, name.rsplit("/", 1)[-1], portable_name(name.rsplit(".", 1)[0].replace("/", "_"))) for name in files):
             raise BadInputError(f"{what} names the photo '{photo}', which is none of the photos ({shortlist(files)}).")
+        alike = [name for name in files if name.rsplit("/", 1)[-1] == photo]
+        if photo not in files and len(alike) > 1:
+            raise BadInputError(f"{what} names the photo '{photo}', which are several ({shortlist(alike)}); name it with its folder.")
 
 
 def reads_subfolders(folder: Path) -> bool:

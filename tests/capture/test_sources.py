@@ -78,6 +78,11 @@ def test_a_photo_that_is_not_there(tmp_path: Path) -> None:
         BadInputError, match=r"export\.front names the photo 'c\.png', which is none of the photos \(b\.png, front/a\.JPG\)"
     ):
         require_photo(tmp_path / "images", "c.png", "export.front")
+    touch(tmp_path / "images/back/a.JPG", tmp_path / "images/back/b.png")
+    with pytest.raises(BadInputError, match=r"'a\.JPG', which are several \(back/a\.JPG, front/a\.JPG\); name it with its folder"):
+        require_photo(tmp_path / "images", "a.JPG", "export.front")
+    for name in ("back/a.JPG", "b.png"):  # the latter is a path
+        require_photo(tmp_path / "images", name, "export.front")
     for absent in (tmp_path / "v.mp4", tmp_path / "moved"):
         require_photo(absent, "c.png", "export.front")
 
