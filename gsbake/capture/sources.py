@@ -66,9 +66,9 @@ def require_photo(source: Path, photo: str, what: str) -> None:
         files = source_files(source)
         if not any(photo in (name, name.rsplit("/", 1)[-1], portable_name(name.rsplit(".", 1)[0].replace("/", "_"))) for name in files):
             raise BadInputError(f"{what} names the photo '{photo}', which is none of the photos ({shortlist(files)}).")
-        alike = [name for name in files if name.rsplit("/", 1)[-1] == photo]
-        if photo not in files and len(alike) > 1:
-            raise BadInputError(f"{what} names the photo '{photo}', which are several ({shortlist(alike)}); name it with its folder.")
+        same = [name for name in files if name.rsplit("/", 1)[-1] == photo]
+        if photo not in files and len(same) > 1:
+            raise BadInputError(f"{what} names the photo '{photo}', which are several ({shortlist(same)}); name it with its folder.")
 
 
 def reads_subfolders(folder: Path) -> bool:
