@@ -23,7 +23,7 @@ import OpenImageIO as oiio
 from numpy.typing import NDArray
 from scipy import stats
 
-from gsbake.materials.visibility import LUMINANCE
+from gsbake.imaging.srgb import LUMINANCE
 
 #: File names of environment maps.
 PATTERNS = ("*.exr", "*.hdr", "*.exr.js")

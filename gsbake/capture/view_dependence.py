@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from gsbake.geometry.cameras import Array, Camera
 from gsbake.imaging.sampling import bilinear_at_pixels
-from gsbake.imaging.srgb import decode_bytes
+from gsbake.imaging.srgb import LUMINANCE, decode_bytes
 
 #: A point is view-dependent when this quantile of its brightness exceeds the median by this share.
 BRIGHTENING_THRESHOLD, BRIGHT_QUANTILE = 0.15, 0.95
@@ -31,7 +31,6 @@ MIN_VIEWS = 4
 MIN_CODE = 12
 #: Standard deviation of the Gaussian blur before comparison, in pixels: about the accuracy of poses.
 BLUR_SIGMA = 1.0
-_LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)
 _MEDIAN_ITERATIONS = 10
 
 
@@ -80,7 +79,7 @@ class SurfaceBrightness:
 
 def sample_luminance(linear: NDArray[np.float32], pixel: Array, blur_sigma: float) -> NDArray[np.float64]:
     """Luminance (n,) of a linear image (h, w, 3) at pixel positions (n, 2), after a Gaussian blur of `blur_sigma` pixels."""
-    smooth = cv2.GaussianBlur(linear @ _LUMINANCE, (0, 0), blur_sigma)
+    smooth = cv2.GaussianBlur(linear @ LUMINANCE, (0, 0), blur_sigma)
     return bilinear_at_pixels(smooth, *(pixel.T - 0.5)).astype(np.float64)
 
 

@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 #: SLOPE · linear up to LINEAR_THRESHOLD (SRGB_THRESHOLD in sRGB), SCALE · linear^(1 / GAMMA) − OFFSET above.
 LINEAR_THRESHOLD, SRGB_THRESHOLD, SLOPE = 0.0031308, 0.04045, 12.92
 SCALE, OFFSET, GAMMA = 1.055, 0.055, 2.4
+#: Weights of the linear channels in the luminance (ITU-R BT.709).
+LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)
 
 
 def _decoded(value: NDArray[Any]) -> NDArray[Any]:

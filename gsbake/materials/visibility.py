@@ -30,6 +30,7 @@ from scipy.spatial.transform import Rotation
 
 from gsbake.geometry.raycast import RayCaster
 from gsbake.geometry.vectors import unit
+from gsbake.imaging.srgb import LUMINANCE
 from gsbake.kernels.declaration import kernel
 from gsbake.shading import cubemap
 from gsbake.texturing.ambient_occlusion import smooth_over_surface
@@ -41,8 +42,6 @@ Floats = NDArray[np.float32]
 PATTERN_SIZE = 4
 #: Rotated copies of the directions.
 ROTATIONS = PATTERN_SIZE * PATTERN_SIZE
-#: Luminance of linear sRGB (ITU-R BT.709).
-LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)
 #: Diffuse bounces of indirect light.
 BOUNCES = 2
 

@@ -70,8 +70,6 @@ def _run(
 ) -> dict[str, Any]:
     """See `run_stereo`."""
     posed, size = photos.posed, photos.size_of(options.max_size, options.min_scale)
-    if size > options.max_size:
-        monitor.decide("stereo size", f"{size} pixels", f"originals are larger; {1e-6 * _pixels(photos, size):.0f} megapixels together")
 
     def report(done: int, text: str) -> None:
         monitor.check_stop()
@@ -82,6 +80,9 @@ def _run(
         run = StereoRun(photos, size, options, hull, seed, threads, scratch / "planes", report)
         with monitor.part("photos"):
             run.prepare()
+        if size > options.max_size:
+            together = 1e-6 * sum(camera.width * camera.height for camera in run.cameras)
+            monitor.decide("stereo size", f"{size} pixels", f"originals are larger; {together:.0f} megapixels together")
         with monitor.part("matching"):
             run.match()
         with monitor.part("consistency"):
@@ -101,11 +102,6 @@ def _run(
         one.save(out / "depth" / f"{one.camera.name}.npz")
     cloud.save(out / "points.ply")
     return _figures(run, maps, cloud, options, monitor)
-
-
-def _pixels(photos: FullPhotos, size: int) -> int:
-    """Pixels of all photos together with the longer side at most `size`."""
-    return sum(camera.width * camera.height for camera in (photos.camera(index, size) for index in range(len(photos))))
 
 
 def _skip_reason(posed: PosedPhotos, options: Stereo) -> str | None:

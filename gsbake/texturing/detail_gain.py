@@ -17,6 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from gsbake.imaging.srgb import LUMINANCE
 from gsbake.texturing.projection import ProjectionBlender
 from gsbake.texturing.texels import Texels
 from gsbake.texturing.view_fusion import SHARPNESS
@@ -34,8 +35,6 @@ PATCH, MARGIN, PATCHES = 32, 8, 600
 MIN_VIEWS, MIN_WEIGHT = 3, 0.05
 #: Fewer patches are no evidence; largest gain; largest factor of a texel's coded luminance, which counts as at least `DARKEST`.
 MIN_PATCHES, MAX_GAIN, MAX_FACTOR, DARKEST = 20, 1.5, 2.5, np.float32(0.02)
-#: Luminance of linear RGB.
-LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)
 
 
 @dataclass

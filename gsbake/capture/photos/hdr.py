@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gsbake.imaging.srgb import encode_bytes
+from gsbake.imaging.srgb import LUMINANCE, encode_bytes
 
 Floats = NDArray[np.float32]
 
@@ -33,7 +33,6 @@ _FROM_P3 = np.array([[1.224940, -0.224940, 0.0], [-0.042057, 1.042057, 0.0], [-0
 _TO_SRGB = {1: _SRGB, 12: _FROM_P3}
 #: Power of BT.1886, and of HLG's OOTF for a screen of 1000 cd/m².
 _BT1886, _OOTF = 2.4, 1.2
-_LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)
 
 
 def _pq(signal: NDArray[Any]) -> NDArray[Any]:
@@ -67,6 +66,6 @@ def frame_to_srgb(decoded: NDArray[np.uint8], transfer: int) -> NDArray[np.uint8
     """The frame (h, w, 3) in 8-bit sRGB that OpenCV decoded from a video with a transfer of TRANSFERS."""
     light = ((np.arange(256) / 255) ** _BT1886).astype(np.float32)[decoded]
     if TRANSFERS[transfer] == "HLG":
-        luminance = light @ _LUMINANCE
+        luminance = light @ LUMINANCE
         light *= np.maximum(luminance, 1e-6)[..., None] ** np.float32(1 / _OOTF - 1)
     return encode_bytes(light)

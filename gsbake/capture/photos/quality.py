@@ -14,13 +14,12 @@ from numpy.typing import NDArray
 
 from gsbake.capture.photos.decode import Bytes
 from gsbake.capture.photos.sharpness import halving_loss
-from gsbake.imaging.srgb import decode_bytes
+from gsbake.imaging.srgb import LUMINANCE, decode_bytes
 
 #: Root mean square difference of thumbnails (32x32 grey levels of 255) below which photos are near-duplicates.
 DUPLICATE_RMS = 1.0
 _THUMBNAIL_SIZE = 32
 _BLUR_LENGTH = 9
-_LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)
 
 
 @dataclass(frozen=True)
@@ -56,7 +55,7 @@ def measure_quality(rgb: Bytes, mask: Bytes | None) -> Quality:
     inside = mask if mask is not None and (mask > 127).any() else None
     grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
     small = cv2.resize(rgb, (256, 256), interpolation=cv2.INTER_AREA)
-    luminance = decode_bytes(np.asarray(small, np.uint8)) @ _LUMINANCE
+    luminance = decode_bytes(np.asarray(small, np.uint8)) @ LUMINANCE
     stops = np.log2(np.maximum(luminance, 1e-4))
     if inside is not None:
         share = cv2.resize(inside, (256, 256), interpolation=cv2.INTER_AREA) > 127

@@ -16,7 +16,7 @@ PNG_END, PNG_TAIL = b"IEND\xaeB`\x82", 1024
 
 def require_sizes(folder: Path, sizes: Mapping[str, tuple[int, int]], stage: str) -> None:
     """Raise BadInputError, which lists them, where photos and masks in the artifact folder of a `stage` cannot be read or have other sizes
-    in pixels than {name: (width, height)}. Only headers are read; files that are not there are not looked at."""
+    in pixels than {name: (width, height)}. Only headers and the ends of files are read; files that are not there are not looked at."""
     wrong = []
     for name, size in sizes.items():
         for path in (folder / sub / f"{name}.png" for sub in ("photos", "masks")):
