@@ -1,9 +1,9 @@
 """Structure from motion with COLMAP (Schönberger, Frahm, *Structure-from-Motion Revisited*, CVPR 2016) on one database.
 
-Steps: SIFT features, pair selection, matching (`sfm.matching`), verification of matches by two-view geometry, mapping in two passes. The
-first pass uses strict thresholds; photos that it does not register are matched with all others and registered to its model under relaxed
-thresholds. Where photos are still missing, models that mapping left apart are merged (`sfm.merging`). Runs in the process of `sfm.worker`.
-The same photos and seed give the same bytes with any number of threads.
+Steps: SIFT features (`sfm.features`), pair selection, matching (`sfm.matching`), verification of matches by two-view geometry, mapping in
+two passes. The first pass uses strict thresholds; photos that it does not register are matched with all others and registered to its model
+under relaxed thresholds. Where photos are still missing, models that mapping left apart are merged (`sfm.merging`). Runs in the process of
+`sfm.worker`. The same photos and seed give the same bytes with any number of threads.
 """
 
 from __future__ import annotations
@@ -23,7 +23,8 @@ from numpy.typing import NDArray
 
 from gsbake.capture.colmap import pycolmap, repeatable_mapping
 from gsbake.capture.sfm import pairs as pairing
-from gsbake.capture.sfm.feature_cache import Descriptors, FeatureCache, Keypoints, photo_key
+from gsbake.capture.sfm.feature_cache import FeatureCache
+from gsbake.capture.sfm.features import FeatureDetection, FeatureOptions, image_of
 from gsbake.capture.sfm.mapping_gain import FIRST_PHOTOS, MappingGain
 from gsbake.capture.sfm.matching import Matches, match_pairs
 from gsbake.capture.sfm.merging import merge_all, new_photos
@@ -35,8 +36,8 @@ Tick = Callable[[str, int, int], None]
 RELAXED_MIN_INLIERS, RELAXED_MIN_INLIER_RATIO = 15, 0.15
 #: Largest features per photo in the ranking of pairs.
 RANKING_FEATURES = 256
-#: Median features per photo from which the finest octave is skipped, and the share of unregistered photos above which it is added again.
-ENOUGH_FEATURES, MAX_UNREGISTERED_SHARE = 1500, 0.05
+#: Share of unregistered photos above which the finest octave of features is added.
+MAX_UNREGISTERED_SHARE = 0.05
 #: Pixels by which the features of a match must differ in photos of a camera that stood.
 MIN_MOTION = 1.5
 #: Photos whose descriptors are kept in memory while pairs are matched, about 1 MB each.
@@ -54,24 +55,12 @@ class Lens:
 
 
 @dataclass
-class FeatureOptions:
-    """Settings of feature detection: features per photo, SIFT's peak threshold, longer side in pixels, and whether the finest octave
-    (photos enlarged twice) is used: True, False or "auto"."""
-
-    max_features: int
-    peak_threshold: float
-    max_size: int
-    fine: bool | str
-
-
-@dataclass
 class SfmPipeline:
     """One SfM run: photos `folder/<name>.png`, masks `mask_folder/<name>.png.png`, database and models in `work`.
 
     `cache` keeps features and matches beyond the run. `one_camera` are pairs of photos of a camera that stood while the object turned: what
-    stands in them is not the object. `seconds` holds the time of each part, `upsampled` whether the features include the
-    finest octave, `detected` the photos whose features, `matched` and `verified` the number of pairs whose matches and geometry were
-    computed, `steps` what was tried in turn and how many photos the best model had after it.
+    stands in them is not the object. `seconds` holds the time of each part, `matched` and `verified` the number of pairs whose matches and
+    geometry were computed, `steps` what was tried in turn and how many photos the best model had after it.
     """
 
     folder: Path
@@ -85,13 +74,14 @@ class SfmPipeline:
     cache: FeatureCache = field(default_factory=lambda: FeatureCache(None))
     one_camera: Set[frozenset[str]] = frozenset()
     seconds: dict[str, float] = field(default_factory=dict)
-    upsampled: bool = False
-    detected: set[str] = field(default_factory=set)
     matched: int = 0
     verified: int = 0
     steps: list[tuple[str, int]] = field(default_factory=list)
-    _known_keys: dict[bool, dict[str, str]] = field(default_factory=dict)
+    detection: FeatureDetection = field(init=False)
     _models: list[Any] = field(default_factory=list)  # all that incremental mapping found
+
+    def __post_init__(self) -> None:
+        self.detection = FeatureDetection(self.folder, self.mask_folder, self.options, self.threads, self.cache)
 
     @property
     def database(self) -> Path:
@@ -113,76 +103,6 @@ class SfmPipeline:
         finally:
             self.seconds[part] = self.seconds.get(part, 0.0) + time.perf_counter() - start
 
-    def _extraction(self) -> Any:
-        options = pycolmap.FeatureExtractionOptions()
-        options.num_threads = self.threads
-        options.use_gpu = False
-        options.max_image_size = self.options.max_size
-        options.sift.max_num_features = self.options.max_features
-        options.sift.peak_threshold = self.options.peak_threshold
-        options.sift.first_octave = -1 if self.upsampled else 0
-        return options
-
-    def _needs_fine(self) -> bool:
-        """Whether the finest octave is needed, measured by the features of three photos."""
-        names = self.names
-        sample = [names[i] for i in sorted({0, len(names) // 2, len(names) - 1})]
-        self.upsampled = False
-        probe = self.work / "probe.db"
-        pycolmap.Database.open(str(probe)).close()
-        self._detect(probe, sample, pycolmap.CameraMode.PER_IMAGE)
-        with closing(pycolmap.Database.open(str(probe))) as base:
-            counts = [base.num_keypoints_for_image(image.image_id) for image in base.read_all_images()]
-        return not counts or float(np.median(counts)) < min(ENOUGH_FEATURES, 0.5 * self.options.max_features)
-
-    def _keys(self, names: Sequence[str]) -> dict[str, str]:
-        """Keys of the features of photos by their names; each photo is read once."""
-        o = self.options
-        detection = {
-            "pycolmap": pycolmap.__version__, "size": o.max_size, "count": o.max_features, "peak": o.peak_threshold, "fine": self.upsampled,
-        }  # fmt: skip
-        known = self._known_keys.setdefault(self.upsampled, {})
-        for name in (name for name in names if name not in known):
-            mask = None if self.mask_folder is None else self.mask_folder / f"{name}.png.png"
-            known[name] = photo_key(self.folder / f"{name}.png", mask, detection)
-        return {name: known[name] for name in names}
-
-    def _detect(self, database: Path, names: Sequence[str], mode: Any) -> None:
-        """Write the features of photos, which share a lens, into a database: kept ones, and those of the other photos."""
-        keys, files = self._keys(names), {name: f"{name}.png" for name in names}
-        # Photos get their identifiers in this order; extraction would number them as its threads finish, and everything after it depends
-        # on the numbers.
-        pycolmap.import_images(str(database), str(self.folder), mode, list(files.values()), self._reader())
-        with closing(pycolmap.Database.open(str(database))) as base:
-            absent = [name for name in names if not self._write_features(base, name, self.cache.features(keys[name]))]
-        if not absent:
-            return
-        self.detected.update(absent)
-        pycolmap.extract_features(
-            str(database), str(self.folder), [files[name] for name in absent], mode, self._reader(), self._extraction(), pycolmap.Device.cpu
-        )
-        with closing(pycolmap.Database.open(str(database))) as base:
-            for name in absent:
-                image = _image(base, name).image_id
-                self.cache.keep_features(keys[name], np.asarray(base.read_keypoints(image)), np.asarray(base.read_descriptors(image).data))
-
-    @staticmethod
-    def _write_features(base: Any, name: str, found: tuple[Keypoints, Descriptors] | None) -> bool:
-        """Write kept features of a photo; returns whether there are any."""
-        if found is None:
-            return False
-        image, (keypoints, descriptors) = _image(base, name).image_id, found
-        base.write_keypoints(image, keypoints)
-        base.write_descriptors(image, pycolmap.FeatureDescriptors(pycolmap.FeatureExtractorType.SIFT, descriptors))
-        return True
-
-    def _reader(self) -> Any:
-        reader = pycolmap.ImageReaderOptions()
-        reader.camera_model = "SIMPLE_RADIAL"
-        if self.mask_folder is not None:
-            reader.mask_path = str(self.mask_folder)
-        return reader
-
     def features(self) -> None:
         """Detect SIFT features in all photos and store them in the database, from which an interrupted run resumes.
 
@@ -191,22 +111,22 @@ class SfmPipeline:
         """
         marker = self.work / "features.done"
         if marker.exists():
-            self.upsampled = marker.read_text(encoding="utf-8") == "fine"
+            self.detection.upsampled = marker.read_text(encoding="utf-8") == "fine"
             return
         self._clear()
         with self._timed("features", len(self.names)):
-            self.upsampled = self._needs_fine() if self.options.fine == "auto" else bool(self.options.fine)
+            self.detection.choose_octave(self.work / "probe.db", self.names)
             pycolmap.Database.open(str(self.database)).close()
             for lens in self.lenses:
-                self._detect(self.database, lens.names, pycolmap.CameraMode.SINGLE)
+                self.detection.detect(self.database, lens.names, pycolmap.CameraMode.SINGLE)
         with closing(pycolmap.Database.open(str(self.database))) as base:
             for lens in self.lenses:
-                camera = base.read_camera(_image(base, lens.names[0]).camera_id)
+                camera = base.read_camera(image_of(base, lens.names[0]).camera_id)
                 if lens.focal is not None:
                     camera.params = [lens.focal, *list(camera.params)[1:]]
                     camera.has_prior_focal_length = True
                     base.update_camera(camera)
-        marker.write_bytes(b"fine" if self.upsampled else b"coarse")
+        marker.write_bytes(b"fine" if self.detection.upsampled else b"coarse")
 
     def _clear(self) -> None:
         for path in self.work.glob("*"):
@@ -221,7 +141,7 @@ class SfmPipeline:
             features = []
             with closing(pycolmap.Database.open(str(self.database))) as base:
                 for name in self.names:
-                    image = _image(base, name)
+                    image = image_of(base, name)
                     points = np.asarray(base.read_keypoints(image.image_id))
                     descriptors = np.asarray(base.read_descriptors(image.image_id).data)
                     # Keypoints are x, y and the affine shape a11 a12 a21 a22, whose determinant is the scale squared.
@@ -241,7 +161,7 @@ class SfmPipeline:
         names = self.names
         with self._timed("matching", len(pairs)), closing(pycolmap.Database.open(str(self.database))) as base:
             ids = {image.name.rsplit(".", 1)[0]: image.image_id for image in base.read_all_images()}
-            key = {ids[name]: key for name, key in self._keys(names).items()}
+            key = {ids[name]: key for name, key in self.detection.keys(names).items()}
             numbered, missing = [(ids[names[i]], ids[names[j]]) for i, j in pairs], []
             standing = {pair for pair, (i, j) in zip(numbered, pairs, strict=True) if frozenset((names[i], names[j])) in self.one_camera}
 
@@ -368,7 +288,7 @@ class SfmPipeline:
         """
         model = self._solve(kind, mapper, None)
         poor = len(self.missing(model)) > MAX_UNREGISTERED_SHARE * len(self.names)
-        if poor and mapper != "trial" and self.options.fine == "auto" and not self.upsampled:
+        if poor and mapper != "trial" and self.options.fine == "auto" and not self.detection.upsampled:
             self._clear()
             self.options.fine = True
             model = self._solve(kind, mapper, model)
@@ -379,7 +299,7 @@ class SfmPipeline:
 
         def tried(step: str, found: Any | None) -> Any | None:
             best = largest([m for m in (model, found) if m is not None])
-            self.steps.append((f"{step}, finest octave of features" if self.upsampled else step, len(registered_names(best))))
+            self.steps.append((f"{step}, finest octave of features" if self.detection.upsampled else step, len(registered_names(best))))
             return best
 
         self._models.clear()  # features of one kind have numbers of their own
@@ -405,14 +325,6 @@ class SfmPipeline:
             if others := self._models_beside(model):
                 model = tried("merging of models", self._merged(model, others))
         return model
-
-
-def _image(base: Any, name: str) -> Any:
-    """The database entry of a photo; raises KeyError when the photo has none."""
-    image = base.read_image_with_name(f"{name}.png")
-    if image is None:
-        raise KeyError(f"the COLMAP database has no entry of photo {name}")
-    return image
 
 
 def registered_names(model: Any | None) -> set[str]:

@@ -24,9 +24,7 @@ from gsbake.capture.sfm.pairs import Pair
 _MATRICES = ("E", "F", "H")
 
 
-def verify(
-    database: Path, pairs: Sequence[Pair], reduced: Set[Pair], keys: Mapping[int, str], cache: FeatureCache, seed: int
-) -> int:
+def verify(database: Path, pairs: Sequence[Pair], reduced: Set[Pair], keys: Mapping[int, str], cache: FeatureCache, seed: int) -> int:
     """Write the two-view geometry of `pairs` of photo identifiers that have matches and no geometry yet; returns how many were computed.
 
     `keys` are those of the photos' features; of `reduced` pairs matches were left out. Runs with all processor cores; results do not depend

@@ -25,8 +25,9 @@ from gsbake.capture.poses.colmap_model import camera_of, cloud
 from gsbake.capture.poses.up_axis import up_direction, upright_rotation
 from gsbake.capture.sfm.epipolar import epipolar_error
 from gsbake.capture.sfm.feature_cache import FeatureCache
+from gsbake.capture.sfm.features import FeatureOptions
 from gsbake.capture.sfm.pairs import exhaustive, neighbouring_views
-from gsbake.capture.sfm.reconstruction import FeatureOptions, Lens, SfmPipeline, registered_names
+from gsbake.capture.sfm.reconstruction import Lens, SfmPipeline, registered_names
 from gsbake.capture.sfm.refined_adjustment import adjust_refined
 from gsbake.errors import InterruptedRun
 from gsbake.geometry.cameras import Camera, CameraSet
@@ -80,7 +81,7 @@ def _write(model: Any, out: Path, pipeline: SfmPipeline, solved: bool) -> dict[s
     return {
         "registered": len(registered),
         "points": len(points),
-        "fine_features": pipeline.upsampled,
+        "fine_features": pipeline.detection.upsampled,
         "reprojection_px": float(model.compute_mean_reprojection_error()) if len(points) else None,
         "track_length": float(model.compute_mean_track_length()) if len(points) else None,
         "missing": [name for name in pipeline.names if name not in registered_names(model)],
@@ -101,7 +102,7 @@ def solve(job: Mapping[str, Any]) -> dict[str, Any]:
         model, refinement = adjusted.model, adjusted.figures
         pipeline.seconds["refinement"] = refinement.pop("seconds")
     model.extract_colors_for_all_images(str(pipeline.folder))
-    counts = {"detected": len(pipeline.detected), "matched": pipeline.matched, "verified": pipeline.verified}
+    counts = {"detected": len(pipeline.detection.detected), "matched": pipeline.matched, "verified": pipeline.verified}
     figures = counts | {"steps": pipeline.steps, "seconds": pipeline.seconds, "refinement": refinement}
     return _write(model, out, pipeline, True) | figures
 

@@ -108,9 +108,7 @@ def test_contradicted_solution_is_tried_again(
 
 
 @pytest.mark.parametrize(("kind", "advice"), [("mask", "correct masks of the object"), (None, "give masks of the object")])
-def test_an_impossible_lens_is_explained_by_movement(
-    kind: str | None, advice: str, tmp_path: Path, answers: Callable[..., Jobs]
-) -> None:
+def test_an_impossible_lens_is_explained_by_movement(kind: str | None, advice: str, tmp_path: Path, answers: Callable[..., Jobs]) -> None:
     """Cameras that tie a moving object to its surroundings end in a distortion that no lens has; the message is about the photos."""
     warped = [replace(c, distortion=(1.9, 0.0, 0.0, 0.0)) for c in ring()]
     entries = write_capture(tmp_path / "ingest", ring(), kind or "mask")

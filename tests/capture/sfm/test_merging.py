@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 from gsbake.capture.colmap import pycolmap
+from gsbake.capture.sfm.features import FeatureOptions
 from gsbake.capture.sfm.merging import common_points, merge, merge_all
-from gsbake.capture.sfm.reconstruction import FeatureOptions, Lens, SfmPipeline, largest
+from gsbake.capture.sfm.reconstruction import Lens, SfmPipeline, largest
 
 PHOTOS, POINTS = 10, 150
 
