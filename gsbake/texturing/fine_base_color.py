@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsbake.capture.full_photos import FullPhotos
+from gsbake.imaging.srgb import decode_bytes, encode_bytes
 from gsbake.monitor import Monitor
 from gsbake.texturing.detail_gain import PATCHES, DetailEnergy, detail_factor
 from gsbake.texturing.inpainting import fill_empty_texels
@@ -44,6 +45,8 @@ def fine_base_color(
 ) -> Floats:
     """Linear base colour (size, size, 3) with the detail of the photos, whose exposure `gains` (views, 3) are divided out.
 
+    Of the values that 8-bit sRGB has, which is what assets hold: with more digits the file would be twice to three times as large.
+
     `coarse` (s, s, 3) is the finished one of the texture of `surface`, without empty texels; `size` is s times a power of two. `smooth`: it
     differs from the photos' colours by what varies slowly, as shading does, and not from texel to texel, as materials may.
     """
@@ -54,7 +57,8 @@ def fine_base_color(
     for channel in range(3):
         monitor.check_stop()
         colour = projected[..., channel].astype(np.float32) * sharpened
-        out[..., channel] = _refined(np.ascontiguousarray(coarse[..., channel]), colour, observed, smooth)
+        refined = _refined(np.ascontiguousarray(coarse[..., channel]), colour, observed, smooth)
+        out[..., channel] = decode_bytes(encode_bytes(refined))
     return out
 
 
