@@ -86,7 +86,7 @@ class DepthMap:
 
         Both are rounded to what matching determines, a depth to 3e-5 of itself: nearly half of the bytes would be noise.
         """
-        confidence = np.maximum(np.rint(_CONFIDENCE_STEPS * self.confidence), 1) / np.float32(_CONFIDENCE_STEPS)
+        confidence = np.asarray(np.maximum(np.rint(_CONFIDENCE_STEPS * self.confidence), 1) / _CONFIDENCE_STEPS, np.float32)
         images: dict[str, NDArray[Any]] = {"depth": rounded(self.depth()), "confidence": self._image(confidence).astype(np.float16)}
         with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
             for name, values in images.items():
