@@ -123,9 +123,9 @@ def test_bands_of_rows_give_the_same_colour(surface: UnwrappedMesh, monkeypatch:
 
 def test_memory_grows_with_the_texture_but_not_beyond_a_band(surface: UnwrappedMesh, monkeypatch: pytest.MonkeyPatch) -> None:
     fill = len(surface.texels) / COARSE**2
-    assert module.needed_bytes(surface, 256) == pytest.approx(256**2 * (22 + 170 * fill), rel=1e-3)
+    assert module.needed_bytes(surface, 256) == pytest.approx(256**2 * (26 + 170 * fill), rel=1e-3)
     monkeypatch.setattr(module, "BAND_TEXELS", 1000)
-    assert module.needed_bytes(surface, 256) == 256**2 * 22 + 1000 * 170
+    assert module.needed_bytes(surface, 256) == 256**2 * 26 + 1000 * 170
 
 
 def test_rows_of_a_texture_are_those_of_the_whole(surface: UnwrappedMesh) -> None:
