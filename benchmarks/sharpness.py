@@ -1,10 +1,15 @@
 """How sharp textures are beside photos that made no part of them, and how sharp one photo alone would be on the same mesh.
 
-python -m benchmarks.sharpness OUT [--only axe_full,fox] [--profile preview] [--captures DIR] [--scorer DIR] [--csv FILE]
+python -m benchmarks.sharpness OUT [--only axe_full,printed] [--profile preview] [--set section.key=value ...] [--captures DIR]
+    [--scorer DIR] [--csv FILE]
 
-Each capture is baked with `train.holdout=4` into OUT/NAME and scored at 1200 and 2592 pixels on its test photos, at full size and
-undistorted, by `sharpness.py` of the scorer, whose environment `make score` installs. The ceiling is the same mesh with the nearest other
-photo laid on it, one asset per test photo; what that photo does not see keeps the baked colour. Seconds are those of the whole command.
+Each capture is baked with `train.holdout=4` into OUT/runs and scored at 1200 and 2592 pixels (at their own size where photos are smaller)
+on its test photos, at full size and undistorted, by `sharpness.py` of the scorer, whose environment `make score` installs. The ceiling is
+the same mesh with the nearest other photo laid on it, one asset per test photo; what that photo does not see keeps the baked colour.
+Seconds are those of the whole command.
+
+The objects of `objects/fine_render.py` are rendered into OUT/captures. Their base colour is known, and scored too: it stands in place of
+the test photos.
 """
 
 from __future__ import annotations
@@ -20,10 +25,12 @@ from statistics import median
 from typing import Any
 
 import numpy as np
+from PIL import Image
 
 from benchmarks.ceiling import finished_folders
 from benchmarks.csv_rows import current_commit, read_rows, today, write_rows
 from benchmarks.objects.__main__ import PYTHON, SCORER, bake
+from benchmarks.objects.fine_render import FINE_MODELS, render_fine
 from benchmarks.timeline import ROOT
 from gsbake.capture.full_photos import FullPhotos
 from gsbake.capture.photos.roles import test_photos
@@ -38,19 +45,21 @@ from gsbake.texturing.projection import ProjectionBlender, mask_weights
 from gsbake.texturing.texels import rasterise
 
 RESULTS = ROOT / "benchmarks" / "results" / "sharpness.csv"
-CAPTURES = ("axe_full", "flowerpot", "mary_rose", "skull", "fox")
+CAPTURES = ("axe_full", "flowerpot", "mary_rose", "skull", "fox", *FINE_MODELS)
 SIZES, HOLDOUT = (1200, 2592), 4
 FIGURES = ("psnr", "detail", "fine_1", "fine_2", "fine_4", "aligned_1", "aligned_2", "aligned_4", "shift")
 
 
 @dataclass(frozen=True)
 class Row:
-    """Medians over the test photos of a capture at one size, of the baked asset or of its `ceiling`; seconds of the run, peak memory of its
-    stages and the disk that the run takes, in MB."""
+    """Medians over the test photos of a capture at one size, of the baked asset or of its `ceiling`, beside the photos or the `truth`;
+    seconds of the run, peak memory of its stages and the disk that the run and the photos take, in MB."""
 
     capture: str
     profile: str
+    settings: str
     texture: str
+    beside: str
     size: int
     photos: int
     psnr: float
@@ -66,13 +75,14 @@ class Row:
     stages: str
     peak_mb: float
     disk_mb: float
+    photos_mb: float
     commit: str = field(default_factory=current_commit)
     date: str = field(default_factory=today)
 
     @property
     def key(self) -> tuple[str, ...]:
         """Rows of one key replace each other."""
-        return self.capture, self.profile, self.texture, str(self.size), self.commit
+        return self.capture, self.profile, self.settings, self.texture, self.beside, str(self.size), self.commit
 
 
 def full_cameras(cameras: Path, photos: FullPhotos, out: Path) -> Path:
@@ -138,35 +148,53 @@ def nearest_photo(photos: FullPhotos, index: int) -> int:
     return int(distance.argmin())
 
 
-def measure(capture: Path, profile: str, out: Path, scorer: Path) -> list[Row]:
-    """The rows of one capture."""
-    seconds = bake(capture, out, argparse.Namespace(profile=profile, seed=0, settings=[f"train.holdout={HOLDOUT}"]))
+def true_colours(capture: Path, cameras: Path) -> Path:
+    """The cameras of `cameras` with the true base colour of `capture` as photos, and its alpha as masks; a file like it."""
+    out = cameras.parent / "truth"
+    for frame in json.loads(cameras.read_text(encoding="utf-8"))["frames"]:
+        rgba = np.asarray(Image.open(capture / "gt" / "base_color" / frame["file_path"]))
+        for kind, pixels in (("photos", rgba[..., :3]), ("masks", rgba[..., 3])):
+            (out / kind).mkdir(parents=True, exist_ok=True)
+            write_png(out / kind / frame["file_path"], pixels)
+    return Path(shutil.copy(cameras, out / "cameras.json"))
+
+
+def measure(capture: Path, out: Path, arguments: argparse.Namespace, rendered: bool) -> list[Row]:
+    """The rows of one capture, baked into `out`; of one that was `rendered` the true base colour is known."""
+    settings = [f"train.holdout={HOLDOUT}", *arguments.settings]
+    seconds = bake(capture, out, argparse.Namespace(profile=arguments.profile, seed=0, settings=settings))
     manifests = [json.loads(path.read_text(encoding="utf-8")) for path in sorted(out.glob("stages/*/*/manifest.json"))]
     stages = " ".join(f"{stage['stage']}={stage['seconds']:.0f}" for stage in manifests)
-    peak, disk = (1e-6 * total for total in (max(stage["peak_bytes"] for stage in manifests), sum(f.stat().st_size for f in _files(out))))
+    peak, disk = (1e-6 * total for total in (max(stage["peak_bytes"] for stage in manifests), _size(out)))
+    taken = next(capture / name for name in ("photos", "images") if (capture / name).is_dir())
     folders, beside, rows = finished_folders(out), out.parent / f"{out.name}-sharpness", []
     with FullPhotos(folders["ingest"], folders["poses"], folders["refine"]) as photos:
         cameras = full_cameras(out / "cameras.json", photos, beside)
         names = {index: photos.posed.cameras.cameras[index].name for index in test_photos(len(photos), HOLDOUT)}
         laid = {name: lay_photo(folders, photos, nearest_photo(photos, index), beside / name) for index, name in names.items()}
-    for size in SIZES:
-        own = score(out / "asset.glb", cameras, size, scorer)
+        longest = max(max(photos.camera(index).width, photos.camera(index).height) for index in names)
+    truth = true_colours(capture, cameras) if rendered else None
+    for size in sorted({min(size, longest) for size in SIZES}):
         ceiling: dict[str, dict[str, float]] = {}
         for name, asset in laid.items():
-            ceiling |= score(asset, cameras, size, scorer, [name])
-        for texture, found in (("baked", own), ("ceiling", ceiling)):
+            ceiling |= score(asset, cameras, size, arguments.scorer, [name])
+        scored = [("baked", "photos", score(out / "asset.glb", cameras, size, arguments.scorer)), ("ceiling", "photos", ceiling)]
+        if truth is not None:
+            scored.append(("baked", "truth", score(out / "asset.glb", truth, size, arguments.scorer)))
+        for texture, against, found in scored:
             figures: dict[str, Any] = {name: round(median(one[name] for one in found.values()), 3) for name in FIGURES}
             rows.append(
                 Row(
-                    capture.name, profile, texture, size, len(found), **figures, seconds=seconds, stages=stages, peak_mb=round(peak, 1),
-                    disk_mb=round(disk, 1),
+                    capture.name, arguments.profile, " ".join(arguments.settings), texture, against, size, len(found), **figures,
+                    seconds=seconds, stages=stages, peak_mb=round(peak, 1), disk_mb=round(disk, 1),
+                    photos_mb=round(1e-6 * _size(taken), 1),
                 )
             )  # fmt: skip
     return rows
 
 
-def _files(folder: Path) -> list[Path]:
-    return [path for path in folder.rglob("*") if path.is_file()]
+def _size(folder: Path) -> int:
+    return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -175,13 +203,16 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("out", type=Path)
     parser.add_argument("--only", type=lambda text: text.split(","), metavar="NAME,…", default=CAPTURES)
     parser.add_argument("--profile", default="preview")
+    parser.add_argument("--set", action="append", default=[], dest="settings", metavar="KEY=VALUE")
     parser.add_argument("--captures", type=Path, default=ROOT.parent / "shared" / "captures")
     parser.add_argument("--scorer", type=Path, default=SCORER)
     parser.add_argument("--csv", type=Path, default=RESULTS)
     options = parser.parse_args(arguments)
-    options.out.mkdir(parents=True, exist_ok=True)
     for name in options.only:
-        rows = measure(options.captures / name, options.profile, options.out / name, options.scorer)
+        capture = render_fine(name, options.out / "captures") if name in FINE_MODELS else options.captures / name
+        run = options.out / "runs" / "-".join([options.profile, *sorted(options.settings)]) / name
+        run.parent.mkdir(parents=True, exist_ok=True)
+        rows = measure(capture, run, options, name in FINE_MODELS)
         write_rows(options.csv, [*read_rows(options.csv, Row), *rows])
         for row in rows:
             print(row, flush=True)

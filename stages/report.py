@@ -17,7 +17,7 @@ def run(ctx: Context) -> dict[str, Any]:
 
 STAGE = Stage(
     name="report",
-    version=12,
+    version=13,
     title="Report",
     run=run,
     summary="{psnr:dB} and SSIM {ssim} over {compared} photos",

@@ -27,7 +27,7 @@ KERNELS = (
 
 STAGE = Stage(
     name="stereo",
-    version=15,
+    version=16,
     title="Multi-view stereo",
     run=run,
     summary="{points} points, {confirmed_share:%} of the object confirmed",

@@ -1,4 +1,4 @@
-"""Tables of captures: photos alone, stereo, and what each rule of `[skip]` saves and costs."""
+"""Tables of captures: photos alone, stereo, sharpness of textures, and what each rule of `[skip]` saves and costs."""
 
 from __future__ import annotations
 
@@ -35,6 +35,22 @@ def stereo(results: Path) -> Table:
     return Table("python -m benchmarks.stereo", headings, rows, lines)
 
 
+def sharpness(results: Path) -> Table:
+    """Textures beside photos or true colours at the larger of the measured sizes."""
+    lines = newest(read(results, "sharpness"), "capture", "profile", "settings", "texture", "beside", "size")
+    largest: dict[str, int] = {}
+    for line in lines:
+        largest[line["capture"]] = max(largest.get(line["capture"], 0), int(line["size"]))
+    lines = [line for line in lines if int(line["size"]) == largest[line["capture"]]]
+    rows = []
+    for line in lines:
+        texture = " ".join([line["texture"], *line["settings"].split()])
+        figures = [number(line[column], digits) for column, digits in (("psnr", 1), ("detail", 2), ("aligned_2", 2), ("shift", 2))]
+        rows.append([f"{spaced(line['capture'])}, {line['profile']}", texture, line["beside"], line["size"], *figures])
+    headings = ("capture", "texture", "beside", "pixels", "PSNR dB", "detail", "aligned 2–4 px", "shift px")
+    return Table("python -m benchmarks.sharpness OUT", headings, rows, lines)
+
+
 def skip(results: Path) -> Table:
     """Every rule: with its work done, and with it left out."""
     measured = newest(read(results, "skip"), "capture", "profile", "rule", "mode")
@@ -53,4 +69,4 @@ def skip(results: Path) -> Table:
     return Table("python -m benchmarks.skip CAPTURE --profile PROFILE", headings, rows, lines)
 
 
-TABLES: Mapping[str, Maker] = {"photos": photos, "stereo": stereo, "skip": skip}
+TABLES: Mapping[str, Maker] = {"photos": photos, "stereo": stereo, "sharpness": sharpness, "skip": skip}

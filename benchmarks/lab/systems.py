@@ -1,4 +1,4 @@
-"""Tables of the systems with a distance: their shape by capture, few photos, other starts, what the distance does."""
+"""Tables of the systems with a distance: their shape by capture, few photos, what the distance does."""
 
 from __future__ import annotations
 
@@ -10,9 +10,6 @@ from benchmarks.lab.tables import Line, Maker, Table, mean, newest, number, read
 
 COMMAND = "python -m benchmarks.fields --captures CAPTURE --systems SYSTEM"
 CAPTURES = ("built-in", "boombox", "avocado", "brass_vase", "stool", "mixer", "racquet")
-#: Overrides with which surfels start on a sphere or on the hull.
-SPHERE = "train.init=sphere train.iterations=1500 train.lr_position=4e-3 loss.silhouette=300"
-STARTS = {"stereo": "", "hull": "train.init=hull", "hull, 1500 steps": SPHERE.replace("sphere", "hull"), "sphere, 1500 steps": SPHERE}
 
 
 def _rows(results: Path) -> list[Line]:
@@ -41,20 +38,6 @@ def few_photos(results: Path) -> Table:
     return Table(command, headings, rows, [line for line in lines if line["system"] in systems])
 
 
-def starts(results: Path) -> Table:
-    """`dsdf` from stereo, hull and sphere."""
-    known = {(x["capture"], x["settings"]): x for x in _rows(results) if x["system"] == "dsdf" and x["seed"] == "0"}
-    lines, rows = [], []
-    for capture in ("boombox", "avocado"):
-        for start, given in STARTS.items():
-            line = known[capture, given]
-            figures = number(line["chamfer_pct"], 3), number(line["normal_deg"], 1), number(line["test_psnr"], 1)
-            lines.append(line)
-            rows.append([capture, start, *figures, number(line["cpu_s"], 0)])
-    headings = ("capture", "start", "Chamfer %", "normals °", "PSNR dB", "CPU s")
-    return Table(f"python -m benchmarks.fields --systems dsdf --set {SPHERE.replace(' ', ' --set ')}", headings, rows, lines)
-
-
 def distance(results: Path) -> Table:
     """What the distance does at the end of training, mean over seeds."""
     lines = [line for line in read(results, "distance") if float(line["share"]) == 1]
@@ -68,5 +51,5 @@ def distance(results: Path) -> Table:
 
 
 TABLES: Mapping[str, Maker] = {
-    "systems, Chamfer": chamfer, "few photos": few_photos, "dsdf starts": starts, "distance": distance,
+    "systems, Chamfer": chamfer, "few photos": few_photos, "distance": distance,
 }  # fmt: skip

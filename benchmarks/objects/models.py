@@ -28,8 +28,8 @@ from benchmarks.objects.parts import COPPER, IRON, PATINA, RUST, STEEL, Array, M
 from gsbake.imaging.srgb import encode
 from gsbake.texturing.texels import rasterise
 
-#: Edge of the textures in texels.
-TEXTURE_SIZE = 1024
+#: Edge of the textures in texels, and texels whose material is computed at a time.
+TEXTURE_SIZE, CHUNK = 1024, 1 << 19
 
 
 def figurine(seed: int, amplitude: float = 0.16) -> trimesh.Trimesh:
@@ -195,7 +195,8 @@ def model_glb(mesh: trimesh.Trimesh, procedure: Callable[[Array], Material], siz
     vertices, normals = vertices[mapping], np.asarray(mesh.vertex_normals)[mapping]
     top_left = np.column_stack([uv[:, 0], 1 - uv[:, 1]])
     texels = rasterise(top_left, faces.astype(np.int32), size)
-    material = procedure(texels.interpolate(vertices, faces).astype(np.float64))
+    position = texels.interpolate(vertices, faces).astype(np.float64)
+    material = Material.joined([procedure(position[start : start + CHUNK]) for start in range(0, len(position), CHUNK)])
     covered = texels.covered()
     nearest = ndimage.distance_transform_edt(~covered, return_distances=False, return_indices=True)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 import trimesh
@@ -28,6 +28,11 @@ class Material:
     def uniform(cls, count: int, base: tuple[float, float, float], roughness: float, metallic: float = 0.0) -> Material:
         """The same material at `count` points."""
         return cls(np.tile(base, (count, 1)), np.full(count, roughness), np.full(count, metallic), np.zeros((count, 3)))
+
+    @classmethod
+    def joined(cls, parts: Sequence[Material]) -> Material:
+        """The materials of several sets of points, one after the other."""
+        return cls(*(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(cls)))
 
     def blend(self, other: Material, share: Array) -> Material:
         """This material with a `share` (n,) of the other one."""

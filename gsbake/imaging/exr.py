@@ -18,14 +18,14 @@ CHANNEL_NAMES = {1: ("Y",), 3: ("R", "G", "B"), 4: ("R", "G", "B", "A")}
 
 
 def write_exr(path: Path, image: NDArray[Any]) -> None:
-    """Write `image` (h, w, c) as a half-float EXR with lossless ZIP compression; equal images give equal bytes.
+    """Write `image` (h, w, c) as a half-float EXR with lossless PIZ compression; equal images give equal bytes.
 
     Raises OSError when it cannot be written.
     """
     height, width, channels = image.shape
     spec = oiio.ImageSpec(width, height, channels, oiio.HALF)
     spec.channelnames = CHANNEL_NAMES.get(channels, tuple(f"C{k}" for k in range(channels)))
-    spec["compression"] = "zip"
+    spec["compression"] = "piz"
     spec["DateTime"] = FIXED_DATE
     _write(path, spec, np.ascontiguousarray(image, np.float16))
 

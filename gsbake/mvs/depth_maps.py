@@ -5,6 +5,7 @@ from __future__ import annotations
 import zipfile
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -29,6 +30,10 @@ SCATTER_SCALE = 0.003
 MIN_SEGMENT_SHARE, MAX_DEPTH_STEP = 2.5e-4, 0.01
 #: Points farther outside the hull than this many cells are removed.
 HULL_MARGIN = 1.5
+
+
+#: Bits behind the leading one of a depth on disk, and steps of a confidence.
+_DEPTH_BITS, _CONFIDENCE_STEPS = 14, 256
 
 
 @dataclass(frozen=True)
@@ -77,11 +82,23 @@ class DepthMap:
         return image
 
     def save(self, path: Path) -> None:
-        """Write depth and confidence as a NumPy archive, compressed at the fastest level: most pixels of a masked photo have no depth."""
+        """Write depth and confidence as a NumPy archive, compressed at the fastest level: most pixels of a masked photo have no depth.
+
+        Both are rounded to what matching determines, a depth to 3e-5 of itself: nearly half of the bytes would be noise.
+        """
+        confidence = np.asarray(np.maximum(np.rint(_CONFIDENCE_STEPS * self.confidence), 1) / _CONFIDENCE_STEPS, np.float32)
+        images: dict[str, NDArray[Any]] = {"depth": rounded(self.depth()), "confidence": self._image(confidence).astype(np.float16)}
         with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
-            for name, values in (("depth", self.depth()), ("confidence", self._image(self.confidence).astype(np.float16))):
+            for name, values in images.items():
                 with archive.open(f"{name}.npy", "w", force_zip64=True) as file:
                     np.lib.format.write_array(file, values, allow_pickle=False)
+
+
+def rounded(values: Floats) -> Floats:
+    """The values with _DEPTH_BITS bits behind the leading one, rounded to nearest."""
+    mantissa, exponent = np.frexp(values)
+    steps = np.float32(2 ** (_DEPTH_BITS + 1))
+    return np.ldexp(np.rint(mantissa * steps) / steps, exponent).astype(np.float32)
 
 
 def read_depth(path: Path) -> tuple[Floats, Floats]:

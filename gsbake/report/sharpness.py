@@ -1,4 +1,5 @@
-"""How fine the texture is beside the photos: texels per pixel, and the asset beside a part of a photo at full size, pixel for pixel."""
+"""How fine the texture is beside the photos: texels per pixel, the asset beside a part of a photo at full size, pixel for pixel, and where
+it has how much of a photo's fine detail."""
 
 from __future__ import annotations
 
@@ -19,6 +20,10 @@ from gsbake.report.render import Asset, Renderer, Shader, uv_density
 
 #: Edge of the part of a photo that is shown, in pixels; and of the squares in which sharpness is measured.
 EDGE, SQUARE = 400, 4
+#: Longer side in pixels of the photo in which the map of detail is measured, and edge of its squares.
+MAP_SIZE, MAP_SQUARE = 1600, 16
+#: Detail of a photo, in levels of 255 (root mean square), below which it is noise and not compared.
+LEAST_DETAIL = 1.5
 #: Longer side of the render that tells where the object is.
 OUTLINE_SIZE = 300
 
@@ -67,3 +72,34 @@ def sharpest_square(rgb: NDArray[np.uint8], alpha: NDArray[Any], edge: int) -> t
     sums = total[down:, across:] - total[:-down, across:] - total[down:, :-across] + total[:-down, :-across]
     y, x = np.unravel_index(int(sums.argmax()), sums.shape)
     return min(int(x) * width // size[0], width - edge), min(int(y) * height // size[1], height - edge)
+
+
+def detail_panel(renderer: Renderer, shader: Shader, photos: FullPhotos, camera: Camera, index: int) -> tuple[Panel, ...]:
+    """Map of the asset's fine detail beside that of photo `index` from its `camera` (asset frame); nothing where no square has any."""
+    view = photos.view(index, MAP_SIZE)
+    beside = compare(view, image := renderer.draw(camera.scaled(view.camera.width, view.camera.height), shader))
+    whole = image.alpha > 0.99 if view.mask is None else (image.alpha > 0.99) & (view.mask > 250)
+    ratio = detail_ratio(beside.photo, beside.render, whole)
+    known = np.isfinite(ratio)
+    if not known.any():
+        return ()
+    coded = np.where(known, np.clip(255 * ratio, 0, 255), 0).astype(np.uint8)
+    coloured = np.where(known[..., None], cv2.applyColorMap(coded, cv2.COLORMAP_VIRIDIS)[..., ::-1] / np.float32(255), np.float32(0.5))
+    size = (MAP_SQUARE // 4 * known.shape[1], MAP_SQUARE // 4 * known.shape[0])
+    caption = f"fine detail of the asset over the photo's: {float(np.median(ratio[known])):.2f} in the median"
+    return (Panel("Sharpness", caption, image_uri(np.asarray(cv2.resize(coloured, size, interpolation=cv2.INTER_NEAREST), np.float32))),)
+
+
+def detail_ratio(photo: NDArray[Any], render: NDArray[Any], whole: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Root mean square of the Laplacian of a render over that of its photo (h, w, 3), sRGB 0..1, in squares of MAP_SQUARE pixels; NaN
+    where less than half of a square is object (`whole` (h, w)), or the photo has no detail."""
+    inside = cv2.erode(whole.astype(np.uint8), np.ones((7, 7), np.uint8)).astype(np.float32)
+    size = max(1, whole.shape[1] // MAP_SQUARE), max(1, whole.shape[0] // MAP_SQUARE)
+
+    def energy(image: NDArray[Any]) -> NDArray[np.float64]:
+        grey = cv2.GaussianBlur(np.asarray(image.mean(2), np.float32), (0, 0), 0.7)
+        return np.asarray(cv2.resize(inside * cv2.Laplacian(grey, cv2.CV_32F) ** 2, size, interpolation=cv2.INTER_AREA), np.float64)
+
+    share, own, shown = cv2.resize(inside, size, interpolation=cv2.INTER_AREA), energy(photo), energy(render)
+    usable = (share > 0.5) & (own > share * (LEAST_DETAIL / 255) ** 2)
+    return np.where(usable, np.sqrt(shown / np.maximum(own, 1e-12)), np.nan)

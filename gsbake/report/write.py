@@ -25,7 +25,7 @@ from gsbake.report.masks import mask_panels
 from gsbake.report.page_model import page_model
 from gsbake.report.quality import select_views
 from gsbake.report.render import Asset, Renderer
-from gsbake.report.sharpness import close_up, texel_density
+from gsbake.report.sharpness import close_up, detail_panel, texel_density
 from gsbake.report.sheets import map_panels, missed_panel
 from gsbake.shading.light_motion import LightMotion
 from gsbake.text import number
@@ -129,7 +129,8 @@ class _ReportWriter:
             )
         with monitor.part("close-up"), FullPhotos(self.folders["ingest"], self.folders["poses"], self.folders["refine"]) as photos:
             shown = indices[len(indices) // 2]
-            beside = close_up(renderer, shader(shown), photos, cameras[shown], shown)
+            of_shown = renderer, shader(shown), photos, cameras[shown], shown
+            beside = close_up(*of_shown) + detail_panel(*of_shown)
             full = [photos.camera(k) for k in range(len(photos))]
             sized = [camera.scaled(own.width, own.height) for camera, own in zip(cameras, full, strict=True)]
             metric = (self.manifests["export"].get("results") or {}).get("scale") == "metres"

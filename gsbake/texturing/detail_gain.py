@@ -26,11 +26,14 @@ Floats = NDArray[np.float32]
 Doubles = NDArray[np.float64]
 Halves = NDArray[np.float16]
 Flags = NDArray[np.bool_]
+Bytes = NDArray[np.uint8]
 
 #: Bands of luminance (square root of the linear one) between Gaussians of these standard deviations in texels, from none on.
 SIGMAS = (1.0, 2.0, 4.0)
 #: Edge of a patch, and the margin on each side that the Gaussians of its neighbourhood would change, in texels; number of patches.
 PATCH, MARGIN, PATCHES = 32, 8, 600
+#: Standard deviations beyond which a Gaussian has next to nothing (.6 % of what lies there).
+REACH = 2.5
 #: Least views that show a patch, and least weight of one beside the best.
 MIN_VIEWS, MIN_WEIGHT = 3, 0.05
 #: Fewer patches are no evidence; largest gain; largest factor of a texel's coded luminance, which counts as at least `DARKEST`.
@@ -102,15 +105,32 @@ class DetailEnergy:
         return f"the mean keeps {kept} % of the photos' energy in bands of 1, 2 and 4 texels; {common} % is common to the photos"
 
 
-def detail_factor(colour: Halves, observed: Flags, gains: Sequence[float]) -> Floats:
-    """Factors (n, n) on linear `colour` (n, n, 3) that amplify its bands of luminance by `gains`; 1 where it is not `observed` (n, n)."""
+def detail_factor(colour: Halves, observed: Flags, gains: Sequence[float], charts: Bytes) -> Floats:
+    """Factors (n, n) on linear `colour` (n, n, 3) that amplify its bands of luminance by `gains`; 1 where it is not `observed` (n, n).
+
+    `charts` (n, n) are `chart_codes`: a band is amplified only where its Gaussians reach no other chart.
+    """
     known = observed.astype(np.float32)
     root = sum(weight * colour[..., channel].astype(np.float32) for channel, weight in enumerate(LUMINANCE))
     root = np.sqrt(np.maximum(root, 0)) * known
-    finer, change = root, np.zeros_like(root)
+    finer, change, spread = root, np.zeros_like(root), 0.0
     for sigma, gain in zip(SIGMAS, gains, strict=True):
         low = cv2.GaussianBlur(root, (0, 0), sigma) / np.maximum(cv2.GaussianBlur(known, (0, 0), sigma), 1e-6)
-        change += np.float32(gain - 1) * (finer - low)
+        spread = float(np.hypot(spread, sigma))
+        foreign = near_other_charts(charts, round(REACH * spread))
+        change += np.where(foreign, np.float32(0), np.float32(gain - 1)) * (finer - low)
         finer = low
     change /= np.maximum(root, DARKEST)
     return np.where(observed, np.clip(1 + change, 1 / MAX_FACTOR, MAX_FACTOR) ** 2, np.float32(1))
+
+
+def chart_codes(chart: NDArray[np.int32]) -> Bytes:
+    """Codes (n,) 1 … 255 of the numbers of charts; the same for a few of many."""
+    return (1 + chart % 255).astype(np.uint8)
+
+
+def near_other_charts(charts: Bytes, reach: int) -> Flags:
+    """Where (n, n) texels of charts with different codes, 0 = none, lie within `reach` texels on both axes."""
+    window = np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)
+    # 0 becomes the largest, so that empty texels count in neither.
+    return np.asarray(cv2.dilate(charts, window) - np.uint8(1) != cv2.erode(charts - np.uint8(1), window)) & (charts > 0)

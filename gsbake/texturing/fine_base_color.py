@@ -12,8 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsbake.capture.full_photos import FullPhotos
+from gsbake.imaging.srgb import decode_bytes, encode_bytes
 from gsbake.monitor import Monitor
-from gsbake.texturing.detail_gain import PATCHES, DetailEnergy, detail_factor
+from gsbake.texturing.detail_gain import PATCHES, DetailEnergy, chart_codes, detail_factor
 from gsbake.texturing.inpainting import fill_empty_texels
 from gsbake.texturing.photo_projection import PhotoProjector
 from gsbake.texturing.projection import ProjectionBlender
@@ -24,9 +25,10 @@ from gsbake.texturing.unwrapped_mesh import UnwrappedMesh
 Floats = NDArray[np.float32]
 Halves = NDArray[np.float16]
 Flags = NDArray[np.bool_]
+Bytes = NDArray[np.uint8]
 
 #: Texels of the surface that are projected at once; bytes of each, and of one of the texture that holds the result.
-BAND_TEXELS, BAND_BYTES, RESULT_BYTES = 6_000_000, 170, 22
+BAND_TEXELS, BAND_BYTES, RESULT_BYTES = 6_000_000, 170, 26
 #: Light and materials change the photos' colours by a factor of at most so much; where it is smooth, it is averaged over so many coarse
 #: texels: the coarse texture is less sharp than the mean of the fine one, and would blur it.
 MAX_RATIO, SMOOTH_TEXELS = 8.0, 2.0
@@ -44,17 +46,20 @@ def fine_base_color(
 ) -> Floats:
     """Linear base colour (size, size, 3) with the detail of the photos, whose exposure `gains` (views, 3) are divided out.
 
+    Of the values that 8-bit sRGB has, which is what assets hold: with more digits the file would be twice to three times as large.
+
     `coarse` (s, s, 3) is the finished one of the texture of `surface`, without empty texels; `size` is s times a power of two. `smooth`: it
     differs from the photos' colours by what varies slowly, as shading does, and not from texel to texel, as materials may.
     """
-    projected, observed, energy = _project(surface, photos, size, gains, holdout, monitor)
+    projected, observed, charts, energy = _project(surface, photos, size, gains, holdout, monitor)
     monitor.decide("detail", ", ".join(f"{gain:.2f}x" for gain in energy.gains), energy.evidence)
-    sharpened = detail_factor(projected, observed, energy.gains)
+    sharpened = detail_factor(projected, observed, energy.gains, charts)
     out = np.empty((size, size, 3), np.float32)
     for channel in range(3):
         monitor.check_stop()
         colour = projected[..., channel].astype(np.float32) * sharpened
-        out[..., channel] = _refined(np.ascontiguousarray(coarse[..., channel]), colour, observed, smooth)
+        refined = _refined(np.ascontiguousarray(coarse[..., channel]), colour, observed, smooth)
+        out[..., channel] = decode_bytes(encode_bytes(refined))
     return out
 
 
@@ -66,11 +71,12 @@ def needed_bytes(surface: UnwrappedMesh, size: int) -> int:
 
 def _project(
     surface: UnwrappedMesh, photos: FullPhotos, size: int, gains: Floats, holdout: int, monitor: Monitor
-) -> tuple[Halves, Flags, DetailEnergy]:
-    """Linear colours of the photos on a texture of `size`, where there are some, and the energies of their detail."""
+) -> tuple[Halves, Flags, Bytes, DetailEnergy]:
+    """Linear colours of the photos on a texture of `size`, where there are some, codes of its charts, and the energies of the detail."""
     reader, atlas, energy = PhotoProjector(photos, holdout), surface.atlas, DetailEnergy()
     edge = surface.texel_size * surface.texels.size / size
     colour, observed = np.zeros((size * size, 3), np.float16), np.zeros(size * size, np.bool_)
+    charts = np.zeros(size * size, np.uint8)
     bands = max(1, -(-len(surface.texels) * size**2 // surface.texels.size**2 // BAND_TEXELS))
     rows = np.linspace(0, size, bands + 1).round().astype(int)
     for band in range(bands):
@@ -88,8 +94,9 @@ def _project(
             monitor.progress(band * len(photos) + index + 1, bands * len(photos), "base colour")
         fused = blender.result(known_gains=gains)
         colour[texels.index], observed[texels.index] = fused.values, fused.observed
+        charts[texels.index] = chart_codes(atlas.chart[texels.face])
         energy.add(blender, texels, part, PATCHES // bands, gains)
-    return colour.reshape(size, size, 3), observed.reshape(size, size), energy
+    return colour.reshape(size, size, 3), observed.reshape(size, size), charts.reshape(size, size), energy
 
 
 def _refined(coarse: Floats, projected: Floats, observed: Flags, smooth: bool) -> Floats:

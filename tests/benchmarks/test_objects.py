@@ -3,21 +3,26 @@
 from __future__ import annotations
 
 import io
+import json
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
+from PIL import Image
 
 from benchmarks.csv_rows import read_rows, write_rows
+from benchmarks.objects import fine
 from benchmarks.objects.__main__ import Row, markdown
 from benchmarks.objects.entries import read_entries
+from benchmarks.objects.fine_render import FINE_MODELS, Z_UP, render_fine
 from benchmarks.objects.gauge import DIAL, ROTATION, gauge, gauge_material
 from benchmarks.objects.models import MODELS, model_glb
 from benchmarks.objects.parts import Material, turned
 from gsbake.errors import BadInputError
 from gsbake.imaging.srgb import decode
+from gsbake.report.asset import open_asset
 
 
 def test_textures_hold_the_material_of_each_position() -> None:
@@ -72,6 +77,45 @@ def test_turned_surfaces_have_exact_normals() -> None:
     cosine = (normals[mesh.faces].mean(1) * mesh.face_normals).sum(1)
     assert on_arc.sum() >= 8 * 32 and cosine.min() > 0.97
     assert trimesh.Trimesh(vertices, mesh.faces, process=True).is_watertight
+
+
+def test_fine_noise_has_detail_of_a_few_texels() -> None:
+    """Unit variance; places a texel (.001) apart differ by a twentieth of it or more, distant ones entirely."""
+    points = np.random.default_rng(3).uniform(-1, 1, (20_000, 3))
+    here, beside, away = (fine.grain(points + [offset, 0, 0], 5) for offset in (0.0, 0.001, 0.5))
+    assert here.std() == pytest.approx(1, abs=0.1)
+    assert 0.05 < (beside - here).std() < 0.5 and abs(np.corrcoef(here, away)[0, 1]) < 0.1
+    cell = fine.lattice(points, 0.003, 5)
+    np.testing.assert_allclose(fine.lattice(points + 0.003 * fine.CUBE, 0.003, 5), cell, atol=1e-6)
+    assert cell.std() == pytest.approx(1, abs=0.03)
+
+
+@pytest.mark.parametrize("name", FINE_MODELS)
+def test_fine_renders_have_their_true_colour(name: str, tmp_path: Path) -> None:
+    """The object fills the photo, a camera looks at its centre, and colours are those of the material at the places that rays hit."""
+    capture = render_fine(name, tmp_path, views=2, size=64, texture=512)
+    poses = json.loads((capture / "transforms.json").read_text(encoding="utf-8"))
+    asset = open_asset(capture / "gt" / "asset.glb")
+    low, high = asset.position.min(0), asset.position.max(0)
+    pose, focal = np.array(poses["frames"][1]["transform_matrix"]), poses["fl_x"]
+    centre = np.linalg.inv(pose) @ [*(Z_UP @ (low + high) / 2), 1]
+    assert np.abs(centre[:2]).max() < 1e-9 and centre[2] < 0
+    photo, base = (np.asarray(Image.open(capture / folder / "0001.png")) for folder in ("images", "gt/base_color"))
+    rows, columns = np.nonzero(base[..., 3] == 255)
+    assert 0.2 < len(rows) / 64**2 < 0.9 and np.array_equal(photo[..., 3], base[..., 3])
+    shape, procedure = FINE_MODELS[name]
+    mesh, keep = shape(), slice(None, None, 7)
+    rays = np.column_stack([columns[keep] + 0.5 - 32, 32 - rows[keep] - 0.5, np.full(len(rows[keep]), -focal)]) @ pose[:3, :3].T
+    place, ray, _ = mesh.ray.intersects_location(np.tile(pose[:3, 3], (len(rays), 1)), rays, multiple_hits=False)
+    true, found = procedure(np.asarray(place)).base.mean(1), decode(base[rows, columns, :3] / 255)[keep][ray].mean(1)
+    assert len(ray) > 50 and np.corrcoef(true, found)[0, 1] > 0.3 and abs(np.log(true.mean() / found.mean())) < 0.1
+    shaded = decode(photo[rows, columns, :3] / 255)
+    assert 0.2 < shaded.mean() / decode(base[rows, columns, :3] / 255).mean() < 5
+
+
+def test_ink_covers_a_part_of_the_sheet() -> None:
+    ink = fine.sheet()
+    assert ink.shape == fine.SHEET[::-1] and 0.1 < ink.mean() < 0.5
 
 
 @pytest.mark.parametrize("name", ["mug", "bowl", "flower_pot", "box", "shoe"])

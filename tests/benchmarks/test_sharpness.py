@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from benchmarks import sharpness
 from gsbake.capture.posed_photos import View
@@ -57,3 +58,17 @@ def test_figures_are_read_by_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     found = sharpness.score(tmp_path / "a.glb", tmp_path / "cameras.json", 1200, tmp_path, ["p1"])
     assert found["p1"]["psnr"] == 25 and found["p1"]["detail"] == 0.6 and found["p1"]["aligned_2"] == 0.5 and found["p1"]["shift"] == 1.5
     assert asked[0][-2:] == ["--names", "p1"] and "--masks" in asked[0]
+
+
+def test_true_colours_stand_in_place_of_the_test_photos(tmp_path: Path) -> None:
+    """By name, in another order than the capture has them; alpha becomes the masks."""
+    (tmp_path / "gt" / "base_color").mkdir(parents=True)
+    for grey, name in enumerate(("a.png", "b.png", "c.png")):
+        image = np.full((3, 4, 4), 100 + grey, np.uint8)
+        image[..., 3] = [0, 255, 255, 255]
+        Image.fromarray(image).save(tmp_path / "gt" / "base_color" / name)
+    (tmp_path / "cameras.json").write_text(json.dumps({"frames": [{"file_path": "c.png"}, {"file_path": "a.png"}]}), encoding="utf-8")
+    cameras = sharpness.true_colours(tmp_path, tmp_path / "cameras.json")
+    photo, mask = (np.asarray(Image.open(cameras.parent / kind)) for kind in ("photos/c.png", "masks/a.png"))
+    assert np.unique(photo).tolist() == [102] and mask[0].tolist() == [0, 255, 255, 255]
+    assert sorted(path.name for path in (cameras.parent / "photos").iterdir()) == ["a.png", "c.png"]

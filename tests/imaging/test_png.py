@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
+from itertools import product
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
-from gsbake.imaging.png import encode_png, write_png
+from gsbake.imaging.png import encode_fast, encode_png, write_png
 
 
 @pytest.mark.parametrize("shape", [(1, 1, 3), (5, 7, 3), (64, 33, 3), (9, 16), (9, 16, 1), (6, 5, 4)])
 def test_opencv_reads_the_same_pixels(shape: tuple[int, ...]) -> None:
     rng = np.random.default_rng(1)
-    for pixels in (rng.integers(0, 256, shape, np.uint8), np.cumsum(np.ones(shape, np.uint8), 0, np.uint8), np.full(shape, 7, np.uint8)):
-        data = encode_png(pixels)
+    kinds = rng.integers(0, 256, shape, np.uint8), np.cumsum(np.ones(shape, np.uint8), 0, np.uint8), np.full(shape, 7, np.uint8)
+    fast = [encode_fast] if len(shape) == 2 or shape[2] == 3 else []
+    for pixels, encode in product(kinds, [encode_png, *fast]):
+        data = encode(pixels)
         found = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
         order = [2, 1, 0, 3][: shape[2]] if len(shape) == 3 and shape[2] > 1 else None
         assert found is not None and np.array_equal(found.reshape(shape) if order is None else found[..., order], pixels)

@@ -8,7 +8,7 @@ import pytest
 from gsbake.mvs.coarse_to_fine import find_planes
 from gsbake.mvs.consistency import check_consistency
 from gsbake.mvs.depth_bounds import depth_bounds, seed_depths
-from gsbake.mvs.depth_maps import DepthMap, consistent_pixels, filter_depth_map, inverse_depth, matched_pixels, read_depth
+from gsbake.mvs.depth_maps import DepthMap, consistent_pixels, filter_depth_map, inverse_depth, matched_pixels, read_depth, rounded
 from gsbake.mvs.fusion import fuse
 from gsbake.mvs.outliers import find_outliers, without_points
 from gsbake.mvs.point_cloud import StereoCloud
@@ -65,6 +65,14 @@ def test_maps_and_points_lie_on_the_sphere(scene, tmp_path) -> None:
     depth, sure = read_depth(tmp_path / "one.npz")
     assert ((depth > 0) == (sure > 0)).all() and np.abs(depth - sphere_depth(cameras[2]))[depth > 0].mean() < 0.005
     assert (tmp_path / "one.npz").stat().st_size < 0.5 * (depth.nbytes + sure.nbytes / 2)  # what has no depth takes no room
+    np.testing.assert_allclose(depth, maps[2].depth(), rtol=2**-15)
+    np.testing.assert_allclose(sure.ravel()[maps[2].pixels], maps[2].confidence, atol=1 / 256)
+
+
+def test_depths_on_disk_have_fourteen_bits() -> None:
+    """Ties aside, the nearest multiple of 2^-14 of the power of two below."""
+    values = np.array([0.0, 1.0, 1 + 0.6 * 2**-14, 1 + 0.4 * 2**-14, 7.9999, 3 + 1.2 * 2**-13], np.float32)
+    np.testing.assert_array_equal(rounded(values), np.array([0, 1, 1 + 2**-14, 1, 8, 3 + 2**-13], np.float32))
 
 
 def test_averaging_consistent_views_reduces_the_error(scene) -> None:

@@ -13,6 +13,8 @@ from gsbake.texturing.detail_gain import SIGMAS, DetailEnergy, detail_factor
 from gsbake.texturing.texels import Texels
 
 SIZE, VIEWS = 256, 5
+#: A texture of one chart.
+ONE = np.ones((SIZE, SIZE), np.uint8)
 
 
 def texels() -> Texels:
@@ -72,7 +74,7 @@ def test_detail_of_views_beside_each_other_comes_nearer_to_theirs(pattern: np.nd
     energy = energy_of(views)
     assert all(1.02 < gain < module.MAX_GAIN for gain in energy.gains[:2])
     colour = np.repeat((mean**2)[..., None], 3, 2).astype(np.float16)
-    found = mean * np.sqrt(detail_factor(colour, np.ones((SIZE, SIZE), np.bool_), energy.gains))
+    found = mean * np.sqrt(detail_factor(colour, np.ones((SIZE, SIZE), np.bool_), energy.gains, ONE))
 
     def detail(plane: np.ndarray) -> float:
         return float((cv2.Laplacian(plane, cv2.CV_32F) ** 2).mean())
@@ -92,8 +94,31 @@ def test_only_detail_of_what_is_observed_is_amplified(pattern: np.ndarray) -> No
     colour[:, :64] = 0.3
     observed = np.ones((SIZE, SIZE), np.bool_)
     observed[:, 200:] = False
-    found = detail_factor(colour, observed, (1.4, 1.2, 1.1))
+    found = detail_factor(colour, observed, (1.4, 1.2, 1.1), ONE)
     assert (found[:, 200:] == 1).all()
     assert np.abs(found[:, :40] - 1).max() < 1e-3
     assert found[:, 70:190].std() > 0.02
-    assert (detail_factor(colour, observed, (1.0, 1.0, 1.0)) == 1).all()
+    assert (detail_factor(colour, observed, (1.0, 1.0, 1.0), ONE) == 1).all()
+
+
+def test_detail_does_not_leak_from_other_charts(pattern: np.ndarray) -> None:
+    """A dark and a bright chart four texels beside each other, without any detail: neither has a line along the other. Detail of a band is
+    amplified as far as its Gaussians reach no other chart."""
+    charts = np.zeros((SIZE, SIZE), np.uint8)
+    charts[:, :126], charts[:, 130:] = module.chart_codes(np.array([0, 300]))
+    colour = np.where(charts[..., None] == 1, np.float16(0.05), np.float16(0.8)).repeat(3, 2)
+    kept, leaking = (detail_factor(colour, charts > 0, (1.4, 1.4, 1.4), codes) for codes in (charts, ONE))
+    assert np.abs(kept - 1).max() < 0.02 and np.abs(leaking - 1).max() > 0.3
+    rough = np.repeat((pattern**2)[..., None], 3, 2).astype(np.float16)
+    found, alone = (detail_factor(rough, charts > 0, (1.4, 1.0, 1.0), codes) for codes in (charts, ONE))
+    np.testing.assert_array_equal(found[:, :125], alone[:, :125])
+    assert found[:, :125].std() > 0.02
+
+
+def test_near_another_chart() -> None:
+    """Within two texels, beside empty ones too; charts 0 and 255 have one code."""
+    charts = np.zeros((1, 12), np.uint8)
+    charts[0, 0:4], charts[0, 5:9], charts[0, 10:] = module.chart_codes(np.array([0, 7, 255]))
+    found = "".join(".#"[int(x)] for x in module.near_other_charts(charts, 2)[0])
+    assert found == "...#.#..#.#."
+    assert module.chart_codes(np.array([0, 254, 255])).tolist() == [1, 255, 1]

@@ -31,7 +31,7 @@ from gsbake.capture.photos.hdr import has_gain_map
 from gsbake.capture.photos.heic_and_raw import HEIC_SUFFIXES
 from gsbake.capture.photos.quality import Quality, measure_quality
 from gsbake.errors import BadInputError
-from gsbake.imaging.png import FAST_COMPRESSION, encode_png, write_png
+from gsbake.imaging.png import encode_fast, write_png
 
 #: Folders of the photos that are larger than the working size, and of their masks; largest longer side that is read of them.
 ORIGINALS, FULL_MASKS = "originals", "full_masks"
@@ -116,7 +116,7 @@ def convert(what: Conversion) -> ConvertedPhoto:
     rgb, mask = to_working_size(photo, mask, what.max_size)
     height, width = rgb.shape[:2]
     quality = measure_quality(rgb, mask)
-    content = encode_png(rgb, FAST_COMPRESSION)
+    content = encode_fast(rgb)
     (what.out / "photos" / f"{what.name}.png").write_bytes(content)
     larger = what.keep and (width, height) != (photo.width, photo.height)
     if mask is not None:
