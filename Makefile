@@ -109,7 +109,7 @@ kernels: $(RUNTIME)
 coverage: kernels setup node ## The quick tests with the share of lines they run, which takes about half as long again
 	$(BIN)/pytest $(QUICK) --cov --cov-report=term:skip-covered
 
-stress: setup node ## The slow tests: hostile input at length, kills at random moments, faults on a Slurm cluster and on servers where installed, poses of a development capture where present
+stress: setup node ## The slow tests: hostile input at length, 200 photos of 24 megapixels (GSBAKE_LARGE_PHOTOS=N), kills at random moments, faults on a Slurm cluster and on servers where installed, poses of a development capture where present
 	GSBAKE_FUZZ_INPUTS=$(FUZZ_INPUTS) $(BIN)/pytest -m "slow or stress"
 
 bench: setup ## Measure kernels, error against time (beside other tools) and growth, about two idle hours: PARTS="table timeline growth" ARGS=…

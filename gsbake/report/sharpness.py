@@ -20,8 +20,8 @@ from gsbake.report.render import Asset, Renderer, Shader, uv_density
 
 #: Edge of the part of a photo that is shown, in pixels; and of the squares in which sharpness is measured.
 EDGE, SQUARE = 400, 4
-#: Longer side in pixels of the photo in which the map of detail is measured, and edge of its squares.
-MAP_SIZE, MAP_SQUARE = 1600, 16
+#: Longer side in pixels of the photo in which the map of detail is measured, rows that are drawn at once, and edge of its squares.
+MAP_SIZE, MAP_ROWS, MAP_SQUARE = 1600, 200, 16
 #: Detail of a photo, in levels of 255 (root mean square), below which it is noise and not compared.
 LEAST_DETAIL = 1.5
 #: Longer side of the render that tells where the object is.
@@ -77,9 +77,14 @@ def sharpest_square(rgb: NDArray[np.uint8], alpha: NDArray[Any], edge: int) -> t
 def detail_panel(renderer: Renderer, shader: Shader, photos: FullPhotos, camera: Camera, index: int) -> tuple[Panel, ...]:
     """Map of the asset's fine detail beside that of photo `index` from its `camera` (asset frame); nothing where no square has any."""
     view = photos.view(index, MAP_SIZE)
-    beside = compare(view, image := renderer.draw(camera.scaled(view.camera.width, view.camera.height), shader))
-    whole = image.alpha > 0.99 if view.mask is None else (image.alpha > 0.99) & (view.mask > 250)
-    ratio = detail_ratio(beside.photo, beside.render, whole)
+    own = camera.scaled(view.camera.width, view.camera.height)
+    # In bands, as a render takes some hundred bytes per ray.
+    bands = [replace(own, height=min(MAP_ROWS, own.height - row), cy=own.cy - row) for row in range(0, own.height, MAP_ROWS)]
+    drawn = [(image.rgb, image.alpha > 0.99) for image in (renderer.draw(band, shader) for band in bands)]
+    render, whole = (np.concatenate(parts) for parts in zip(*drawn, strict=True))
+    if view.mask is not None:
+        whole &= view.mask > 250
+    ratio = detail_ratio(view.rgb / np.float32(255), render, whole)
     known = np.isfinite(ratio)
     if not known.any():
         return ()
