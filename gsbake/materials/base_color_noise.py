@@ -33,10 +33,9 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class MetalNoise:
-    """Takes out of metals' base colours the noise that two halves of the photos tell, `rounds` times; after each texels and light adapt in
-    the gradient `steps`."""
+    """Takes out of metals' base colours the noise that two halves of the photos tell; texels and light then adapt in the gradient `steps`,
+    if there are some."""
 
-    rounds: int = 1
     steps: Steps | None = None
 
     def applies(self, scene: Scene, state: State) -> bool:
@@ -45,14 +44,11 @@ class MetalNoise:
 
     def run(self, scene: Scene, state: State) -> State:
         """Base colours of metals without noise."""
-        for turn in range(self.rounds):
-            metal, surface, m = state.metal & state.emits_nothing, state.level.surface, state.materials
-            halves = [state.metal_samples(slice(first, None, 2)) for first in range(2)]
-            base, texel = without_noise(halves, m, metal, surface.texels, surface.pairs), np.flatnonzero(metal)
-            state = state.with_inside(texel, replace(m.of(texel), base_color=base[texel].astype(np.float32))).with_transport()
-            if self.steps is not None:
-                state = descend(scene.seeded(turn), state, self.steps, scene.each("trials of metal and dielectric"))
-        return state
+        metal, surface, m = state.metal & state.emits_nothing, state.level.surface, state.materials
+        halves = [state.metal_samples(slice(first, None, 2)) for first in range(2)]
+        base, texel = without_noise(halves, m, metal, surface.texels, surface.pairs), np.flatnonzero(metal)
+        state = state.with_inside(texel, replace(m.of(texel), base_color=base[texel].astype(np.float32))).with_transport()
+        return descend(scene, state, self.steps, scene.each("trials of metal and dielectric")) if self.steps else state
 
 
 @dataclass(frozen=True)

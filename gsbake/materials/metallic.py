@@ -33,7 +33,7 @@ from numpy.typing import NDArray
 
 from gsbake.kernels.declaration import kernel
 from gsbake.materials.fit_kernel import srgb_and_slope
-from gsbake.materials.linear_shading import CLIPPED, BaseColourSolver, LinearParts, LinearShading, PhotoSamples, observed_weight
+from gsbake.materials.linear_shading import CLIPPED, BaseColourSolver, LinearParts, PhotoSamples, observed_weight
 
 Floats = NDArray[np.float64]
 #: A filter of values (texels,).
@@ -77,21 +77,6 @@ class MetalTexels:
     dielectric: tuple[NDArray[np.int64], Floats, Floats]
 
 
-@dataclass(frozen=True)
-class ShadingModel:
-    """The `shading` of a photo's pixels at one roughness and metallic, and the same with `tilted` normals."""
-
-    shading: LinearShading
-    tilted: tuple[LinearShading, ...]
-
-    def negative_log_likelihood(self, samples: PhotoSamples, base: Floats) -> Floats:
-        """Weighted sums (texels,) over pixels and channels, up to a constant, for base colours `base` (texels, 3)."""
-        slope, offset = (np.stack([getattr(one, part) for one in (self.shading, *self.tilted)]) for part in ("slope", "offset"))
-        cost, noise = np.empty(len(samples.texel), np.float32), np.float32(OPTIONS.noise**2)
-        pixel_costs(samples.texel, samples.encoded, slope, offset, base, noise, np.float32(OPTIONS.degrees_of_freedom), cost)
-        return np.asarray(np.bincount(samples.texel, samples.weight * cost, len(base)), np.float64)
-
-
 @kernel("i8[::1], f4[:, ::1], f4[:, :, ::1], f4[:, :, ::1], f8[:, ::1], f4, f4, f4[::1]", parallel=True, nogil=True, error_model="numpy")
 def pixel_costs(texel: Any, encoded: Any, slope: Any, offset: Any, base: Any, noise: Any, freedom: Any, cost: Any) -> None:
     """`cost` (n,): −log of the likelihood of n pixels, up to a constant, summed over channels.
@@ -100,7 +85,7 @@ def pixel_costs(texel: Any, encoded: Any, slope: Any, offset: Any, base: Any, no
     tilted ones, where the photo has the sRGB colour `encoded` (n, 3). The variance is `noise` and the squared changes by the tilts.
     """
     for i in prange(len(texel)):
-        total = np.float32(0)
+        errors = variances = np.float32(1)  # products over channels, as logarithms take long
         for c in range(3):
             b, variance = np.float32(base[texel[i], c]), noise
             shown = srgb_and_slope(min(max(b * slope[0, i, c] + offset[0, i, c], np.float32(0)), np.float32(1)))[0]
@@ -108,10 +93,9 @@ def pixel_costs(texel: Any, encoded: Any, slope: Any, offset: Any, base: Any, no
                 change = srgb_and_slope(min(max(b * slope[k, i, c] + offset[k, i, c], np.float32(0)), np.float32(1)))[0] - shown
                 variance += change * change
             error = shown - encoded[i, c]
-            total += np.float32(0.5) * (
-                (freedom + np.float32(1)) * math.log(np.float32(1) + error * error / (variance * freedom)) + math.log(variance)
-            )
-        cost[i] = total
+            errors *= np.float32(1) + error * error / (variance * freedom)
+            variances *= variance
+        cost[i] = np.float32(0.5) * ((freedom + np.float32(1)) * math.log(errors) + math.log(variances))
 
 
 def _itself(values: Floats) -> Floats:
@@ -167,10 +151,18 @@ def candidate_model(
 ) -> tuple[Floats, Floats]:
     """The best model of one kind with the shading `parts` of `shaded`: costs (texels,), which are negative log-likelihoods up to a
     constant, and base colours (texels, 3)."""
-    models = [ShadingModel(first.of(metal), tuple(one.of(metal) for one in tilted)) for first, *tilted in parts]
-    base = solver.solve([model.shading for model in models], MIN_METAL_ALBEDO if metal else 0.0)
-    costs = [model.negative_log_likelihood(samples, base) for samples, model in zip(photos, models, strict=True)]
-    return sum(costs, np.zeros(len(base))), base
+    base = solver.solve([plain.of(metal) for plain, *_ in parts], MIN_METAL_ALBEDO if metal else 0.0)
+    costs = np.zeros(len(base))
+    for samples, shadings in zip(photos, parts, strict=True):
+        slope, offset = (np.stack([getattr(one.of(metal), part) for one in shadings]) for part in ("slope", "offset"))
+        cost, noise, freedom = (
+            np.empty(len(samples.texel), np.float32),
+            np.float32(OPTIONS.noise**2),
+            np.float32(OPTIONS.degrees_of_freedom),
+        )
+        pixel_costs(samples.texel, samples.encoded, slope, offset, base, noise, freedom, cost)
+        costs += np.bincount(samples.texel, samples.weight * cost, len(base))
+    return costs, base
 
 
 def _compare_models(photos: Sequence[PhotoSamples], own: NDArray[np.float32]) -> tuple[_BestModel, _BestModel]:

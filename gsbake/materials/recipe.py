@@ -49,9 +49,9 @@ FINE = Steps(0.25, normals=True, passes=(Pass("metal-search", MetalSearch(), at=
 
 
 def coarsest(steps: Steps) -> Steps:
-    """The same on the coarsest level: fewer, as only the order of the starts counts, and with one step of the light, which takes most of
-    the time there, for two photos."""
-    return replace(steps, share=0.6 * steps.share, photos_per_light=2)
+    """The same on the coarsest level: fewer, as only the order of the starts counts, with one step of the light, which takes most of the
+    time there, for two photos, and without the sparsity prior, whose means take as long as the steps between."""
+    return replace(steps, share=0.6 * steps.share, photos_per_light=2, sparsity=False)
 
 
 _STARTS = StartComparison(coarsest(TRIAL), coarsest(COARSE))
@@ -64,14 +64,13 @@ FIT = (
     Pass("coarse-level", ChosenStart()),
     Pass("coarse-steps", GradientSteps(TRIAL, "material fit, coarse level")),
     Pass("coarse-steps", GradientSteps(COARSE, "material fit, coarse level")),
-    Pass("metal-noise", MetalNoise(rounds=2, steps=ADAPT)),
+    Pass("metal-noise", MetalNoise(steps=ADAPT)),
     Pass("metal-trials", KindTrials(TURN)),
     Pass("light-level", LightLevel(ADAPT_AND_SEARCH)),
     Pass("remaining-shading", RemainingShading(RELIT, rounds=4)),
     Pass("pure-metals", PureMetals()),
     # On the fine level.
     Pass("fine-level", FineLevel()),
-    Pass("metal-noise", MetalNoise()),
     Pass("fine-steps", GradientSteps(FINE, "material fit, fine level")),
     Pass("metal-noise", MetalNoise()),
 )
