@@ -181,7 +181,7 @@ def test_the_curve_and_its_slope_are_those_of_srgb() -> None:
     assert found[502, 0] == pytest.approx(1) and np.isnan(found[503, 0])  # neither reads beyond the table
     inner = linear[:500].astype(np.float64)
     slope = np.where(inner <= 0.0031308, 12.92, 1.055 / 2.4 * inner ** (1 / 2.4 - 1))
-    bright = inner > 1e-4  # below, lines are no wider than a curve's bend
+    bright = inner > 1e-4  # below, lines are as wide as the curve is steep
     np.testing.assert_allclose(found[:500, 1][bright], slope[bright], rtol=6e-2)
     assert np.abs(found[:500, 1] / slope - 1)[bright].mean() < 6e-3
 
