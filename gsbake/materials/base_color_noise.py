@@ -33,10 +33,9 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class MetalNoise:
-    """Takes out of metals' base colours the noise that two halves of the photos tell, `rounds` times; after each texels and light adapt in
-    the gradient `steps`."""
+    """Takes out of metals' base colours the noise that two halves of the photos tell; texels and light then adapt in the gradient `steps`,
+    if there are some."""
 
-    rounds: int = 1
     steps: Steps | None = None
 
     def applies(self, scene: Scene, state: State) -> bool:
@@ -45,13 +44,11 @@ class MetalNoise:
 
     def run(self, scene: Scene, state: State) -> State:
         """Base colours of metals without noise."""
-        for turn in range(self.rounds):
-            metal, surface, m = state.metal & state.emits_nothing, state.level.surface, state.materials
-            base, texel = without_noise(state.metal_samples(), m, metal, surface.texels, surface.pairs), np.flatnonzero(metal)
-            state = state.with_inside(texel, replace(m.of(texel), base_color=base[texel].astype(np.float32))).with_transport()
-            if self.steps is not None:
-                state = descend(scene.seeded(turn), state, self.steps, scene.each("trials of metal and dielectric"))
-        return state
+        metal, surface, m = state.metal & state.emits_nothing, state.level.surface, state.materials
+        halves = [state.metal_samples(slice(first, None, 2)) for first in range(2)]
+        base, texel = without_noise(halves, m, metal, surface.texels, surface.pairs), np.flatnonzero(metal)
+        state = state.with_inside(texel, replace(m.of(texel), base_color=base[texel].astype(np.float32))).with_transport()
+        return descend(scene, state, self.steps, scene.each("trials of metal and dielectric")) if self.steps else state
 
 
 @dataclass(frozen=True)
@@ -71,17 +68,17 @@ MIN_WEIGHT, MIN_SHARE = 0.15, 0.01
 
 
 def without_noise(
-    photos: Sequence[PhotoSamples], materials: Materials, metal: NDArray[np.bool_], texels: Texels, pairs: NDArray[np.int64]
+    halves: Sequence[Sequence[PhotoSamples]], materials: Materials, metal: NDArray[np.bool_], texels: Texels, pairs: NDArray[np.int64]
 ) -> Floats:
-    """Linear base colours (n, 3): those of `metal` (n,) without the noise that two halves of the `photos` tell.
+    """Linear base colours (n, 3): those of `metal` (n,) without the noise that two `halves` of the photos tell.
 
     `materials` are those of the `texels` with neighbouring `pairs` (m, 2).
     """
     base = np.asarray(materials.base_color, np.float64)
-    if metal.mean() < MIN_SHARE or len(photos) < 2:
+    if metal.mean() < MIN_SHARE or not all(halves):
         return base
-    colour, weight = encode(np.clip(base, 0, 1)).astype(np.float64), observed_weight(photos, len(base)) * metal
-    noise, measured = _noise(photos, np.ascontiguousarray(materials.roughness))
+    colour, weight = encode(np.clip(base, 0, 1)).astype(np.float64), observed_weight([*halves[0], *halves[1]], len(base)) * metal
+    noise, measured = _noise(halves, np.ascontiguousarray(materials.roughness))
     near = EdgeAwareFilter(texels, pairs, np.where(metal[:, None], colour, 0).astype(np.float32), OPTIONS.scale)
     mean = _mean(near, colour, weight)
     variance = _mean(near, np.square(colour - mean), weight)
@@ -89,11 +86,11 @@ def without_noise(
     return np.where(metal[:, None], decode(np.clip(mean + share * (colour - mean), 0, 1)), base)
 
 
-def _noise(photos: Sequence[PhotoSamples], roughness: NDArray[np.float32]) -> tuple[Floats, NDArray[np.bool_]]:
-    """Variance (n, 3) of the noise of metals' base colours in sRGB from all photos, a quarter of the squared difference of those from every
-    second one, and where it is measured (n,)."""
+def _noise(halves: Sequence[Sequence[PhotoSamples]], roughness: NDArray[np.float32]) -> tuple[Floats, NDArray[np.bool_]]:
+    """Variance (n, 3) of the noise of metals' base colours in sRGB from all photos, a quarter of the squared difference of those from each
+    of the `halves`, and where it is measured (n,)."""
     solved, measured = [], np.ones(len(roughness), bool)
-    for half in (photos[::2], photos[1::2]):
+    for half in halves:
         shadings = [samples.shade(roughness).metal for samples in half]
         solved.append(encode(BaseColourSolver(half, len(roughness)).solve(shadings, robust=True)))
         measured &= observed_weight(half, len(roughness)) > MIN_WEIGHT

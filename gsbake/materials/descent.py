@@ -86,7 +86,7 @@ class DescentOptions:
     #: the change per texel grows with their size.
     normal_smoothness: float = 60.0
     #: Steps between updates of visibility and indirect light, and of the common materials; all change slowly.
-    transport_interval: int = 25
+    transport_interval: int = 40
     sparsity_interval: int = 50
     #: Start of the sparsity prior: the light's intensity must be known.
     sparsity_from: float = 0.5

@@ -18,6 +18,7 @@ import numba
 import numpy as np
 from numba import njit, prange
 
+from gsbake.imaging.srgb import encode
 from gsbake.kernels.declaration import argument_types, kernel
 from gsbake.shading.reflection_kernel import reflected_radiance, specular_visibility
 from gsbake.shading.split_sum_kernel import (
@@ -27,6 +28,7 @@ from gsbake.shading.split_sum_kernel import (
     MIN_SQUARED_LENGTH,
     _bilinear,
     _bilinear_backward,
+    _cell,
     _encode,
     _encode_backward,
     _geometry,
@@ -37,10 +39,11 @@ from gsbake.shading.split_sum_kernel import (
     _taps,
 )
 
-_0, _1, _2, _HALF = np.float32(0), np.float32(1), np.float32(2), np.float32(0.5)
-# sRGB curve (IEC 61966-2-1).
-_THRESHOLD, _SLOPE, _SCALE, _OFFSET = np.float32(0.0031308), np.float32(12.92), np.float32(1.055), np.float32(0.055)
-_POWER = np.float32(1 / 2.4)
+_0, _1, _2, _HALF, _SIXTH = np.float32(0), np.float32(1), np.float32(2), np.float32(0.5), np.float32(1 / 6)
+_16, _32 = np.float32(16), np.float32(32)
+#: The sRGB curve at the squares of 0, 1/1024 … 1: over the square root it is so smooth that lines between are off by 4e-6 at most.
+_CURVE = encode(np.square(np.arange(1026) / 1024)).astype(np.float32)
+_CURVE_STEPS, _CURVE_HALF = np.float32(1024), np.float32(512)
 
 #: Columns of a texel's parameters: base colour (3), roughness, metallic, normal offset (3).
 PARAMETERS = 8
@@ -62,10 +65,11 @@ _TABLES = "f4[:, ::1], f4[::1], i8[::1], i8[::1], Array(f4, 3, 'C', readonly=Tru
 @njit(forceinline=True, **_FLAGS)
 def srgb_and_slope(linear: Any) -> Any:
     """sRGB of a linear value in [0, 1], and its derivative."""
-    if linear > _THRESHOLD:
-        power = linear**_POWER
-        return _SCALE * power - _OFFSET, _SCALE * _POWER * power / linear
-    return _SLOPE * linear, _SLOPE
+    root = math.sqrt(linear)
+    at = root * _CURVE_STEPS
+    k = _cell(at, 1024)
+    rise = _CURVE[k + np.uint64(1)] - _CURVE[k]
+    return _CURVE[k] + (at - np.float32(k)) * rise, rise * _CURVE_HALF / max(root, _HALF / _CURVE_STEPS)
 
 
 @kernel(
@@ -289,8 +293,16 @@ def gather_gradient(touched: Any, start: Any, pixel: Any, share: Any, gradient: 
 
 
 @njit(forceinline=True, **_FLAGS)
-def _sign(x: Any) -> Any:
-    return np.float32(x > _0) - np.float32(x < _0)
+def _logistic(x: Any) -> Any:
+    """1 / (1 + e^−x), off by 1e-6 at most: e^x from a polynomial at x/32 and five squarings, which are vector instructions."""
+    x = min(max(x, -_16), _16) / -_32
+    e = _1 + x * (_1 + x * (_HALF + x * (_SIXTH + x * (_HALF * _HALF * _SIXTH + x * np.float32(1 / 120)))))
+    e *= e
+    e *= e
+    e *= e
+    e *= e
+    e *= e
+    return _1 / (_1 + e)
 
 
 @kernel(
@@ -313,43 +325,36 @@ def adam_step(
     `common_weight` (4,) draws sRGB base colour and roughness. `rate` (PARAMETERS,) learning rates, without one of normal offsets these and
     their moments stay; `first`, `second` moments.
     """
-    regular, texels = common.shape[0] > 0, raw.shape[0]
-    active = PARAMETERS if rate[5] > _0 else 5
+    regular, moves, texels = common.shape[0] > 0, rate[5] > _0, raw.shape[0]
     size = -(-texels // CHUNKS)
     for chunk in prange(CHUNKS):
-        pull = np.empty(PARAMETERS, np.float32)
-        for t in range(chunk * size, min(texels, (chunk + 1) * size)):
-            pull[:] = _0
-            for e in range(start[t], start[t + 1]):
+        g = np.empty(PARAMETERS, np.float32)
+        # Loops over parameters have fixed bounds, so that they are vector instructions.
+        for texel in range(chunk * size, min(texels, (chunk + 1) * size)):
+            t = np.uint64(texel)
+            g[:] = _0
+            for e in range(np.uint64(start[t]), np.uint64(start[t + np.uint64(1)])):
                 other = np.uint64(neighbour[e])
-                for c in range(5):
-                    pull[c] += _sign(values[t, c] - values[other, c])
-                for c in range(5, active):
-                    pull[c] += values[t, c] - values[other, c]
-            for c in range(active, PARAMETERS):
+                for c in range(PARAMETERS):
+                    change = values[t, c] - values[other, c]
+                    g[c] += np.float32(change > _0) - np.float32(change < _0) if c < 5 else _2 * change
+            for c in range(PARAMETERS):
+                g[c] = data[t, c] + smoothness[c] * g[c] + mean_weight[c] * (_1 - values[t, 4] if c < 3 else _1)  # its diffuse part
                 data[t, c] = _0
-                new_values[t, c] = values[t, c]
-            for c in range(active):
-                value = values[t, c]
-                g = data[t, c] + mean_weight[c] * (_1 - values[t, 4] if c < 3 else _1)  # of base colour only the diffuse part
-                data[t, c] = _0
-                if c < 5:
-                    g += smoothness[c] * pull[c]
-                    if regular and c < 3:
-                        encoded, slope = srgb_and_slope(value)
-                        g += common_weight[c] * (encoded - common[t, c]) * slope
-                    elif regular and c == 3:
-                        g += common_weight[3] * (value - common[t, 3])
-                    g *= value * (_1 - value)
-                else:
-                    g += _2 * (smoothness[c] * pull[c] + offset_weight * value)
-                m = beta1 * first[t, c] + (_1 - beta1) * g
-                s = beta2 * second[t, c] + (_1 - beta2) * g * g
-                first[t, c] = m
-                second[t, c] = s
-                r = raw[t, c] - rate[c] * m * correction1 / (math.sqrt(s * correction2) + epsilon)
-                raw[t, c] = r
-                new_values[t, c] = r if c >= 5 else _1 / (_1 + math.exp(-r))
+            if regular:
+                for c in range(3):
+                    encoded, slope = srgb_and_slope(values[t, c])
+                    g[c] += common_weight[c] * (encoded - common[t, c]) * slope
+                g[3] += common_weight[3] * (values[t, 3] - common[t, 3])
+            for c in range(PARAMETERS):
+                g[c] = g[c] * values[t, c] * (_1 - values[t, c]) if c < 5 else g[c] + _2 * offset_weight * values[t, c]
+            for c in range(PARAMETERS):
+                if c < 5 or moves:
+                    m = beta1 * first[t, c] + (_1 - beta1) * g[c]
+                    s = beta2 * second[t, c] + (_1 - beta2) * g[c] * g[c]
+                    first[t, c], second[t, c] = m, s
+                    raw[t, c] -= rate[c] * m * correction1 / (math.sqrt(s * correction2) + epsilon)
+                new_values[t, c] = _logistic(raw[t, c]) if c < 5 else raw[t, c]
 
 
 @kernel(

@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from gsbake.imaging.srgb import decode, encode
 from gsbake.kernels.declaration import kernel
 from gsbake.materials import fit_kernel
-from gsbake.materials.photo import Photo, interpolate
+from gsbake.materials.photo import Photo, interpolate, joined
 from gsbake.shading import brdf
 from gsbake.shading.light_motion import rotated
 from gsbake.shading.light_tables import LightTables, prefilter_cube_map
@@ -77,8 +77,9 @@ Shader = Callable[[NDArray[np.float32]], LinearParts]
 
 @dataclass(frozen=True)
 class PhotoSamples:
-    """n pixels of one photo: the `texel` (n,) each shows, its linear `colour` (n, 3), `weight` (n,), the `block` (n,) of the photo it lies
-    in, the function that shades them, and functions that shade them with normals `tilted` by `NORMAL_ERROR` along a tangent each."""
+    """n pixels of photos under one light: the `texel` (n,) each shows, its linear `colour` (n, 3), `weight` (n,), the `block` (n,) of a
+    photo it lies in, the function that shades them, and functions that shade them with normals `tilted` by `NORMAL_ERROR` along a tangent
+    each; `start` of each photo but the first among the pixels."""
 
     texel: NDArray[np.int64]
     colour: NDArray[np.float32]
@@ -86,6 +87,7 @@ class PhotoSamples:
     block: NDArray[np.int32]
     shade: Shader
     tilted: tuple[Shader, ...] = ()
+    start: tuple[int, ...] = ()
 
     @cached_property
     def encoded(self) -> NDArray[np.float32]:
@@ -276,17 +278,20 @@ class PhotoShader:
 def linear_samples(
     photos: Iterable[Photo], normal_offset: Floats, transport: Records, lights: PhotoLights, tilted: bool = False
 ) -> list[PhotoSamples]:
-    """The pixels of `photos` for searches over all photos, with `tilted` normals as well, on texels with `normal_offset` (texels, 3) and
-    light `transport` (texels,)."""
+    """The pixels of `photos` for searches over all photos, those under the same light together, with `tilted` normals as well, on texels
+    with `normal_offset` (texels, 3) and light `transport` (texels,)."""
     block = np.ascontiguousarray(transport.view(np.float32).reshape(len(transport), -1)[:, : fit_kernel.LOCAL.itemsize // 4])
-    samples = []
+    samples, lit = [], dict[bytes, list[Photo]]()
     for photo in photos:
+        lit.setdefault(b"" if photo.to_light is None else photo.to_light.tobytes(), []).append(photo)
+    for together in lit.values():
+        photo, start = joined(together), tuple(np.cumsum([*map(len, together)])[:-1].tolist())
         normal = photo.normal + interpolate(normal_offset, photo.texel, photo.bilinear)
         local = interpolate(block, photo.texel, photo.bilinear).view(fit_kernel.LOCAL)[:, 0]
         shader, *others = (
             PhotoShader(photo, n, lights.tables(photo.to_light), local, transport) for n in (normal, *(_tilted(normal) if tilted else ()))
         )
-        samples.append(PhotoSamples(photo.dominant_texel, decode(photo.colour), photo.weight, photo.block, shader, tuple(others)))
+        samples.append(PhotoSamples(photo.dominant_texel, decode(photo.colour), photo.weight, photo.block, shader, tuple(others), start))
     return samples
 
 

@@ -141,21 +141,24 @@ def superresolved(maps: Materials, texels: Texels, region: NDArray[np.bool_], ph
     Results darker than any metal, or much darker than the metal around, are holes: dielectric and rough, without a specular reflection of
     the room. The rest of the perforated metal has metallic 1.
     """
-    systems, initial = _photo_systems(photos, region), maps.base_color[region]
-    everything, half, other_half = (
-        _with_local_hue(_solve(some, initial), texels, region) for some in (systems, systems[::2], systems[1::2])
-    )
-    around, perforated = _metal_colour(everything, texels, region).mean(1), region.copy()
-    dark = everything.mean(1) < np.maximum(OPTIONS.dark * around, MIN_METAL_ALBEDO)
-    perforated[region] = _has_holes(texels, region, dark) & _correlated(texels, region, half.mean(1), other_half.mean(1))
-    if not perforated.any():
-        return maps
+
+    def solved(chosen: NDArray[np.bool_], some: slice = slice(None), prior: Callable[[Floats], Floats] | None = None) -> Floats:
+        base = _solve(_photo_systems(photos, chosen)[some], maps.base_color[chosen], prior)
+        return _with_local_hue(base, texels, chosen)
 
     def prior(base: Floats) -> Floats:
         return _metal_or_black(base, texels, perforated)
 
-    solved = _solve(_photo_systems(photos, perforated), maps.base_color[perforated], prior)
-    base = _with_local_hue(solved, texels, perforated)
+    everything, dotted = solved(region), region.copy()
+    dark = everything.mean(1) < np.maximum(OPTIONS.dark * _metal_colour(everything, texels, region).mean(1), MIN_METAL_ALBEDO)
+    dotted[region] = _has_holes(texels, region, dark)
+    if not dotted.any():
+        return maps
+    perforated = dotted.copy()
+    perforated[dotted] = _correlated(texels, dotted, *(solved(dotted, slice(first, None, 2)).mean(1) for first in range(2)))
+    if not perforated.any():
+        return maps
+    base = solved(perforated, prior=prior)
     metal = _metal_colour(base, texels, perforated).mean(1)
     hole = base.mean(1) < np.maximum(OPTIONS.hole_threshold * metal, MIN_METAL_ALBEDO)
     out = maps.copied()
@@ -167,8 +170,10 @@ def superresolved(maps: Materials, texels: Texels, region: NDArray[np.bool_], ph
 
 
 def _blur(texels: Texels, values: NDArray[np.floating], radius: float) -> Floats:
-    """`values` (n, c) blurred in the texture with a Gaussian of `radius` texels; 0 outside the charts."""
-    image = cv2.GaussianBlur(texels.image(values), (0, 0), radius)
+    """`values` (n, c) blurred in the texture with a Gaussian of `radius` texels, a wide one on fewer; 0 outside the charts."""
+    step = max(1, int(radius / 6))
+    small = cv2.resize(texels.image(values), None, fx=1 / step, fy=1 / step, interpolation=cv2.INTER_AREA)
+    image = cv2.resize(cv2.GaussianBlur(small, (0, 0), radius / step), (texels.size, texels.size), interpolation=cv2.INTER_LINEAR)
     return np.asarray(image.reshape(texels.size**2, -1)[texels.index])
 
 

@@ -22,13 +22,18 @@ wider neighbourhood of similar photos does, in which narrow metal between wood o
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
+from numba import prange
 from numpy.typing import NDArray
 
-from gsbake.materials.linear_shading import CLIPPED, BaseColourSolver, LinearParts, LinearShading, PhotoSamples, observed_weight
+from gsbake.kernels.declaration import kernel
+from gsbake.materials.fit_kernel import srgb_and_slope
+from gsbake.materials.linear_shading import CLIPPED, BaseColourSolver, LinearParts, PhotoSamples, observed_weight
 
 Floats = NDArray[np.float64]
 #: A filter of values (texels,).
@@ -72,23 +77,25 @@ class MetalTexels:
     dielectric: tuple[NDArray[np.int64], Floats, Floats]
 
 
-@dataclass(frozen=True)
-class ShadingModel:
-    """The `shading` of a photo's pixels at one roughness and metallic, and the same with `tilted` normals."""
+@kernel("i8[::1], f4[:, ::1], f4[:, :, ::1], f4[:, :, ::1], f8[:, ::1], f4, f4, f4[::1]", parallel=True, nogil=True, error_model="numpy")
+def pixel_costs(texel: Any, encoded: Any, slope: Any, offset: Any, base: Any, noise: Any, freedom: Any, cost: Any) -> None:
+    """`cost` (n,): −log of the likelihood of n pixels, up to a constant, summed over channels.
 
-    shading: LinearShading
-    tilted: tuple[LinearShading, ...]
-
-    def negative_log_likelihood(self, samples: PhotoSamples, base: Floats) -> Floats:
-        """Weighted sums (texels,) over pixels and channels, up to a constant, for base colours `base` (texels, 3)."""
-        b = base[samples.texel]
-        shown = self.shading.srgb(b)
-        variance = np.full(shown.shape, OPTIONS.noise**2, np.float32)
-        for tilted in self.tilted:
-            variance += np.square(tilted.srgb(b) - shown)
-        error = np.square(shown - samples.encoded) / variance
-        nll = 0.5 * (OPTIONS.degrees_of_freedom + 1) * np.log1p(error / OPTIONS.degrees_of_freedom) + 0.5 * np.log(variance)
-        return np.asarray(np.bincount(samples.texel, samples.weight * nll.sum(1), len(base)), np.float64)
+    They show `texel` (n,) as base · slope + offset, the first of `slope` and `offset` (k, n, 3) with the normal as it is, the others with
+    tilted ones, where the photo has the sRGB colour `encoded` (n, 3). The variance is `noise` and the squared changes by the tilts.
+    """
+    for i in prange(len(texel)):
+        errors = variances = np.float32(1)  # products over channels, as logarithms take long
+        for c in range(3):
+            b, variance = np.float32(base[texel[i], c]), noise
+            shown = srgb_and_slope(min(max(b * slope[0, i, c] + offset[0, i, c], np.float32(0)), np.float32(1)))[0]
+            for k in range(1, len(slope)):
+                change = srgb_and_slope(min(max(b * slope[k, i, c] + offset[k, i, c], np.float32(0)), np.float32(1)))[0] - shown
+                variance += change * change
+            error = shown - encoded[i, c]
+            errors *= np.float32(1) + error * error / (variance * freedom)
+            variances *= variance
+        cost[i] = np.float32(0.5) * ((freedom + np.float32(1)) * math.log(errors) + math.log(variances))
 
 
 def _itself(values: Floats) -> Floats:
@@ -109,8 +116,10 @@ def find_metals(photos: Sequence[PhotoSamples], own: NDArray[np.float32], near: 
     texels = len(own)
     dielectric, metal = _compare_models(photos, own)
     telling = [replace(e, weight=e.weight * (e.colour < CLIPPED).any(1)) for e in photos]
-    visible = sum((wide((np.bincount(e.texel, e.weight, texels) > 0).astype(np.float64)) > MIN_PHOTO_SHARE for e in telling),
-                  np.zeros(texels, int))  # fmt: skip
+    visible = np.zeros(texels, int)
+    for e in telling:
+        for texel, weight in zip(np.split(e.texel, e.start), np.split(e.weight, e.start), strict=True):
+            visible += wide((np.bincount(texel, weight, texels) > 0).astype(np.float64)) > MIN_PHOTO_SHARE
     decided = (observed_weight(telling, texels) > MIN_WEIGHT) & (visible >= MIN_PHOTOS)
     difference = metal.cost - dielectric.cost
     evidence = near(difference) / np.maximum(near(observed_weight(photos, texels)), 1e-6)
@@ -142,10 +151,18 @@ def candidate_model(
 ) -> tuple[Floats, Floats]:
     """The best model of one kind with the shading `parts` of `shaded`: costs (texels,), which are negative log-likelihoods up to a
     constant, and base colours (texels, 3)."""
-    models = [ShadingModel(first.of(metal), tuple(one.of(metal) for one in tilted)) for first, *tilted in parts]
-    base = solver.solve([model.shading for model in models], MIN_METAL_ALBEDO if metal else 0.0)
-    costs = [model.negative_log_likelihood(samples, base) for samples, model in zip(photos, models, strict=True)]
-    return sum(costs, np.zeros(len(base))), base
+    base = solver.solve([plain.of(metal) for plain, *_ in parts], MIN_METAL_ALBEDO if metal else 0.0)
+    costs = np.zeros(len(base))
+    for samples, shadings in zip(photos, parts, strict=True):
+        slope, offset = (np.stack([getattr(one.of(metal), part) for one in shadings]) for part in ("slope", "offset"))
+        cost, noise, freedom = (
+            np.empty(len(samples.texel), np.float32),
+            np.float32(OPTIONS.noise**2),
+            np.float32(OPTIONS.degrees_of_freedom),
+        )
+        pixel_costs(samples.texel, samples.encoded, slope, offset, base, noise, freedom, cost)
+        costs += np.bincount(samples.texel, samples.weight * cost, len(base))
+    return costs, base
 
 
 def _compare_models(photos: Sequence[PhotoSamples], own: NDArray[np.float32]) -> tuple[_BestModel, _BestModel]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
@@ -89,10 +89,6 @@ class Scene:
     def each(self, name: str) -> Each:
         """What reports the steps of `name`."""
         return lambda done, total: self.progress(name, done, total)
-
-    def seeded(self, offset: int) -> Scene:
-        """The same with another seed."""
-        return replace(self, seed=self.seed + offset)
 
 
 class Rule(Protocol):

@@ -10,7 +10,7 @@ where photos match; these are anywhere on the object, so specular areas count to
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -133,6 +133,17 @@ class Photo:
         weight = chosen.weight * (total > 0)
         normals = interpolate(normal, texel, bilinear)
         return replace(chosen, texel=texel, bilinear=bilinear, normal=normals, reflected=reflected, weight=weight)
+
+
+def joined(photos: Sequence[Photo]) -> Photo:
+    """All pixels of one or more `photos` under the same light, as if of one, with blocks of their own."""
+    if len(photos) == 1:
+        return photos[0]
+    first = np.cumsum([0, *(int(photo.block.max(initial=-1)) + 1 for photo in photos)])
+    names = "texel", "bilinear", "normal", "view", "colour", "weight", "pixel", "reflected"
+    block = np.concatenate([photo.block + start for photo, start in zip(photos, first, strict=False)]).astype(np.int32)
+    joint: dict[str, Any] = {name: np.concatenate([getattr(photo, name) for photo in photos]) for name in names}
+    return replace(photos[0], block=block, **joint)
 
 
 def coarse_texels(texture: CoarseTexture) -> NDArray[np.int64]:

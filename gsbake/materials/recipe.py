@@ -2,7 +2,7 @@
 
 Short trials from several starts run on the coarsest level, where a step costs a sixteenth; they choose a start, and nothing else of them
 is used. The fit from it, with all searches (light, metals, emissive regions), runs on the coarse level, where a step costs a quarter. The
-fine level continues from the result for a few steps: it sharpens base colours and the edges of metals. Shares are those of
+fine level continues from the result for a few steps: it sharpens base colours. Shares are those of
 `bake.fit_iterations`; among gradient steps `at` are shares of these. A pass that is left out by its name is left out wherever it stands
 (`benchmarks.ablation`).
 """
@@ -34,7 +34,7 @@ COARSE = Steps(
     passes=(
         Pass("emission", EmissionSearch(), at=(0.5,)),
         Pass("light-search", LightSearch(), at=(0.5, 0.6, 0.7, 0.8)),
-        Pass("metal-search", MetalSearch(), at=(0.3, 0.55, 0.8)),
+        Pass("metal-search", MetalSearch(), at=(0.3, 0.55)),
     ),
 )
 #: Texels and light adapt to a change; slowly, so that noise of single photos does not decide.
@@ -45,13 +45,13 @@ ADAPT_AND_SEARCH = Steps(0.15, rate=0.3, sparsity=False, passes=(Pass("light-sea
 #: Texels adapt to a light that is given.
 RELIT = Steps(0.05, rate=0.5, normals=True)
 #: The fine level.
-FINE = Steps(0.25, normals=True, passes=(Pass("metal-search", MetalSearch(), at=(0.3,)),))
+FINE = Steps(0.25, normals=True)
 
 
 def coarsest(steps: Steps) -> Steps:
-    """The same on the coarsest level: fewer, as only the order of the starts counts, and with one step of the light, which takes most of
-    the time there, for two photos."""
-    return replace(steps, share=0.6 * steps.share, photos_per_light=2)
+    """The same on the coarsest level: fewer, as only the order of the starts counts, with one step of the light, which takes most of the
+    time there, for two photos, and without the sparsity prior, whose means take as long as the steps between."""
+    return replace(steps, share=0.6 * steps.share, photos_per_light=2, sparsity=False)
 
 
 _STARTS = StartComparison(coarsest(TRIAL), coarsest(COARSE))
@@ -64,14 +64,13 @@ FIT = (
     Pass("coarse-level", ChosenStart()),
     Pass("coarse-steps", GradientSteps(TRIAL, "material fit, coarse level")),
     Pass("coarse-steps", GradientSteps(COARSE, "material fit, coarse level")),
-    Pass("metal-noise", MetalNoise(rounds=2, steps=ADAPT)),
+    Pass("metal-noise", MetalNoise(steps=ADAPT)),
     Pass("metal-trials", KindTrials(TURN)),
     Pass("light-level", LightLevel(ADAPT_AND_SEARCH)),
     Pass("remaining-shading", RemainingShading(RELIT, rounds=4)),
     Pass("pure-metals", PureMetals()),
     # On the fine level.
     Pass("fine-level", FineLevel()),
-    Pass("metal-noise", MetalNoise()),
     Pass("fine-steps", GradientSteps(FINE, "material fit, fine level")),
     Pass("metal-noise", MetalNoise()),
 )

@@ -265,11 +265,11 @@ class State:
         """The pixels of `photos` for searches under the present light, with `tilted` normals as well."""
         return linear_samples(filter(len, photos), self.values[:, 5:], self.transport, self.lights, tilted)
 
-    def metal_samples(self) -> list[PhotoSamples]:
-        """The pixels that a search for metals uses, with tilted normals, under the present light."""
+    def metal_samples(self, part: slice = slice(None)) -> list[PhotoSamples]:
+        """The pixels that a search for metals uses in `part` of the photos, with tilted normals, under the present light."""
         photos = [photo for photo in self.level.photos if len(photo)]
         step = max(1, sum(map(len, photos)) // (LIMITS.metal_pixels * len(self.values)))
-        return self.samples([photo.every(step) for photo in photos], tilted=True)
+        return self.samples([photo.every(step) for photo in photos[part]], tilted=True)
 
     def decibels(self, photos: list[Photo], materials: Materials | None = None) -> float | None:
         """PSNR in dB over all pixels of `photos` (None without any), with the fitted `materials` or with others."""

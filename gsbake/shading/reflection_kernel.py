@@ -26,7 +26,7 @@ from gsbake.shading.split_sum_kernel import (
 )
 
 _0, _1, _2, _HALF = np.float32(0), np.float32(1), np.float32(2), np.float32(0.5)
-_16 = np.float32(16)
+_16, _LOG_2 = np.float32(16), np.float32(math.log(2))
 _MIN_OCCLUSION_BASE = np.float32(1e-3)
 
 #: Least share of the hemisphere that blocks the light where indirect light is divided by it.
@@ -37,8 +37,9 @@ _MIN_BLOCKED = np.float32(MIN_BLOCKED)
 @njit(forceinline=True, **_FLAGS)
 def specular_occlusion(cosine: Any, roughness: Any, occlusion: Any) -> Any:
     """Specular occlusion of Lagarde & de Rousiers for a positive `cosine`."""
-    exponent = np.float32(2) ** (-_16 * roughness - _1)
-    return min(max(max(min(cosine, _1) + occlusion, _MIN_OCCLUSION_BASE) ** exponent - _1 + occlusion, _0), _1)
+    exponent = math.exp(-_LOG_2 * (_16 * roughness + _1))  # an exponential takes half the time of a power
+    power = math.exp(exponent * math.log(max(min(cosine, _1) + occlusion, _MIN_OCCLUSION_BASE)))
+    return min(max(power - _1 + occlusion, _0), _1)
 
 
 @njit(forceinline=True, **_FLAGS)

@@ -54,7 +54,7 @@ class Plate:
 
     def filtered(self, metal: bool = True) -> NDArray[np.float64]:
         materials = Materials(self.values[:, :3], self.values[:, 3], self.values[:, 4])
-        return without_noise(self.photos, materials, np.full(len(self.values), metal), self.texels, self.pairs)
+        return without_noise((self.photos[::2], self.photos[1::2]), materials, np.full(len(self.values), metal), self.texels, self.pairs)
 
 
 def test_noise_on_a_uniform_metal_is_taken_out() -> None:

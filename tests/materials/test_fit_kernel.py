@@ -9,6 +9,7 @@ import pytest
 import torch
 from numba import set_num_threads
 
+from gsbake.imaging.srgb import encode
 from gsbake.materials import fit_kernel
 from gsbake.materials.linear_shading import KernelTables, PhotoLights, ShadingStep, linear_samples
 from gsbake.materials.photo import Photo
@@ -171,3 +172,36 @@ def test_adam_step_follows_pytorch() -> None:
     assert not gradient.any() and not np.array_equal(spare[:, :5], values[:, :5])
     for before, after in zip(kept, (raw, spare, first, second), strict=True):
         np.testing.assert_array_equal(after[:, 5:], before)
+
+
+def test_the_curve_and_its_slope_are_those_of_srgb() -> None:
+    linear = np.append(np.geomspace(1e-5, 0.999, 500), [0.0, 1.0, 2.0, np.nan]).astype(np.float32)
+    found = np.array([fit_kernel.srgb_and_slope(value) for value in linear])
+    np.testing.assert_allclose(found[:502, 0], encode(linear[:502]), atol=4e-6)
+    assert found[502, 0] == pytest.approx(1) and np.isnan(found[503, 0])  # neither reads beyond the table
+    inner = linear[:500].astype(np.float64)
+    slope = np.where(inner <= 0.0031308, 12.92, 1.055 / 2.4 * inner ** (1 / 2.4 - 1))
+    bright = inner > 1e-4  # below, lines are as wide as the curve is steep
+    np.testing.assert_allclose(found[:500, 1][bright], slope[bright], rtol=6e-2)
+    assert np.abs(found[:500, 1] / slope - 1)[bright].mean() < 6e-3
+
+
+def test_the_logistic_function_of_the_steps() -> None:
+    x = np.linspace(-12, 12, 101, dtype=np.float32)
+    np.testing.assert_allclose([fit_kernel._logistic(value) for value in x], 1 / (1 + np.exp(-x.astype(np.float64))), atol=1e-6)
+    assert 0 < fit_kernel._logistic(np.float32(-99)) < 1e-6
+
+
+def test_photos_under_one_light_are_shaded_together() -> None:
+    """What two photos show apart they show together; another light is apart, and blocks of different photos have different numbers."""
+    case = Case(6, True)
+    turned = replace(case.photo, to_light=np.eye(3)[[1, 2, 0]])
+    lights = PhotoLights(case.light.radiance().detach())
+    parts = [case.photo.rows(slice(0, 1200)), case.photo.rows(slice(1200, None)), turned]
+    together, alone = linear_samples(parts, case.values[:, 5:], case.transport, lights)
+    assert together.start == (1200,) and alone.start == () and len(alone.texel) == PIXELS
+    assert not set(together.block[:1200]) & set(together.block[1200:])
+    rough = np.ascontiguousarray(case.values[:, 3])
+    apart = [linear_samples([part], case.values[:, 5:], case.transport, lights)[0].shade(rough).metal.offset for part in parts]
+    np.testing.assert_array_equal(together.shade(rough).metal.offset, np.concatenate(apart[:2]))
+    np.testing.assert_array_equal(alone.shade(rough).metal.offset, apart[2])

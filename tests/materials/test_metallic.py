@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 import torch
 from numpy.typing import NDArray
+from scipy import stats
 
+from gsbake.imaging.srgb import encode
 from gsbake.materials.linear_shading import LinearParts, LinearShading, PhotoSamples, Shader
-from gsbake.materials.metallic import MIN_METAL_ALBEDO, MIN_PHOTOS, find_metals, majority_vote
+from gsbake.materials.metallic import MIN_METAL_ALBEDO, MIN_PHOTOS, find_metals, majority_vote, pixel_costs
 from gsbake.shading.environment import EnvironmentLight
 from gsbake.shading.split_sum import shade
 from tests.support.linear import linear
@@ -202,3 +204,16 @@ def test_overexposed_white_is_not_metal(wall: Wall, exposure: float) -> None:
     clipped = np.mean([e.colour >= 1 for e in photos])
     assert clipped > (0.95 if exposure > 10 else 0.5)
     assert len(find_metals(photos, np.full(TEXELS, 0.2, np.float32)).texel) == 0
+
+
+def test_costs_of_pixels_are_those_of_students_t() -> None:
+    """Against SciPy's density, whose constant they lack; the scale is that of the noise and of the change by two tilts."""
+    rng, n = np.random.default_rng(4), 40
+    texel, shown, base = rng.integers(0, 9, n), rng.uniform(0, 1, (n, 3)).astype(np.float32), rng.uniform(0.1, 0.9, (9, 3))
+    slope, offset = (rng.uniform(0, high, (3, n, 3)).astype(np.float32) for high in (0.9, 0.2))
+    cost = np.empty(n, np.float32)
+    pixel_costs(texel, shown, slope, offset, base, np.float32(1e-4), np.float32(3), cost)
+    plain, *tilted = encode(base[texel] * slope + offset).astype(np.float64)
+    scale = np.sqrt(1e-4 + sum(np.square(one - plain) for one in tilted))
+    expected = stats.t.logpdf(shown, 3, plain, scale) - stats.t.logpdf(0, 3)
+    np.testing.assert_allclose(cost, -expected.sum(1), rtol=1e-3, atol=1e-3)
