@@ -28,7 +28,7 @@ FIT_KERNELS = (
 
 STAGE = Stage(
     name="bake",
-    version=59,
+    version=60,
     title="Textures",
     run=run,
     summary="{charts} charts, {texels} texels, {fit_psnr:dB} on test photos",

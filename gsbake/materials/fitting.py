@@ -223,7 +223,9 @@ def _report(state: State, read: _Photos, specular: Rule, monitor: Monitor, saved
     monitor.decide("initial material", f"metallic {metallic:g}, roughness {roughness:g}", state.evidence)
     skipped, done = "diffuse object", "specular reflection fitted"
     decide_skip(monitor, "specular", specular, read.diffuse, read.evidence, skipped, done, saved)
-    monitor.decide("light intensity", "; ".join(map(str, state.adjustments)), "lowest residual with the best base colours")
+    open_ = "" if state.open_factors is None else "; factors of {:.2f} to {:.2f} are open, and one over them on base colours"
+    certain = f"lowest residual with the best base colours{open_.format(*state.open_factors or ())}"
+    monitor.decide("light intensity", "; ".join(map(str, state.adjustments)), certain)
     monitor.decide("emission", f"{state.emissive_regions} regions", "bright, bounded by an edge, and independent of irradiance")
 
 
@@ -243,5 +245,7 @@ def _result(state: State, texture: CoarseTexture, footprint: float, read: _Photo
         "fit_texels": len(texture.texels),
         "fit_metal_texels": int(state.metal.sum()),
         "fit_emissive_regions": state.emissive_regions,
+        "light_factor_low": state.open_factors and state.open_factors[0],
+        "light_factor_high": state.open_factors and state.open_factors[1],
     }
     return FitResult(state, state.maps, normal, observed, figures)

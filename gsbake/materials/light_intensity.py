@@ -47,6 +47,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
 
 from gsbake.materials.linear_shading import BaseColourSolver, PhotoSamples
 from gsbake.materials.surface import Materials
@@ -148,7 +149,7 @@ def search_light(
             light = (*candidate.intensity, CONTRAST_EXPONENT**candidate.contrast_steps)
             if light not in lit:
                 lit[light] = samples(candidate.intensity, light[-1])
-            residuals[candidate] = _residual(lit[light], shift_roughness(roughness, ROUGHNESS_STEP * candidate.roughness_steps))
+            residuals[candidate] = block_residual(lit[light], shift_roughness(roughness, ROUGHNESS_STEP * candidate.roughness_steps))
         return residuals[candidate]
 
     def cost(candidate: _Candidate) -> float:
@@ -224,7 +225,7 @@ def _tinted(best: _Candidate, residual: Callable[[_Candidate], Floats]) -> _Cand
     return best
 
 
-def _residual(photos: Sequence[PhotoSamples], roughness: NDArray[np.float32]) -> Floats:
+def block_residual(photos: Sequence[PhotoSamples], roughness: NDArray[np.float32]) -> Floats:
     """Block-averaged absolute residuals (3,) of sRGB values at the best base colours."""
     shadings = [photo.shade(roughness).dielectric for photo in photos]
     base = BaseColourSolver(photos, len(roughness)).solve(shadings, robust=True)
@@ -240,8 +241,9 @@ def _residual(photos: Sequence[PhotoSamples], roughness: NDArray[np.float32]) ->
 DIELECTRICS, METALS, RADIANCE = (0.3, 0.66), (0.66, 0.4), (0.7, 0.29)
 #: Least share of texels of a kind whose base colours count; what is added to those of dielectrics, so that black places do not decide.
 MIN_SHARE, LOG_OFFSET = 0.05, 0.01
-#: Factors on the intensity over which `mean_factor` integrates.
+#: Factors on the intensity over which `mean_factor` integrates, and those at which photos are compared for `open_factors`.
 FACTORS = np.exp(np.linspace(-math.log(4), math.log(4), 121))
+TRIED_FACTORS = FACTORS[::10]
 
 
 @dataclass(frozen=True)
@@ -274,6 +276,18 @@ class IntensityPrior:
         cost = np.array([self.negative_log(factor) for factor in FACTORS])
         density = np.exp(cost.min() - cost)
         return float(np.exp(density @ np.log(FACTORS) / density.sum()))
+
+    def open_factors(self, residuals: NDArray[np.floating] | None = None) -> tuple[float, float]:
+        """The least and the largest factor on the intensity, between 1/4 and 4, whose posterior is above e⁻² of the highest.
+
+        `residuals` (k,) are those of photos at `TRIED_FACTORS`; None: the prior alone.
+        """
+        cost = np.array([self.negative_log(factor) for factor in FACTORS], np.float64)
+        if residuals is not None:
+            logarithm = np.log(np.maximum(residuals, OPTIONS.min_cost))
+            cost += OBSERVATIONS * CubicSpline(np.log(TRIED_FACTORS), logarithm)(np.log(FACTORS))
+        likely = FACTORS[cost <= cost.min() + 2]
+        return float(likely[0]), float(likely[-1])
 
 
 def _negative_log(value: float, median: float, scale: float) -> float:

@@ -17,7 +17,7 @@ The same photos are shaded with gradients for the steps of the fit (`ShadingStep
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -214,6 +214,11 @@ class PhotoLights:
         if key not in self._known:
             self._known[key] = KernelTables.of(prefilter_cube_map(rotated(self.radiance, to_light)))
         return self._known[key]
+
+    def times(self, factor: float) -> PhotoLights:
+        """The light times a `factor`, with the tables known so far."""
+        known = {key: replace(tables, table=tables.table * np.float32(factor)) for key, tables in self._known.items()}
+        return PhotoLights(self.radiance * factor, known)
 
 
 class ShadingStep:

@@ -18,7 +18,7 @@ from gsbake.materials.metal_superresolution import MetalSuperresolution
 from gsbake.materials.metal_trials import KindTrials, LightLevel
 from gsbake.materials.passes import Pass
 from gsbake.materials.remaining_shading import RemainingShading
-from gsbake.materials.searches import EmissionSearch, LightScaling, LightSearch, MetalSearch
+from gsbake.materials.searches import EmissionSearch, LightInterval, LightScaling, LightSearch, MetalSearch
 from gsbake.materials.starts import ChosenStart, MotionComparison, StartComparison
 
 #: Trials of how the light moves: metals take longer to find than such a fit, and have not changed which light fits better.
@@ -69,6 +69,7 @@ FIT = (
     Pass("light-level", LightLevel(ADAPT_AND_SEARCH)),
     Pass("remaining-shading", RemainingShading(RELIT, rounds=4)),
     Pass("pure-metals", PureMetals()),
+    Pass("light-interval", LightInterval()),
     # On the fine level.
     Pass("fine-level", FineLevel()),
     Pass("fine-steps", GradientSteps(FINE, "material fit, fine level")),

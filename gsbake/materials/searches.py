@@ -9,10 +9,11 @@ import torch
 from numpy.typing import NDArray
 
 from gsbake.materials.emission import find_emission
-from gsbake.materials.light_intensity import LightAdjustment, adjust_radiance, search_light
+from gsbake.materials.light_intensity import TRIED_FACTORS, LightAdjustment, adjust_radiance, block_residual, search_light
 from gsbake.materials.linear_shading import PhotoLights, PhotoSamples, linear_samples
 from gsbake.materials.metallic import find_metals
 from gsbake.materials.passes import Scene
+from gsbake.materials.photo import Photo
 from gsbake.materials.state import LIMITS, State
 from gsbake.materials.surface import Materials
 from gsbake.shading.cubemap import solid_angles
@@ -72,16 +73,20 @@ class LightSearch:
         adjusted = adjust_radiance(state.radiance, found.intensity, found.contrast, area)
         return after.under_light(EnvironmentLight.from_radiance(adjusted), dielectric)
 
-    def _search(self, scene: Scene, state: State) -> LightAdjustment:
-        dielectric, surface = state.dielectric, state.level.surface
+    def pixels_of(self, scene: Scene, state: State, pixels: int) -> list[Photo]:
+        """Those among about so many `pixels` that show dielectric texels; of all photos, or of some where the light moves."""
         photos = [photo for photo in state.level.photos if len(photo)]
-        share = min(1.0, self.pixels / max(1, sum(map(len, photos))))
-        chosen = dielectric & (scene.random.random(len(dielectric)) < share)
+        share = min(1.0, pixels / max(1, sum(map(len, photos))))
+        chosen = state.dielectric & (scene.random.random(len(state.values)) < share)
         step = -(-len(photos) // self.moving_photos) if state.level.moving else 1
-        subset = [part for photo in photos[::step] if len(part := photo.showing(chosen))]
+        return [part for photo in photos[::step] if len(part := photo.showing(chosen))]
+
+    def _search(self, scene: Scene, state: State) -> LightAdjustment:
+        surface, subset = state.level.surface, self.pixels_of(scene, state, self.pixels)
         if not subset:
             return LightAdjustment(np.ones(3), 1.0, 0.0, 0.0)
-        radiance, area, rotations = state.radiance, solid_angles(state.light.size), [photo.to_light for photo in photos]
+        radiance, area = state.radiance, solid_angles(state.light.size)
+        rotations = [photo.to_light for photo in state.level.photos if len(photo)]
         visible: dict[float, NDArray[np.float32]] = {}  # the share does not depend on the intensity, and hardly on the tint
 
         def samples_under(intensity: NDArray[np.float64], contrast: float) -> list[PhotoSamples]:
@@ -96,6 +101,34 @@ class LightSearch:
         tint = not scene.diffuse or len(state.adjustments) < self.diffuse_tints
         prior = replace(state.intensity_prior, metals=None)  # reflections of dielectrics tell of the light
         return search_light(samples_under, state.materials.roughness.copy(), tint, not state.adjustments, prior)
+
+
+@dataclass(frozen=True)
+class LightInterval:
+    """Finds the factors on the light's intensity that photos and prior leave open: base colours are known to one over them only. Where most
+    is metal the prior alone says so, as in the search."""
+
+    search: LightSearch = LightSearch()
+    #: Pixels that are compared: enough for an interval.
+    pixels: int = 12_000
+
+    def applies(self, scene: Scene, state: State) -> bool:
+        """Always."""
+        return True
+
+    @torch.no_grad()
+    def run(self, scene: Scene, state: State) -> State:
+        """The same with the `open_factors`."""
+        prior, subset = state.intensity_prior, self.search.pixels_of(scene, state, self.pixels)
+        if not state.mostly_dielectric or not subset:
+            return replace(state, open_factors=prior.open_factors())
+        lights, roughness, residuals = state.lights, state.materials.roughness.copy(), []
+        for photo in subset:
+            lights.tables(photo.to_light)
+        for factor in TRIED_FACTORS:
+            samples = linear_samples(subset, state.values[:, 5:], state.transport, lights.times(float(factor)))
+            residuals.append(block_residual(samples, roughness).sum())
+        return replace(state, open_factors=replace(prior, metals=None).open_factors(np.array(residuals)))
 
 
 @dataclass(frozen=True)

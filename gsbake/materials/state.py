@@ -101,8 +101,8 @@ class State:
     `psnr` on the validation photos when last judged: mean robust error, 0 without any, and dB, None without any.
 
     What passes found: the metallic and roughness of the `chosen_start` and the `evidence`; the light's mean `intensity` (3,) after
-    searches; whether texels' `kinds_changed` since; how the light moves; the materials `selected` for the asset, and the `maps` made of
-    them at its texels.
+    searches, and the least and the largest of the `open_factors` on it; whether texels' `kinds_changed` since; how the light moves; the
+    materials `selected` for the asset, and the `maps` made of them at its texels.
     """
 
     level: Level
@@ -122,6 +122,7 @@ class State:
     chosen_start: tuple[float, float] = (0.0, 0.0)
     evidence: str = ""
     intensity: Doubles | None = None
+    open_factors: tuple[float, float] | None = None
     kinds_changed: bool = False
     light_motion: LightMotion = LightMotion()
     selected: Materials | None = None
@@ -151,7 +152,8 @@ class State:
         start = State.start(level, self.light.size, 0.5)
         start.transport["emission"] = emission
         started = State._of(level, values, start.transport, copied(self.light), self.from_metal)
-        kept = "light_given", "adjustments", "emissive_regions", "chosen_start", "evidence", "intensity", "kinds_changed", "light_motion"
+        kept = "light_given", "adjustments", "emissive_regions", "chosen_start", "evidence", "kinds_changed", "light_motion"
+        started = replace(started, intensity=self.intensity, open_factors=self.open_factors)
         return replace(started, **{name: getattr(self, name) for name in kept})
 
     @property

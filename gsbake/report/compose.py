@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -103,11 +104,13 @@ def heat_map(photo: NDArray[np.floating], render: NDArray[np.floating]) -> NDArr
     return np.asarray(cv2.applyColorMap(coded, cv2.COLORMAP_INFERNO)[..., ::-1] / np.float32(255), np.float32)
 
 
-def panorama(shader: LitShader) -> Panel:
-    """The fitted light as an image, its 95th percentile white."""
+def panorama(shader: LitShader, bake: Mapping[str, Any]) -> Panel:
+    """The fitted light as an image, its 95th percentile white, and which factors on it the results of the `bake` leave open."""
     radiance = shader.equirectangular(PANORAMA_HEIGHT)
     white = max(float(np.quantile(radiance, 0.95)), 1e-6)
-    return Panel("Fitted light", f"white is a radiance of {number(white)}", image_uri(encode(np.clip(radiance / white, 0, 1))))
+    low, high = (bake.get(f"light_factor_{end}") for end in ("low", "high"))
+    certain = f"; a factor of {low:.2f} to {high:.2f} on it is open" if low and high and "white_factor" not in bake else ""
+    return Panel("Fitted light", f"white is a radiance of {number(white)}{certain}", image_uri(encode(np.clip(radiance / white, 0, 1))))
 
 
 def framing_camera(asset: Asset, direction: Array, pixels: int) -> Camera:

@@ -149,7 +149,7 @@ class _ReportWriter:
             region = None if posed.region is None else posed.region.moved(frame_between(posed.cameras.cameras, tuple(cameras)))
             drawn = coverage.map_json(asset, named, points, by_name, proposed, region)
             places = tuple(f"{coverage.in_words(d)} ({share:.0%} of it)" for d, share in proposed)
-        panoramas = () if learnt is None else (compose.panorama(learnt),)
+        panoramas = () if learnt is None else (compose.panorama(learnt, self.manifests["bake"].get("results") or {}),)
         return _Renders(asset, posed, scored, held, learnt is not None, relit, lights, panoramas, drawn, places, beside, density)
 
     def _figures(self, renders: _Renders) -> dict[str, Any]:

@@ -24,9 +24,10 @@ from gsbake.materials.levels import FineLevel, PureMetals
 from gsbake.materials.passes import Priors, Scene
 from gsbake.materials.photo import Photo, PhotoReader, coarse_texels, texel_weight
 from gsbake.materials.recipe import COARSE, TRIAL
+from gsbake.materials.searches import LightInterval
 from gsbake.materials.starts import ChosenStart, Start, StartComparison, Trials, descend_all, started
 from gsbake.materials.state import Finer, Level, State
-from gsbake.materials.surface import InterpolatedTransport, Surface, neighbours
+from gsbake.materials.surface import InterpolatedTransport, Materials, Surface, neighbours
 from gsbake.shading.environment import EnvironmentLight
 from gsbake.shading.light_motion import Motion, light_rotations
 from gsbake.shading.split_sum import shade
@@ -213,6 +214,18 @@ def test_base_colour_and_roughness_are_recovered(glossy: Sphere) -> None:
 def test_all_metal_object_has_no_light_adjustment(glossy: Sphere) -> None:
     fitted = after(glossy.start(0.2, metallic=0.9), 4, Steps(1.0, passes=COARSE.passes[1:2]))
     assert len(fitted.adjustments) > 0 and all(adjustment.improvement == 0 for adjustment in fitted.adjustments)
+
+
+@pytest.mark.parametrize("metallic", [0.05, 0.9])
+def test_the_open_factors_follow_the_light(glossy: Sphere, metallic: float) -> None:
+    """Under a light 1.5 times as bright, on base colours as much darker, they are divided by as much: of photos and of the prior alone."""
+    state, scene = after(glossy.start(0.2, metallic=metallic), 40), Scene(WEAK_PRIORS, 400, 16)
+    m, light = state.materials, EnvironmentLight.from_radiance(1.5 * state.radiance)
+    every = np.arange(len(m))
+    bright = state.with_light(light).with_inside(every, Materials(m.base_color / 1.5, m.roughness, m.metallic)).with_transport()
+    before, after_it = (LightInterval().run(scene, one).open_factors for one in (state, bright))
+    assert before is not None and after_it is not None and before[0] < before[1] < 4
+    assert after_it == pytest.approx(np.array(before) / 1.5, rel=0.08)
 
 
 def test_emission_is_separated_from_base_colour(glossy: Sphere) -> None:

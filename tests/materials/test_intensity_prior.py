@@ -10,7 +10,7 @@ import pytest
 from scipy import integrate, stats
 
 from benchmarks.light_levels import mean_radiance, median_and_scale
-from gsbake.materials.light_intensity import DIELECTRICS, METALS, RADIANCE, IntensityPrior
+from gsbake.materials.light_intensity import DIELECTRICS, METALS, OBSERVATIONS, RADIANCE, TRIED_FACTORS, IntensityPrior
 from gsbake.materials.surface import Materials
 
 #: Normal reflectances, strongest channel (Lagarde & de Rousiers 2014, table 4; iron from the same course).
@@ -45,6 +45,22 @@ def test_the_mean_of_the_prior() -> None:
     assert math.log(prior.mean_factor()) == pytest.approx(moments[1] / moments[0], abs=1e-3)
     assert IntensityPrior(metals=METALS[0]).mean_factor() == pytest.approx(1)
     assert IntensityPrior().mean_factor() == pytest.approx(1)
+
+
+def test_the_open_factors_of_a_prior_are_those_of_its_density() -> None:
+    """Against SciPy's density of Student's t: e⁻² of the highest at both ends, to a step of the factors."""
+    low, high = IntensityPrior(radiance=1.25 * RADIANCE[0]).open_factors()
+    for bound in (low, high):
+        x = math.log(1.25 * bound) / RADIANCE[1]
+        assert stats.t.logpdf(0, 2) - stats.t.logpdf(x, 2) == pytest.approx(2, abs=0.12)
+    assert low < 1 / 1.25 < high
+
+
+def test_the_open_factors_by_photos_are_those_of_their_residuals() -> None:
+    """Without a prior, residuals that grow like exp(5 x²) count as a normal density of standard deviation .1 about .8."""
+    x = np.log(TRIED_FACTORS / 0.8)
+    bounds = IntensityPrior().open_factors(0.02 * np.exp(0.5 * x**2 / 0.1**2 / OBSERVATIONS))
+    assert np.log(bounds) == pytest.approx(np.log(0.8) + np.array([-0.2, 0.2]), abs=0.025)
 
 
 def test_quantities_that_contradict_each_other_meet_between() -> None:

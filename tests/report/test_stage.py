@@ -144,6 +144,14 @@ def test_relit_panels_differ_by_light() -> None:
     assert [p.title for p in panels] == ["As photographed"] and lights == ()
 
 
+def test_the_fitted_light_says_how_certain_it_is() -> None:
+    learnt = LitShader(EnvironmentLight.from_radiance(np.ones((6, 8, 8, 3), np.float32)))
+    found = {"light_factor_low": 0.634, "light_factor_high": 1.55}
+    assert compose.panorama(learnt, found).caption == "white is a radiance of 1; a factor of 0.63 to 1.55 on it is open"
+    for known in (found | {"white_factor": [1.1] * 3}, {}):
+        assert compose.panorama(learnt, known).caption == "white is a radiance of 1"
+
+
 def test_charts_of_the_atlas() -> None:
     faces = np.array([[0, 1, 2], [2, 1, 3], [4, 5, 6]], np.int32)
     found = face_charts(faces, 7)
