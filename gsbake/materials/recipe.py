@@ -2,7 +2,7 @@
 
 Short trials from several starts run on the coarsest level, where a step costs a sixteenth; they choose a start, and nothing else of them
 is used. The fit from it, with all searches (light, metals, emissive regions), runs on the coarse level, where a step costs a quarter. The
-fine level continues from the result for a few steps: it sharpens base colours. Shares are those of
+fine level continues from the result for a few steps: it sharpens base colours and the edges of metals. Shares are those of
 `bake.fit_iterations`; among gradient steps `at` are shares of these. A pass that is left out by its name is left out wherever it stands
 (`benchmarks.ablation`).
 """
@@ -45,7 +45,7 @@ ADAPT_AND_SEARCH = Steps(0.15, rate=0.3, sparsity=False, passes=(Pass("light-sea
 #: Texels adapt to a light that is given.
 RELIT = Steps(0.05, rate=0.5, normals=True)
 #: The fine level.
-FINE = Steps(0.25, normals=True)
+FINE = Steps(0.25, normals=True, passes=(Pass("metal-search", MetalSearch(), at=(0.3,)),))
 
 
 def coarsest(steps: Steps) -> Steps:
