@@ -34,7 +34,7 @@ COARSE = Steps(
     passes=(
         Pass("emission", EmissionSearch(), at=(0.5,)),
         Pass("light-search", LightSearch(), at=(0.5, 0.6, 0.7, 0.8)),
-        Pass("metal-search", MetalSearch(), at=(0.3, 0.55)),
+        Pass("metal-search", MetalSearch(), at=(0.3, 0.55, 0.8)),
     ),
 )
 #: Texels and light adapt to a change; slowly, so that noise of single photos does not decide.
