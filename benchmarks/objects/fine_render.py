@@ -21,6 +21,7 @@ import trimesh
 from benchmarks.objects import fine
 from benchmarks.objects.models import bottle, figurine, model_glb
 from benchmarks.objects.parts import Array, Material
+from benchmarks.truth import Z_UP
 from gsbake.geometry.cameras import Camera
 from gsbake.imaging.png import encode_png
 from gsbake.imaging.srgb import encode_bytes
@@ -34,8 +35,6 @@ VIEWS, SIZE, TEXTURE_SIZE, LIGHT = 24, 2048, 4096, "studio"
 NOISE, FIELD_OF_VIEW, ELEVATIONS = 1.5, 40.0, (-15.0, 70.0)
 #: Rows of a photo that are drawn at once.
 ROWS = 256
-#: From the frame of glTF (+Y up) to that of the poses (+Z up).
-Z_UP = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
 #: Diffuse and bulgy; slightly glossy and turned.
 FINE_MODELS: dict[str, tuple[Callable[[], trimesh.Trimesh], Callable[[Array], Material]]] = {
     "printed": (lambda: figurine(3, 0.12), fine.printed_material),
@@ -54,13 +53,6 @@ def cameras(centre: Array, radius: float, views: int = VIEWS, size: int = SIZE) 
         away = np.array([math.sqrt(1 - up**2) * math.cos(azimuth), math.sqrt(1 - up**2) * math.sin(azimuth), up])
         found.append(look_at(f"{index:04d}", centre + distance * away, centre, 0.0, focal, (0.5 * size, 0.5 * size), size))
     return found
-
-
-def pose(camera: Camera) -> list[list[float]]:
-    """Camera to world, 4 × 4, OpenGL axes."""
-    matrix = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = camera.R.T * [1, -1, -1], camera.centre
-    return [[float(x) for x in row] for row in matrix]
 
 
 def render_fine(name: str, out: Path, views: int = VIEWS, size: int = SIZE, texture: int = TEXTURE_SIZE) -> Path:
@@ -88,7 +80,7 @@ def render_fine(name: str, out: Path, views: int = VIEWS, size: int = SIZE, text
         photo[..., :3] = np.where(photo[..., 3:] > 0, np.clip(np.round(noisy), 0, 255), 0)
         (capture / "images" / f"{camera.name}.png").write_bytes(encode_png(photo, 1))
         (capture / "gt" / "base_color" / f"{camera.name}.png").write_bytes(encode_png(base, 1))
-    frames = [{"file_path": f"images/{camera.name}.png", "transform_matrix": pose(camera)} for camera in placed]
+    frames = [{"file_path": f"images/{camera.name}.png", "transform_matrix": camera.camera_to_world_opengl().tolist()} for camera in placed]
     first = placed[0]
     intrinsics = {"fl_x": first.fx, "fl_y": first.fy, "cx": first.cx, "cy": first.cy, "w": size, "h": size}
     done.write_text(json.dumps(intrinsics | {"frames": frames}, indent=1), encoding="utf-8")

@@ -223,8 +223,10 @@ def _report(state: State, read: _Photos, specular: Rule, monitor: Monitor, saved
     monitor.decide("initial material", f"metallic {metallic:g}, roughness {roughness:g}", state.evidence)
     skipped, done = "diffuse object", "specular reflection fitted"
     decide_skip(monitor, "specular", specular, read.diffuse, read.evidence, skipped, done, saved)
-    open_ = "" if state.open_factors is None else "; factors of {:.2f} to {:.2f} are open, and one over them on base colours"
-    certain = f"lowest residual with the best base colours{open_.format(*state.open_factors or ())}"
+    certain = "lowest residual with the best base colours"
+    if state.open_factors is not None:
+        low, high = state.open_factors
+        certain += f"; factors of {low:.2f} to {high:.2f} are open, and one over them on base colours"
     monitor.decide("light intensity", "; ".join(map(str, state.adjustments)), certain)
     monitor.decide("emission", f"{state.emissive_regions} regions", "bright, bounded by an edge, and independent of irradiance")
 

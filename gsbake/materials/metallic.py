@@ -152,14 +152,10 @@ def candidate_model(
     """The best model of one kind with the shading `parts` of `shaded`: costs (texels,), which are negative log-likelihoods up to a
     constant, and base colours (texels, 3)."""
     base = solver.solve([plain.of(metal) for plain, *_ in parts], MIN_METAL_ALBEDO if metal else 0.0)
-    costs = np.zeros(len(base))
+    costs, noise, freedom = np.zeros(len(base)), np.float32(OPTIONS.noise**2), np.float32(OPTIONS.degrees_of_freedom)
     for samples, shadings in zip(photos, parts, strict=True):
         slope, offset = (np.stack([getattr(one.of(metal), part) for one in shadings]) for part in ("slope", "offset"))
-        cost, noise, freedom = (
-            np.empty(len(samples.texel), np.float32),
-            np.float32(OPTIONS.noise**2),
-            np.float32(OPTIONS.degrees_of_freedom),
-        )
+        cost = np.empty(len(samples.texel), np.float32)
         pixel_costs(samples.texel, samples.encoded, slope, offset, base, noise, freedom, cost)
         costs += np.bincount(samples.texel, samples.weight * cost, len(base))
     return costs, base

@@ -152,8 +152,10 @@ class State:
         start = State.start(level, self.light.size, 0.5)
         start.transport["emission"] = emission
         started = State._of(level, values, start.transport, copied(self.light), self.from_metal)
-        kept = "light_given", "adjustments", "emissive_regions", "chosen_start", "evidence", "kinds_changed", "light_motion"
-        started = replace(started, intensity=self.intensity, open_factors=self.open_factors)
+        kept = (
+            "light_given", "adjustments", "emissive_regions", "chosen_start", "evidence", "intensity", "open_factors", "kinds_changed",
+            "light_motion",
+        )  # fmt: skip
         return replace(started, **{name: getattr(self, name) for name in kept})
 
     @property
