@@ -19,13 +19,10 @@ from gsbake.geometry.raycast import RayCaster
 from gsbake.imaging.exr import write_exr
 from gsbake.kernels.threads import configure
 from gsbake.materials.fitting import RAY_OFFSET, SMOOTHING_RADIUS, FitSettings, fit_materials
-from gsbake.materials.printed_light import printed_factors
 from gsbake.materials.remaining_shading import find_irradiance, remove_shading
-from gsbake.materials.white import Evidence, KnownWhite, common_factor, divide_light, find_white, on_object, with_factor
+from gsbake.materials.white import KnownWhite, divide_light, find_white, white_factor, with_factor
 from gsbake.meshing.repair import repair_foreign
 from gsbake.monitor import SILENT, Monitor, Rule, decide_skip
-from gsbake.shading.environment import EnvironmentLight
-from gsbake.shading.light_motion import LightMotion
 from gsbake.text import number
 from gsbake.texturing.atlas import make_atlas
 from gsbake.texturing.fine_base_color import fine_base_color, needed_bytes
@@ -275,13 +272,7 @@ class _Baking:
         if not white:
             return textures
         projected, light = textures.projected, self.out / "light.safetensors"
-        found = on_object(projected.values, projected.observed, white.on_object)
-        if white.printed:
-            lit = LightMotion.load(self.out / "light_motion.json").rotations
-            radiance = EnvironmentLight.load(light).radiance().detach().numpy()
-            factors = printed_factors(white.printed, self.photos.posed, projected.gains[:, :3], surface.caster, radiance, lit)
-            found += [Evidence(patch.name, factor) for patch, factor in zip(white.printed, factors, strict=True)]
-        factor = common_factor(found, self.monitor)
+        factor = white_factor(white, projected, self.photos.posed, surface.caster, light, self.monitor)
         divide_light(light, factor)
         values = projected.values.copy()
         values[:, :3] = with_factor(values[:, :3], factor, self.monitor)

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from gsbake.imaging.srgb import decode, encode
 from gsbake.materials.descent import Steps, descend
 from gsbake.materials.linear_shading import BaseColourSolver, PhotoSamples, observed_weight
-from gsbake.materials.passes import Scene
+from gsbake.materials.passes import Rule, Scene
 from gsbake.materials.state import State
 from gsbake.materials.surface import EdgeAwareFilter, Materials
 from gsbake.texturing.texels import Texels
@@ -32,7 +32,7 @@ Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class MetalNoise:
+class MetalNoise(Rule):
     """Takes out of metals' base colours the noise that two halves of the photos tell; texels and light then adapt in the gradient `steps`,
     if there are some."""
 

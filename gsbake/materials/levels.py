@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsbake.materials.descent import Steps, descend
-from gsbake.materials.passes import Decide, Scene
+from gsbake.materials.passes import Decide, Rule, Scene
 from gsbake.materials.photo import texel_weight
 from gsbake.materials.state import LIMITS, State
 from gsbake.materials.surface import Materials
@@ -25,7 +25,7 @@ Psnr = Callable[[Materials], float | None]
 
 
 @dataclass(frozen=True)
-class PureMetals:
+class PureMetals(Rule):
     """Scales metallic, where it is metal, so that its median there is 1: metals are pure.
 
     Gradient steps leave it lower, as a share of diffuse reflection makes up for reflections that are misplaced.
@@ -45,7 +45,7 @@ class PureMetals:
 
 
 @dataclass(frozen=True)
-class FineLevel:
+class FineLevel(Rule):
     """Goes on to the next finer level, with base colours that take their detail from the photos' colours there."""
 
     def applies(self, scene: Scene, state: State) -> bool:
@@ -65,15 +65,11 @@ class FineLevel:
 
 
 @dataclass(frozen=True)
-class GradientSteps:
+class GradientSteps(Rule):
     """Gradient `steps` on the present level, reported by the `name`."""
 
     steps: Steps
     name: str
-
-    def applies(self, scene: Scene, state: State) -> bool:
-        """Always."""
-        return True
 
     def run(self, scene: Scene, state: State) -> State:
         """The state after the steps, with the light's intensity that searches left."""
@@ -82,7 +78,7 @@ class GradientSteps:
 
 
 @dataclass(frozen=True)
-class FullTexture:
+class FullTexture(Rule):
     """Brings the maps to the texels of the asset, with the fine detail of the photos' colours."""
 
     def applies(self, scene: Scene, state: State) -> bool:
@@ -101,7 +97,7 @@ class FullTexture:
 
 
 @dataclass(frozen=True)
-class MapSelection:
+class MapSelection(Rule):
     """Replaces metallic and roughness by constants where validation views are reproduced as well."""
 
     #: A constant may lower PSNR by this many dB.
@@ -110,7 +106,7 @@ class MapSelection:
     metal_share: float = 0.002
 
     def applies(self, scene: Scene, state: State) -> bool:
-        """Always."""
+        """Where maps are wanted."""
         return scene.target is not None
 
     def run(self, scene: Scene, state: State) -> State:

@@ -37,7 +37,7 @@ from numpy.typing import NDArray
 from gsbake.imaging.srgb import encode
 from gsbake.materials.linear_shading import LinearShading, PhotoSamples, unclipped_weights
 from gsbake.materials.metallic import MIN_METAL_ALBEDO
-from gsbake.materials.passes import Scene
+from gsbake.materials.passes import Rule, Scene
 from gsbake.materials.photo import PhotoReader
 from gsbake.materials.state import State
 from gsbake.materials.surface import Materials
@@ -106,7 +106,7 @@ class MetalPixels:
 
 
 @dataclass(frozen=True)
-class MetalSuperresolution:
+class MetalSuperresolution(Rule):
     """Solves the base colour of perforated metal at the texels of the asset."""
 
     def applies(self, scene: Scene, state: State) -> bool:

@@ -24,7 +24,7 @@ from scipy.cluster.vq import kmeans2
 from gsbake.materials.descent import Steps, descend
 from gsbake.materials.linear_shading import BaseColourSolver, observed_weight
 from gsbake.materials.metallic import TRIED_ROUGHNESS, candidate_model, shaded
-from gsbake.materials.passes import Scene
+from gsbake.materials.passes import Rule, Scene
 from gsbake.materials.photo import texel_weight
 from gsbake.materials.state import LIMITS, State
 from gsbake.materials.surface import Materials
@@ -77,7 +77,7 @@ class Turn:
 
 
 @dataclass(frozen=True)
-class KindTrials:
+class KindTrials(Rule):
     """Tries groups of texels as the other kind and keeps what validation photos prefer after the gradient `steps` of each trial."""
 
     steps: Steps
@@ -109,7 +109,7 @@ class KindTrials:
 
 
 @dataclass(frozen=True)
-class LightLevel:
+class LightLevel(Rule):
     """Sets the light to the intensity that searches had left, from which gradient steps drift along a valley; where texels changed their
     kind the gradient `steps` search for it again."""
 

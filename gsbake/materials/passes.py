@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -91,12 +91,14 @@ class Scene:
         return lambda done, total: self.progress(name, done, total)
 
 
-class Rule(Protocol):
+class Rule(ABC):
     """What a pass does; its options are the fields of its class."""
 
     def applies(self, scene: Scene, state: State) -> bool:
-        """Whether the photos and the state so far call for it."""
+        """Whether the photos and the state so far call for it: always, unless a rule says otherwise."""
+        return True
 
+    @abstractmethod
     def run(self, scene: Scene, state: State) -> State:
         """The next state."""
 

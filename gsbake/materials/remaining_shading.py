@@ -41,7 +41,7 @@ from scipy.spatial import cKDTree
 
 from gsbake.kernels.declaration import kernel
 from gsbake.materials.descent import Steps, descend
-from gsbake.materials.passes import Scene
+from gsbake.materials.passes import Rule, Scene
 from gsbake.materials.state import State
 from gsbake.shading.cubemap import directions
 from gsbake.shading.environment import EnvironmentLight
@@ -74,7 +74,7 @@ _MAX_CHROMATICITY = np.float32(30)
 
 
 @dataclass(frozen=True)
-class RemainingShading:
+class RemainingShading(Rule):
     """Moves shading left in base colours to the light, `rounds` times and once more; between these texels adapt to it in the gradient
     `steps`.
 

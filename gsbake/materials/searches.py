@@ -12,7 +12,7 @@ from gsbake.materials.emission import find_emission
 from gsbake.materials.light_intensity import TRIED_FACTORS, LightAdjustment, adjust_radiance, block_residual, search_light
 from gsbake.materials.linear_shading import PhotoLights, PhotoSamples, linear_samples
 from gsbake.materials.metallic import find_metals
-from gsbake.materials.passes import Scene
+from gsbake.materials.passes import Rule, Scene
 from gsbake.materials.photo import Photo
 from gsbake.materials.state import LIMITS, State
 from gsbake.materials.surface import Materials
@@ -22,7 +22,7 @@ from gsbake.shading.light_motion import mean_radiance
 
 
 @dataclass(frozen=True)
-class LightScaling:
+class LightScaling(Rule):
     """Scales the light to the intensity expected by the prior, and base colours with it: reflections of metal leave the scale open."""
 
     def applies(self, scene: Scene, state: State) -> bool:
@@ -40,7 +40,7 @@ class LightScaling:
 
 
 @dataclass(frozen=True)
-class LightSearch:
+class LightSearch(Rule):
     """Searches for the light's intensity and contrast and a roughness shift by the reflections of dielectrics (`light_intensity`); scales
     it by the prior where most is metal. Adds to the `adjustments`."""
 
@@ -50,10 +50,6 @@ class LightSearch:
     moving_photos: int = 12
     #: Searches that include the light's tint on a diffuse object: its reflections hardly determine the tint, which then drifts.
     diffuse_tints: int = 2
-
-    def applies(self, scene: Scene, state: State) -> bool:
-        """Always."""
-        return True
 
     @torch.no_grad()
     def run(self, scene: Scene, state: State) -> State:
@@ -104,17 +100,13 @@ class LightSearch:
 
 
 @dataclass(frozen=True)
-class LightInterval:
+class LightInterval(Rule):
     """Finds the factors on the light's intensity that photos and prior leave open: base colours are known to one over them only. Where most
     is metal the prior alone says so, as in the search."""
 
     search: LightSearch = LightSearch()
     #: Pixels that are compared: enough for an interval.
     pixels: int = 12_000
-
-    def applies(self, scene: Scene, state: State) -> bool:
-        """Always."""
-        return True
 
     @torch.no_grad()
     def run(self, scene: Scene, state: State) -> State:
@@ -132,7 +124,7 @@ class LightInterval:
 
 
 @dataclass(frozen=True)
-class MetalSearch:
+class MetalSearch(Rule):
     """Turns texels that are detected as metal into metal, and from a metallic start those that are dielectric (`metallic`)."""
 
     def applies(self, scene: Scene, state: State) -> bool:
@@ -157,12 +149,8 @@ class MetalSearch:
 
 
 @dataclass(frozen=True)
-class EmissionSearch:
+class EmissionSearch(Rule):
     """Finds emissive regions (`emission`), sets their radiance, and makes their base colour black."""
-
-    def applies(self, scene: Scene, state: State) -> bool:
-        """Always."""
-        return True
 
     def run(self, scene: Scene, state: State) -> State:
         """Emissive texels with their radiance."""

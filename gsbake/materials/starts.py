@@ -28,7 +28,7 @@ from gsbake.capture.photos.roles import held_out
 from gsbake.materials.concurrent_fits import Each, run_concurrently
 from gsbake.materials.descent import Steps, descend
 from gsbake.materials.light_intensity import OBSERVATIONS
-from gsbake.materials.passes import Scene
+from gsbake.materials.passes import Rule, Scene
 from gsbake.materials.remaining_shading import moved_to_light, shading_of
 from gsbake.materials.state import Level, State
 from gsbake.shading.light_motion import LightMotion, Motion
@@ -48,7 +48,7 @@ MOTIONS: dict[Motion, str] = {
 
 
 @dataclass(frozen=True)
-class StartComparison:
+class StartComparison(Rule):
     """Trials from several starts by the `trial` steps; the best continued by the `full` ones; and the best of these."""
 
     trial: Steps
@@ -73,10 +73,6 @@ class StartComparison:
     def starts(self) -> tuple[Start, ...]:
         """All starts."""
         return self.dielectric_starts + self.metal_starts
-
-    def applies(self, scene: Scene, state: State) -> bool:
-        """Always."""
-        return True
 
     def run(self, scene: Scene, state: State) -> State:
         """The same with the chosen start and the evidence."""
@@ -133,7 +129,7 @@ class StartComparison:
 
 
 @dataclass(frozen=True)
-class MotionComparison:
+class MotionComparison(Rule):
     """How the light moves, by short fits to photos under lights that move differently, from the `start`, by the `trial` steps. Where one
     that moves wins, both are continued by the `full` steps, and it must win again: it explains photos sooner, and often not better.
 
@@ -173,12 +169,8 @@ class MotionComparison:
 
 
 @dataclass(frozen=True)
-class ChosenStart:
+class ChosenStart(Rule):
     """Starts anew on the next finer level, from the start that was chosen on this one."""
-
-    def applies(self, scene: Scene, state: State) -> bool:
-        """Always."""
-        return True
 
     def run(self, scene: Scene, state: State) -> State:
         """The start there."""

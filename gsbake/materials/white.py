@@ -3,6 +3,10 @@
 Brighter light on darker base colour looks the same, so photos alone hardly tell either; a patch whose reflectance is known does. Base
 colour is multiplied so that it is right there, in each channel, and the light is divided by the same: diffuse colours and the reflections
 of metals stay as they were fitted. Dielectrics reflect 4 % whatever their colour; those reflections change with the light.
+
+Markers and colour cards beside the object say the same: paper of the reflectance R under the irradiance E sends R E / π. The fitted light
+says E at the paper, less what the mesh hides; photos show what the paper sends. A fitted light that is too bright, on base colours that are
+too dark, is so by the ratio of the two.
 """
 
 from __future__ import annotations
@@ -17,11 +21,16 @@ from numpy.typing import NDArray
 from gsbake.capture.posed_photos import PosedPhotos
 from gsbake.config.white import PrintedWhite, WhitePatch, parse_white
 from gsbake.errors import BadInputError
-from gsbake.materials.printed_light import MAX_VALUE
+from gsbake.geometry.cameras import Array
+from gsbake.geometry.raycast import RayCaster
+from gsbake.imaging.srgb import decode_bytes
 from gsbake.monitor import Monitor
 from gsbake.scale.printed_white import PrintedPatches, find_printed
 from gsbake.scale.triangulation import PickedPhotos, find_entry
+from gsbake.shading import cubemap
 from gsbake.shading.environment import EnvironmentLight
+from gsbake.shading.light_motion import LightMotion
+from gsbake.texturing.projection import ProjectedTexture
 from gsbake.texturing.unwrapped_mesh import UnwrappedMesh
 
 Doubles = NDArray[np.float64]
@@ -33,6 +42,12 @@ PATCH_SIZE, PATCH_RAYS = 0.01, 9
 MIN_BASE_COLOR = 0.01
 #: Share of the texels whose base colour may exceed 1, and ratio of two patches, from which on a warning is given.
 MAX_CLIPPED, MAX_RATIO = 0.01, 1.15
+#: Rays over the hemisphere of each point, and their height above the paper, as a share of the object's diagonal.
+RAYS, LIFT = 1024, 0.002
+#: Least cosine of the view and least size in pixels of a patch, and the brightest 8-bit value that is not clipped.
+MIN_COSINE, MIN_PIXELS, MAX_VALUE = 0.3, 4.0, 250
+#: Least radiance of a patch that tells of the light.
+MIN_RADIANCE = 0.005
 
 
 @dataclass(frozen=True)
@@ -116,6 +131,77 @@ def on_object(values: Floats, observed: NDArray[np.bool_], patches: Sequence[Whi
         factor = known / colour if colour.min() >= MIN_BASE_COLOR and not white.clipped else None
         found.append(Evidence(f"patch '{white.patch.text}'", factor, f"{_three(colour)} where {known:g} is known"))
     return found
+
+
+def printed_factors(
+    patches: Sequence[PrintedPatches],
+    posed: PosedPhotos,
+    gains: NDArray[np.floating],
+    caster: RayCaster,
+    radiance: NDArray[np.float32],
+    rotations: Doubles | None,
+) -> list[Doubles | None]:
+    """The factor (3,) on base colour that each of the `patches` in the frame of `posed` asks for, the median over points and photos; None
+    where no photo shows it unclipped and at a sufficient size.
+
+    `gains` (photos, 3) of the exposures; `caster` holds the object, `radiance` (6, s, s, 3) is the fitted light, which `rotations`
+    (photos, 3, 3) turn to the frame of a light that moves.
+    """
+    found: list[list[Doubles]] = [[] for _ in patches]
+    lift = LIFT * float(np.linalg.norm(np.ptp(caster.vertices, axis=0)))
+    origins = [patch.points + lift * patch.normal for patch in patches]
+    rays = [_hemisphere(patch.normal) for patch in patches]
+    free = [np.stack([~caster.occluded(point[None], around) for point in points]) for points, around in zip(origins, rays, strict=True)]
+    for index, camera in enumerate(posed.cameras.cameras):
+        rgb = posed.view(index).rgb
+        for k, patch in enumerate(patches):
+            pixel, depth = camera.project(patch.points)
+            view = camera.centre - patch.points
+            distance = np.linalg.norm(view, axis=1)
+            large = camera.fx * patch.spacing * (view @ patch.normal / distance) / distance > MIN_PIXELS
+            usable = camera.in_view(pixel, depth) & large & (view @ patch.normal > MIN_COSINE * distance)
+            usable[usable] = ~caster.occluded(origins[k][usable], view[usable], 1.0)
+            column, row = np.floor(pixel[usable]).astype(np.int64).T
+            shown = rgb[row, column]
+            clear = (shown <= MAX_VALUE).all(1)
+            seen = decode_bytes(shown[clear]) / np.asarray(gains[index], np.float64)
+            bright = (seen > MIN_RADIANCE).all(1)
+            chosen = np.flatnonzero(usable)[clear][bright]
+            if not len(chosen):
+                continue
+            turned = rays[k] if rotations is None else rays[k] @ rotations[index].T
+            arriving = free[k][chosen].astype(np.float64) @ cubemap.sample(radiance, turned) / RAYS
+            found[k].extend(patch.reflectance[chosen, None] * arriving / seen[bright])
+    return [_factor(factors) for factors in found]
+
+
+def _factor(factors: list[Doubles]) -> Doubles | None:
+    """The median of the factors (3,); None without any, or where the fitted light is black."""
+    factor = np.median(factors, axis=0) if factors else np.zeros(3)
+    return factor if (factor > 0).all() else None
+
+
+def _hemisphere(normal: Array) -> Array:
+    """Directions (RAYS, 3) about a unit `normal` (3,), as dense as the cosine: the mean of what comes along them is the irradiance / π."""
+    k = np.arange(RAYS) + 0.5
+    radius, angle = np.sqrt(k / RAYS), np.pi * (3 - 5**0.5) * k
+    across = np.linalg.svd(normal[None])[2][1:]
+    flat = np.stack([radius * np.cos(angle), radius * np.sin(angle)], 1) @ across
+    return np.asarray(flat + np.sqrt(1 - radius**2)[:, None] * normal)
+
+
+def white_factor(
+    white: KnownWhite, projected: ProjectedTexture, posed: PosedPhotos, caster: RayCaster, light: Path, monitor: Monitor
+) -> Doubles:
+    """The factor (3,) on base colour that all of `white` asks for, by the `projected` maps with fitted materials and by the fitted light in
+    the file `light`, beside which `light_motion.json` says how it moves. `caster` holds the object in the frame of `posed`."""
+    found = on_object(projected.values, projected.observed, white.on_object)
+    if white.printed:
+        rotations = LightMotion.load(light.with_name("light_motion.json")).rotations
+        radiance = EnvironmentLight.load(light).radiance().detach().numpy()
+        factors = printed_factors(white.printed, posed, projected.gains[:, :3], caster, radiance, rotations)
+        found += [Evidence(patch.name, factor) for patch, factor in zip(white.printed, factors, strict=True)]
+    return common_factor(found, monitor)
 
 
 def common_factor(found: Sequence[Evidence], monitor: Monitor) -> Doubles:

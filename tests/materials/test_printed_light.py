@@ -16,7 +16,7 @@ from gsbake.errors import BadInputError
 from gsbake.geometry.cameras import Array, Camera, CameraSet
 from gsbake.geometry.raycast import RayCaster
 from gsbake.imaging.srgb import decode_bytes, encode_bytes
-from gsbake.materials.printed_light import printed_factors
+from gsbake.materials.white import printed_factors
 from gsbake.scale.printed_white import GREYS, find_printed
 from tests.scale.test_markers import photograph, ring
 
