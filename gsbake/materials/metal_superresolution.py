@@ -132,7 +132,9 @@ class MetalSuperresolution(Rule):
 
 def metal_regions(texels: Texels, metal: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Mask (n,) of the texels in a neighbourhood of mostly `metal` (n,)."""
-    return np.asarray(_blur(texels, metal[:, None].astype(np.float32), OPTIONS.region_radius)[:, 0] > OPTIONS.min_metal_share)
+    image = texels.image(metal[:, None].astype(np.float32))
+    share = cv2.GaussianBlur(image, (0, 0), OPTIONS.region_radius).ravel()[texels.index]
+    return np.asarray(share > OPTIONS.min_metal_share)
 
 
 def superresolved(maps: Materials, texels: Texels, region: NDArray[np.bool_], photos: Sequence[MetalPixels]) -> Materials:
@@ -169,14 +171,6 @@ def superresolved(maps: Materials, texels: Texels, region: NDArray[np.bool_], ph
     return out
 
 
-def _blur(texels: Texels, values: NDArray[np.floating], radius: float) -> Floats:
-    """`values` (n, c) blurred in the texture with a Gaussian of `radius` texels, a wide one on fewer; 0 outside the charts."""
-    step = max(1, int(radius / 6))
-    small = cv2.resize(texels.image(values), None, fx=1 / step, fy=1 / step, interpolation=cv2.INTER_AREA)
-    image = cv2.resize(cv2.GaussianBlur(small, (0, 0), radius / step), (texels.size, texels.size), interpolation=cv2.INTER_LINEAR)
-    return np.asarray(image.reshape(texels.size**2, -1)[texels.index])
-
-
 def _has_holes(texels: Texels, region: NDArray[np.bool_], hole: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Which of the t texels in `region` (n,) have both metal and holes (t,) around them."""
     share = _local_mean(hole[:, None].astype(np.float32), texels, region, OPTIONS.local_radius)[:, 0]
@@ -196,9 +190,11 @@ def _local_mean(
 ) -> Floats:
     """Gaussian mean over about `radius` texels of `values` (t, c) in `region` (n,), weighted by `weight` (t,)."""
     w = np.ones(len(values), np.float32) if weight is None else weight
-    weighted = np.zeros((len(region), values.shape[1] + 1), np.float32)
-    weighted[region, :-1], weighted[region, -1] = values * w[:, None], w
-    blurred = _blur(texels, weighted, radius)[region]
+    row, column = np.divmod(texels.index[region], texels.size)
+    row, column = row - row.min(), column - column.min()
+    image = np.zeros((row.max() + 1, column.max() + 1, values.shape[1] + 1), np.float32)
+    image[row, column, :-1], image[row, column, -1] = values * w[:, None], w
+    blurred = cv2.GaussianBlur(image, (0, 0), radius)[row, column]
     return np.asarray(blurred[:, :-1] / np.maximum(blurred[:, -1:], 1e-6))
 
 
