@@ -8,10 +8,10 @@ both into grey. Shading is linear in base colour, though, so with light and roug
 and the pixels of all photos together determine more than one value per pixel. The weighted squares (perceptual, robust) are reduced by
 simultaneous iterations (SIRT), within [0, 1] and near the initial values where no pixel constrains them.
 
-Holes are at the same places in all photos, unexplained reflections are not. So the problem is solved with all photos and with each half of
-them; where the full solution has dark texels beside bright ones and both halves show the same pattern, the metal is perforated. Other metal
-keeps its fitted values, which have less noise. So do dielectrics: their photos depend on diffuse shading, which the fit at pixel size
-determines as well, and residual reflections would become stains.
+Holes are at the same places in all photos, unexplained reflections are not. So the problem is solved with each half of the photos; where
+their mean has dark texels beside bright ones and both show the same pattern, the metal is perforated. The halves start without detail:
+what pixels do not determine would stay in both, and agree. Other metal keeps its fitted values, which have less noise. So do dielectrics:
+their photos depend on diffuse shading, which the fit at pixel size determines as well, and residual reflections would become stains.
 
 Perforated metal is solved once more with a binary prior: one metal, and holes. From step to step every texel is drawn, finally as strongly
 as by the pixels, to metal or to black: the brightest texels to metal, as many as the local mean brightness implies (a threshold at half the
@@ -144,23 +144,25 @@ def superresolved(maps: Materials, texels: Texels, region: NDArray[np.bool_], ph
     the room. The rest of the perforated metal has metallic 1.
     """
 
-    def solved(chosen: NDArray[np.bool_], some: slice = slice(None), prior: Callable[[Floats], Floats] | None = None) -> Floats:
-        base = _solve(_photo_systems(photos, chosen)[some], maps.base_color[chosen], prior)
-        return _with_local_hue(base, texels, chosen)
+    def solved(
+        chosen: NDArray[np.bool_], start: Floats, some: slice = slice(None), prior: Callable[[Floats], Floats] | None = None
+    ) -> Floats:
+        return _with_local_hue(_solve(_photo_systems(photos, chosen)[some], start, prior), texels, chosen)
 
     def prior(base: Floats) -> Floats:
         return _metal_or_black(base, texels, perforated)
 
-    everything, dotted = solved(region), region.copy()
-    dark = everything.mean(1) < np.maximum(OPTIONS.dark * _metal_colour(everything, texels, region).mean(1), MIN_METAL_ALBEDO)
-    dotted[region] = _has_holes(texels, region, dark)
-    if not dotted.any():
+    if not region.any():
         return maps
-    perforated = dotted.copy()
-    perforated[dotted] = _correlated(texels, dotted, *(solved(dotted, slice(first, None, 2)).mean(1) for first in range(2)))
+    even = _local_mean(maps.base_color[region], texels, region, OPTIONS.detail_radius)
+    halves = [solved(region, even, slice(first, None, 2)) for first in range(2)]
+    both = np.asarray((halves[0] + halves[1]) / 2, np.float32)
+    dark = both.mean(1) < np.maximum(OPTIONS.dark * _metal_colour(both, texels, region).mean(1), MIN_METAL_ALBEDO)
+    perforated = region.copy()
+    perforated[region] = _has_holes(texels, region, dark) & _correlated(texels, region, *(half.mean(1) for half in halves))
     if not perforated.any():
         return maps
-    base = solved(perforated, prior=prior)
+    base = solved(perforated, maps.base_color[perforated], prior=prior)
     metal = _metal_colour(base, texels, perforated).mean(1)
     hole = base.mean(1) < np.maximum(OPTIONS.hole_threshold * metal, MIN_METAL_ALBEDO)
     out = maps.copied()

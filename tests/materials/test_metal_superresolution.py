@@ -48,12 +48,12 @@ def full_texture() -> Texels:
     return Texels(SIZE, np.arange(n), np.zeros(n, np.int32), np.zeros((n, 3), np.float32), np.ones(n, bool))
 
 
-def photos(base: NDArray[np.float32], count: int = 30, noise: float = 0.0) -> list[MetalPixels]:
-    """Photos whose pixels are the means of squares of 3 x 3 texels, each photo with its own grid and reflection."""
+def photos(base: NDArray[np.float32], count: int = 30, noise: float = 0.0, grids: int = 3) -> list[MetalPixels]:
+    """Photos whose pixels are the means of squares of 3 x 3 texels, each photo with a reflection and one of `grids`² grids."""
     rng = np.random.default_rng(5)
     out = []
     for _ in range(count):
-        x, y = (rng.integers(0, 3) + 3 * np.arange(SIZE // 3 - 1) for _ in range(2))
+        x, y = (rng.integers(0, grids) + 3 * np.arange(SIZE // 3 - 1) for _ in range(2))
         corner = (y[:, None] * SIZE + x).ravel()
         texel = (corner[:, None] + np.array([i * SIZE + j for i in range(3) for j in range(3)])).astype(np.int64)
         slope = np.repeat(rng.uniform(0.1, 0.9, (len(corner), 1)), 3, 1).astype(np.float32)
@@ -144,6 +144,15 @@ def test_solid_metal_and_dielectrics_are_unchanged() -> None:
     out = solved(values, texels, region, photos(pierced.astype(np.float32)))
     np.testing.assert_array_equal(out[~region], values[~region])
     assert (out[region] != values[region]).mean() > 0.5
+
+
+def test_detail_that_photos_do_not_determine_is_no_pattern() -> None:
+    """Bars a third of a pixel wide in the fitted base colour, and photos of even metal, whose pixels all lie on one grid."""
+    texels = full_texture()
+    values = np.tile(np.array([0.9, 0.9, 0.9, 0.2, 0.8], np.float32), (len(texels), 1))
+    values[COLUMN % 3 == 0, :3] = 0
+    even = np.full((len(texels), 3), 0.6, np.float32)
+    np.testing.assert_array_equal(solved(values, texels, np.ones(len(texels), bool), photos(even, noise=0.01, grids=1)), values)
 
 
 def test_binary_prior_reduces_noise() -> None:
