@@ -22,8 +22,8 @@ KERNELS = (
     "gsbake.texturing.view_fusion",
 )  # fmt: skip
 FIT_KERNELS = (
-    "gsbake.materials.visibility", "gsbake.materials.fit_kernel", "gsbake.materials.linear_shading", "gsbake.materials.metallic",
-    "gsbake.materials.remaining_shading",
+    "gsbake.materials.visibility", "gsbake.materials.fit_kernel", "gsbake.materials.adam_kernel", "gsbake.materials.linear_shading",
+    "gsbake.materials.metallic", "gsbake.materials.remaining_shading",
 )  # fmt: skip
 
 

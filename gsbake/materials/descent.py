@@ -27,7 +27,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from gsbake.materials import fit_kernel
+from gsbake.materials.adam_kernel import adam_step
 from gsbake.materials.concurrent_fits import Each
 from gsbake.materials.linear_shading import KernelTables, ShadingStep
 from gsbake.materials.passes import Pass, Priors, Scene, run_passes
@@ -221,7 +221,7 @@ class _Work:
             common_weight = (self._priors.sparsity * residual / np.square(KERNEL_WIDTHS)).astype(f)
         rate = np.array([o.texel_rate] * 5 + [o.normal_rate if normals else 0.0] * 3, f) * f(decay)
         beta1, beta2 = o.betas
-        fit_kernel.adam_step(
+        adam_step(
             state.logits, state.values, self._spare, self._shade.gradient, *state.moments, *state.level.surface.neighbour_lists,
             *self._weights, f(o.normal_offset_weight), self._common, common_weight, rate, f(beta1), f(beta2),
             f(1 / (1 - beta1**count)), f(1 / (1 - beta2**count)), f(o.epsilon),

@@ -10,7 +10,7 @@ import torch
 from numba import set_num_threads
 
 from gsbake.imaging.srgb import encode
-from gsbake.materials import fit_kernel
+from gsbake.materials import adam_kernel, fit_kernel
 from gsbake.materials.linear_shading import KernelTables, PhotoLights, ShadingStep, linear_samples
 from gsbake.materials.photo import Photo
 from gsbake.shading.environment import EnvironmentLight
@@ -154,7 +154,7 @@ def test_adam_step_follows_pytorch() -> None:
         (loss + (torch.cat([materials, offset], 1) * torch.as_tensor(data)).sum()).backward()
         optimiser.step()
         gradient, f = data.copy(), np.float32
-        fit_kernel.adam_step(
+        adam_kernel.adam_step(
             raw, values, spare, gradient, first, second, start, neighbour, smoothness, mean, f(offset_weight), common, common_weight, rate,
             f(0.9), f(0.99), f(1 / (1 - 0.9**k)), f(1 / (1 - 0.99**k)), f(2e-3),
         )  # fmt: skip
@@ -165,7 +165,7 @@ def test_adam_step_follows_pytorch() -> None:
 
     kept = [array[:, 5:].copy() for array in (raw, values, first, second)]
     gradient, rate[5:] = data.copy(), 0
-    fit_kernel.adam_step(
+    adam_kernel.adam_step(
         raw, values, spare, gradient, first, second, start, neighbour, smoothness, mean, f(offset_weight), common, common_weight, rate,
         f(0.9), f(0.99), f(1), f(1), f(2e-3),
     )  # fmt: skip
@@ -188,8 +188,8 @@ def test_the_curve_and_its_slope_are_those_of_srgb() -> None:
 
 def test_the_logistic_function_of_the_steps() -> None:
     x = np.linspace(-12, 12, 101, dtype=np.float32)
-    np.testing.assert_allclose([fit_kernel._logistic(value) for value in x], 1 / (1 + np.exp(-x.astype(np.float64))), atol=1e-6)
-    assert 0 < fit_kernel._logistic(np.float32(-99)) < 1e-6
+    np.testing.assert_allclose([adam_kernel._logistic(value) for value in x], 1 / (1 + np.exp(-x.astype(np.float64))), atol=1e-6)
+    assert 0 < adam_kernel._logistic(np.float32(-99)) < 1e-6
 
 
 def test_photos_under_one_light_are_shaded_together() -> None:
