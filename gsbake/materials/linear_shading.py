@@ -16,6 +16,7 @@ The same photos are shaded with gradients for the steps of the fit (`ShadingStep
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -45,6 +46,8 @@ MIN_SLOPE_COLOUR = 0.02
 ROUNDS, ROBUST_SCALE = 3, 0.02
 #: Standard deviation of normals, as a length added to the unit normal along each tangent.
 NORMAL_ERROR = 0.035
+#: Turn of the tilt of normals from pixel to pixel.
+GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
 
 
 @dataclass(frozen=True)
@@ -78,8 +81,8 @@ Shader = Callable[[NDArray[np.float32]], LinearParts]
 @dataclass(frozen=True)
 class PhotoSamples:
     """n pixels of photos under one light: the `texel` (n,) each shows, its linear `colour` (n, 3), `weight` (n,), the `block` (n,) of a
-    photo it lies in, the function that shades them, and functions that shade them with normals `tilted` by `NORMAL_ERROR` along a tangent
-    each; `start` of each photo but the first among the pixels."""
+    photo it lies in, the function that shades them, and those that shade them with normals `tilted` by their error; `start` of each photo
+    but the first among the pixels."""
 
     texel: NDArray[np.int64]
     colour: NDArray[np.float32]
@@ -294,17 +297,21 @@ def linear_samples(
         normal = photo.normal + interpolate(normal_offset, photo.texel, photo.bilinear)
         local = interpolate(block, photo.texel, photo.bilinear).view(fit_kernel.LOCAL)[:, 0]
         shader, *others = (
-            PhotoShader(photo, n, lights.tables(photo.to_light), local, transport) for n in (normal, *(_tilted(normal) if tilted else ()))
+            PhotoShader(photo, n, lights.tables(photo.to_light), local, transport) for n in (normal, *([_tilted(normal)] if tilted else []))
         )
         samples.append(PhotoSamples(photo.dominant_texel, decode(photo.colour), photo.weight, photo.block, shader, tuple(others), start))
     return samples
 
 
-def _tilted(normal: Floats) -> tuple[Floats, Floats]:
-    """The `normal` (n, 3), of any length, tilted by `NORMAL_ERROR` along two tangents."""
+def _tilted(normal: Floats) -> Floats:
+    """The `normal` (n, 3), of any length, tilted by `NORMAL_ERROR` along both tangents together.
+
+    These turn by the golden angle from pixel to pixel, so that over the pixels of a texel squared changes are those of two tilts each.
+    """
     unit = normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-20)
     axis = np.where(np.abs(unit[:, :1]) < 0.7, np.array([[1, 0, 0]]), np.array([[0, 1, 0]])).astype(np.float32)
     first = np.cross(unit, axis)
     first /= np.maximum(np.linalg.norm(first, axis=1, keepdims=True), 1e-20)
-    step = np.float32(NORMAL_ERROR)
-    return unit + step * first, unit + step * np.cross(unit, first)
+    angle = (GOLDEN_ANGLE * np.arange(len(unit)))[:, None]
+    tilt = np.cos(angle) * first + np.sin(angle) * np.cross(unit, first)
+    return np.asarray(unit + math.sqrt(2) * NORMAL_ERROR * tilt, np.float32)

@@ -165,11 +165,9 @@ def _compare_models(photos: Sequence[PhotoSamples], own: NDArray[np.float32]) ->
     """The best dielectric and the best metal of each texel over all roughnesses tried."""
     texels = len(own)
     solver, found = BaseColourSolver(photos, texels), (_BestModel(texels), _BestModel(texels))
-    smooth = np.minimum(own, np.float32(OPTIONS.max_metal_roughness))
-    for pair in ((own, smooth), *((r, r) for r in (np.full(texels, tried, np.float32) for tried in TRIED_ROUGHNESS))):
-        parts = shaded(photos, pair[0])
-        found[False].offer(*candidate_model(photos, solver, parts, False), pair[0])
-        if (pair[0] != pair[1]).any():
-            parts = shaded(photos, pair[1])
-        found[True].offer(*candidate_model(photos, solver, parts, True), pair[1])
+    for roughness in (own, *(np.full(texels, tried, np.float32) for tried in TRIED_ROUGHNESS)):
+        parts = shaded(photos, roughness)
+        found[False].offer(*candidate_model(photos, solver, parts, False), roughness)
+        cost, base = candidate_model(photos, solver, parts, True)
+        found[True].offer(np.where(roughness > OPTIONS.max_metal_roughness, np.inf, cost), base, roughness)
     return found

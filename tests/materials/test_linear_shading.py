@@ -8,11 +8,13 @@ from numpy.typing import NDArray
 
 from gsbake.materials.linear_shading import (
     CLIPPED,
+    NORMAL_ERROR,
     ROBUST_SCALE,
     ROUNDS,
     BaseColourSolver,
     LinearShading,
     PhotoSamples,
+    _tilted,
     solve_base_colours,
 )
 
@@ -101,3 +103,11 @@ def test_the_solution_equals_that_by_sums_over_arrays(robust: bool) -> None:
             products = np.bincount(texel, used[:, k] * slope[:, k] * (colour - offset)[:, k].astype(float), texels)
             base[:, k] = np.clip(products / squares, 0.02, 1)
     assert clipped.any() and np.allclose(found, base, rtol=1e-5)
+
+
+@pytest.mark.parametrize("normal", [(0.0, 0.0, 2.0), (1.0, 0.0, 0.0), (0.3, -0.5, 0.4)])
+def test_tilts_have_the_covariance_of_normals_errors(normal: tuple[float, ...]) -> None:
+    """Equal variances along both tangents, none along the normal: that of two tilts by the standard deviation, one along each."""
+    unit = np.array(normal) / np.linalg.norm(normal)
+    change = _tilted(np.tile(np.array(normal, np.float32), (300, 1))) - unit
+    np.testing.assert_allclose(change.T @ change / 300, NORMAL_ERROR**2 * (np.eye(3) - np.outer(unit, unit)), atol=0.01 * NORMAL_ERROR**2)
