@@ -36,8 +36,8 @@ EDGE_MARGIN = 0.008
 EDGE_STEP = 0.015
 #: Photos are reduced to the size of texels that are at least so many pixels wide.
 FINER = 1.5
-#: Code of a sample (of its square root in 16 bit) from which it is clipped, and the weight of one that is only a lower bound.
-CLIPPED_CODE, BOUND_WEIGHT = round(65535 * 0.96**0.5), 0.01
+#: Linear values from which a photo is clipped, and the weight of one that is only a lower bound.
+CLIPPED, BOUND_WEIGHT = 0.96, np.float32(0.01)
 #: A view whose gain is that many times the least is brighter.
 BRIGHTER = 1.05
 #: A texel may lie behind the depth map by this share of the object's diagonal.
@@ -120,8 +120,8 @@ class ProjectionBlender:
         if gains is None:
             return self._fused(np.ones((max(self._count, 1), self._values.shape[2]), np.float32), self._weights)
         brighter = (gains > BRIGHTER * gains.min(0)).any(1)
-        bound = (self._values >= CLIPPED_CODE).any(2) & brighter[np.maximum(self._view, 0)]
-        return self._fused(gains, np.where(bound, np.float32(BOUND_WEIGHT) * self._weights, self._weights))
+        bound = (self._values >= 65535 * CLIPPED**0.5).any(2) & brighter[np.maximum(self._view, 0)]
+        return self._fused(gains, np.where(bound, BOUND_WEIGHT * self._weights, self._weights))
 
     def _fused(self, gains: Floats, weights: Floats) -> ProjectedTexture:
         values, views, confidence = fuse(self._values, weights, self._view, gains)

@@ -8,16 +8,42 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsbake.capture.exposure import MAX_SPREAD
+from gsbake.monitor import Monitor
 from gsbake.texturing.exposure_agreement import Agreement
 from gsbake.texturing.normal_map import DenseSamples
+from gsbake.texturing.view_fusion import disagreement
 
 #: Photos differ in exposure where parts of the surface have at least the first share of the variance of gains in common. The second where
 #: EXIF tells of their exposures: then what is left is light that moves with the camera or the object, unless it is nearly all.
 MIN_COMMON_SHARE, MIN_COMMON_SHARE_WRITTEN = 0.12, 0.7
+#: Exposures within this factor are one: cameras round what they write.
+ONE_EXPOSURE = 1.03
 #: Fewer pairs of parts, or fewer photos, say nothing.
 MIN_PAIRS, MIN_PHOTOS = 10, 20
 #: No normal map is needed where normals deviate by less than this angle (degrees) at this share of the texels.
 MAX_NORMAL_ANGLE, NORMAL_QUANTILE = 2.0, 0.95
+
+
+def believed_exposures(
+    written: NDArray[np.float64] | None, logs: NDArray[np.float64], view: NDArray[np.int64], monitor: Monitor
+) -> tuple[NDArray[np.float64] | None, str]:
+    """The exposures to divide out by EXIF, None where they are equal or not known, and what EXIF says, "" where it is not believed.
+
+    `written` are logarithms (photos,) or None, `logs` and `view` samples of the surface (`view_fusion.log_samples`). Exposures are believed
+    with which photos differ less: photos that were edited since have others, as have those whose light changed.
+    """
+    if written is None or len(logs) == 0:
+        return None, ""
+    spread = float(np.exp(np.ptp(written)))
+    if spread < ONE_EXPOSURE:
+        return None, "EXIF gives all photos one exposure"
+    gains = np.exp(written)[:, None]
+    before, after = disagreement(logs, view, np.ones_like(gains)), disagreement(logs, view, gains)
+    differ = f"photos differ by {100 * np.expm1(after):.0f} % on the surface with them, by {100 * np.expm1(before):.0f} % without"
+    if after < before:
+        return written, f"EXIF gives exposures within {spread:.1f}x: {differ}"
+    monitor.decide("exposures by EXIF", "not used", f"within {spread:.1f}x, but {differ}")
+    return None, ""
 
 
 def constant_exposure(

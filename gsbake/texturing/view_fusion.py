@@ -138,3 +138,9 @@ def solve_gains(logs: NDArray[np.float64], view: NDArray[np.int64], count: int) 
                 gains[v] = np.median(mine, axis=0) * len(mine) / (len(mine) + 50)
         gains -= gains.mean(0)
     return np.exp(np.clip(gains, -1.5, 1.5)).astype(np.float32)
+
+
+def disagreement(logs: NDArray[np.float64], view: NDArray[np.int64], gains: NDArray[np.floating]) -> float:
+    """Mean absolute deviation of the samples `logs` (n, keep, c) from their texel's median, `gains` (views, c) divided out."""
+    equal = logs - np.log(gains)[view]
+    return float(np.nanmean(np.abs(equal - np.nanmedian(equal, axis=1, keepdims=True))))

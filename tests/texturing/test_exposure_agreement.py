@@ -1,4 +1,4 @@
-"""Exposures are told from reflections by parts of the surface that face different ways."""
+"""Exposures are distinguished from reflections by parts of the surface that face different ways."""
 
 from __future__ import annotations
 

@@ -10,6 +10,7 @@ import trimesh
 
 from gsbake.capture.exposure import MAX_SPREAD
 from gsbake.geometry.raycast import RayCaster
+from gsbake.monitor import SILENT, SilentMonitor
 from gsbake.texturing.exposure_agreement import Agreement
 from gsbake.texturing.normal_map import sample_dense_mesh, vertex_normals
 from gsbake.texturing.skip_rules import (
@@ -17,9 +18,22 @@ from gsbake.texturing.skip_rules import (
     MIN_COMMON_SHARE_WRITTEN,
     MIN_PAIRS,
     MIN_PHOTOS,
+    believed_exposures,
     constant_exposure,
     normals_agree,
-)  # fmt: skip
+)
+
+
+class Decisions(SilentMonitor):
+    """Keeps what is decided."""
+
+    def __init__(self) -> None:
+        self.said: dict[str, tuple[str, str]] = {}
+
+    def decide(self, what: str, choice: str, evidence: str, saved: float | None = None) -> None:
+        """Keep it."""
+        self.said[what] = choice, evidence
+
 
 ENOUGH = {"error": 0.05, "pairs": MIN_PAIRS}
 
@@ -48,6 +62,31 @@ def test_what_is_written_takes_more_to_contradict() -> None:
     holds, evidence = constant_exposure(middle, MIN_PHOTOS, written="EXIF gives all photos one exposure")
     assert holds and evidence.startswith(f"EXIF gives all photos one exposure; {100 * middle.share:.0f} ±")
     assert not constant_exposure(all_common, MIN_PHOTOS, 1.0, "EXIF gives all photos one exposure")[0]
+
+
+def surface_samples(exposures: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Samples of a surface in photos of these `exposures` (photos,), with noise."""
+    rng = np.random.default_rng(3)
+    logs = rng.normal(-1, 0.3, (500, 1)) + np.log(exposures) + rng.normal(0, 0.1, (500, len(exposures)))
+    return logs[..., None] * np.ones(3), np.tile(np.arange(len(exposures)), (500, 1))
+
+
+def test_written_exposures_are_believed_where_photos_show_them() -> None:
+    exposures = np.array([0.5, 1.0, 1.0, 2.0, 1.0])
+    known, said = believed_exposures(np.log(exposures), *surface_samples(exposures), SILENT)
+    assert known is not None and np.exp(known) == pytest.approx(exposures) and said.startswith("EXIF gives exposures within 4.0x")
+
+
+def test_written_exposures_of_edited_photos_are_not_believed() -> None:
+    monitor, written = Decisions(), np.log([0.5, 1.0, 1.0, 2.0, 1.0])
+    assert believed_exposures(written, *surface_samples(np.ones(5)), monitor) == (None, "")
+    assert monitor.said["exposures by EXIF"][0] == "not used" and "within 4.0x" in monitor.said["exposures by EXIF"][1]
+
+
+def test_one_written_exposure_is_no_gain() -> None:
+    known, said = believed_exposures(np.log([1.0, 1.01, 1.0]), *surface_samples(np.ones(3)), SILENT)
+    assert known is None and said == "EXIF gives all photos one exposure"
+    assert believed_exposures(None, *surface_samples(np.ones(3)), SILENT) == (None, "")
 
 
 def agreement(subdivisions: int, ripple: float) -> tuple[bool, str]:
