@@ -18,7 +18,7 @@ def run(ctx: Context) -> dict[str, Any]:
 
 STAGE = Stage(
     name="ingest",
-    version=8,
+    version=9,
     title="Photos",
     run=run,
     summary="{photos} photos, {masks} masks, {skipped} skipped",

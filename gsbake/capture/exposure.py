@@ -1,4 +1,4 @@
-"""Exposure differences between photos, measured at the tie points of structure from motion.
+"""Exposure differences between photos: as EXIF has them, and measured at the tie points of structure from motion.
 
 Tie points match because they look the same in their photos, and most lie on the diffuse, textured surroundings of the object. Their
 brightness therefore changes with the exposure alone. The surface of a specular object also changes with the viewing direction: on smooth
@@ -7,7 +7,9 @@ metal photos of equal exposure differ by half.
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +28,20 @@ MIN_VIEWS, MIN_POINTS_PER_PHOTO, MIN_POINTS = 3, 30, 200
 SPREAD_QUANTILE = 0.9
 #: Photos whose spread is below this factor have one exposure: tie points are rarely specular.
 MAX_SPREAD = 1.15
+
+
+def written_exposures(entries: Sequence[Mapping[str, Any]]) -> NDArray[np.float64] | None:
+    """Logarithms (photos,) of the exposures by EXIF, of mean 0, of photos with these `entries` of photos.json.
+
+    None where a photo has none, where cameras or focal lengths differ, whose constants are unknown, and where a flash fired: EXIF does not
+    measure its light.
+    """
+    if not entries or any(not entry.get("light_exposure") or entry["flash"] for entry in entries):
+        return None
+    if len({(entry["camera_model"], entry["camera_body"]) for entry in entries}) > 1:
+        return None
+    logs = np.log([entry["light_exposure"] for entry in entries])
+    return np.asarray(logs - logs.mean())
 
 
 class TiePointExposure:

@@ -11,7 +11,9 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
+from gsbake.capture.exposure import written_exposures
 from gsbake.capture.photos.conversion import file_digest
 from gsbake.capture.photos.originals import Originals, changed_pixels
 from gsbake.capture.photos.undistortion import intrinsics_key, pinhole_camera, undistorted
@@ -64,6 +66,10 @@ class FullPhotos:
             lenses[name] = lens.scaled(width, height)
             pinholes[name] = pinhole.scaled(round(camera.width * width / lens.width), round(camera.height * height / lens.height))
         return lenses, pinholes
+
+    def written_exposures(self) -> NDArray[np.float64] | None:
+        """Logarithms (photos,) of their exposures by EXIF, of mean 0 (`capture.exposure.written_exposures`)."""
+        return written_exposures(self._originals.entries([camera.name for camera in self.posed.cameras.cameras]))
 
     def size_of(self, least: int, share: float) -> int:
         """Longer side in pixels of this `share` of the photos' full size, in the median; less where all together would have more than

@@ -168,7 +168,7 @@ def _read_photos(
         view = posed.view(index, settings.bake.fit_size)
         brightness.add(view)
         photo = reader.read(view.camera, view.rgb, usable.mask(index, view), MAX_PIXELS, index)
-        photos.append(photo.without_gain(gains[index]))
+        photos.append(photo.without_gain(gains[index], gains.min(0)))
         cameras.append(view.camera)
     validation, test = (set(roles(count, settings.holdout)) for roles in (validation_photos, test_photos))
     return _Photos(photos, cameras, validation, test, *is_diffuse(*brightness.statistics()))

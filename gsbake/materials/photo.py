@@ -26,7 +26,7 @@ from gsbake.geometry.raycast import RayCaster
 from gsbake.imaging.srgb import decode, encode
 from gsbake.materials.fit_kernel import interpolate_taps
 from gsbake.shading.reflections import trace_reflections
-from gsbake.texturing.projection import edge_weights
+from gsbake.texturing.projection import BOUND_WEIGHT, BRIGHTER, CLIPPED, edge_weights
 from gsbake.texturing.resampling import CoarseTexture
 from gsbake.texturing.texels import Texels
 
@@ -115,11 +115,17 @@ class Photo:
         """The same on a mesh whose texels have the `normal` (texels, 3)."""
         return replace(self, normal=interpolate(normal, self.texel, self.bilinear))
 
-    def without_gain(self, gain: NDArray[np.floating]) -> Photo:
-        """The pixels with the photo's exposure `gain` (3,) on linear colour divided out."""
+    def without_gain(self, gain: NDArray[np.floating], least: NDArray[np.floating]) -> Photo:
+        """The pixels with the photo's exposure `gain` (3,) on linear colour divided out; `least` (3,) is that of the darkest photo.
+
+        What is clipped in a brighter photo is only a lower bound: it hardly weighs.
+        """
         if np.allclose(gain, 1):
             return self
-        return replace(self, colour=encode(decode(self.colour) / np.asarray(gain, np.float32)))
+        linear, weight = decode(self.colour), self.weight
+        if (gain > BRIGHTER * least).any():
+            weight = np.where((linear >= CLIPPED).any(1), BOUND_WEIGHT * weight, weight)
+        return replace(self, colour=encode(linear / np.asarray(gain, np.float32)), weight=weight)
 
     def on_coarse_texels(self, texture: CoarseTexture, normal: NDArray[np.floating]) -> Photo:
         """One pixel of as many as a coarse texel of `texture` has fine ones, reading the coarse texels that contain these, which have the

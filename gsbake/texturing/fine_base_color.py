@@ -92,7 +92,7 @@ def _project(
             monitor.check_stop()
             reader.add(blender, index)
             monitor.progress(band * len(photos) + index + 1, bands * len(photos), "base colour")
-        fused = blender.result(known_gains=gains)
+        fused = blender.result(gains)
         colour[texels.index], observed[texels.index] = fused.values, fused.observed
         charts[texels.index] = chart_codes(atlas.chart[texels.face])
         energy.add(blender, texels, part, PATCHES // bands, gains)

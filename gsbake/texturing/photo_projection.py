@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -15,10 +16,12 @@ from gsbake.geometry.cameras import Camera
 from gsbake.imaging.srgb import decode_bytes
 from gsbake.monitor import Monitor, Rule, decide_skip
 from gsbake.surfels.renderer import SurfelRenderer
+from gsbake.texturing.exposure_agreement import exposure_agreement
 from gsbake.texturing.projection import ProjectedTexture, ProjectionBlender, mask_weights
-from gsbake.texturing.skip_rules import constant_exposure
+from gsbake.texturing.skip_rules import believed_exposures, constant_exposure
 from gsbake.texturing.unwrapped_mesh import UnwrappedMesh
 from gsbake.texturing.usable_pixels import UsablePixels
+from gsbake.texturing.view_fusion import solve_gains
 
 Floats = NDArray[np.float32]
 
@@ -26,6 +29,8 @@ Floats = NDArray[np.float32]
 HELD_OUT_WEIGHT = 1e-4
 #: Within this share of a photo's longer side from the mask's boundary, pixels weigh less.
 MASK_MARGIN = 0.008
+#: The two outcomes of the rule on exposure.
+CONSTANT, EQUALISED = "exposure taken as constant", "exposure equalised"
 #: Least alpha of a surfel render whose materials are used.
 MIN_ALPHA = 0.8
 
@@ -68,14 +73,37 @@ def project_photos(surface: UnwrappedMesh, photos: FullPhotos, holdout: int, equ
         if tie_points is not None:
             tie_points.add(camera, linear)
         monitor.progress(index + 1, len(posed), "projection")
-    projected = blender.result(solve_exposure=measured)
-    constant, evidence = True, "not measured"
-    if measured:
-        constant, evidence = constant_exposure(projected.gains, projected.explained, None if tie_points is None else tie_points.spread())
-    skipped, done = "exposure taken as constant", "exposure equalised"
-    if decide_skip(monitor, "exposure_equalisation", equalisation, constant, evidence, skipped, done) and (projected.gains != 1).any():
-        projected = blender.result()
-    return projected
+    if not measured:
+        decide_skip(monitor, "exposure_equalisation", equalisation, True, "not measured", CONSTANT, EQUALISED)
+        return blender.result()
+    spread = None if tie_points is None else tie_points.spread()
+    known = photos.written_exposures()
+    return blender.result(_exposure_gains(blender, surface, posed.cameras.cameras, known, spread, equalisation, monitor))
+
+
+def _exposure_gains(
+    blender: ProjectionBlender,
+    surface: UnwrappedMesh,
+    cameras: Sequence[Camera],
+    written: NDArray[np.float64] | None,
+    spread: float | None,
+    rule: Rule,
+    monitor: Monitor,
+) -> Floats | None:
+    """Gains (photos, 3) of the photos in `blender`, None where all have one exposure; `written` are logarithms (photos,) of those by EXIF,
+    `spread` is that at tie points."""
+    logs, view, texel = blender.log_samples()
+    known, said = believed_exposures(written, logs, view, monitor)
+    gains = np.ones((len(cameras), 3), np.float32)
+    if known is not None:
+        gains *= np.exp(known)[:, None].astype(np.float32)
+        logs = logs - known[view][..., None]
+    centres = np.stack([camera.centre for camera in cameras])
+    agreement = exposure_agreement(logs.mean(2), view, surface.texel_position[texel], surface.texel_normal[texel], centres)
+    constant, evidence = constant_exposure(agreement, len(cameras), spread, said)
+    if decide_skip(monitor, "exposure_equalisation", rule, constant and known is None, evidence, CONSTANT, EQUALISED):
+        return None
+    return gains if constant and known is not None else gains * solve_gains(logs, view, len(cameras))
 
 
 def project_surfel_materials(surface: UnwrappedMesh, posed: PosedPhotos, trained: Path, size: int, monitor: Monitor) -> ProjectedTexture:

@@ -1,8 +1,8 @@
 """Projective texturing: views projected onto the texture and fused robustly.
 
 Views are added one at a time. Each texel visible in a view gets a weight: pixels per area (viewing angle and distance), distance to depth
-edges and silhouettes, and the view's own weight image. The `VIEWS_PER_TEXEL` best views of a texel are stored. At the end one exposure gain
-per view and channel may be solved for; a texel's value is the mean of its views near their weighted median, the best ones weighted most:
+edges and silhouettes, and the view's own weight image. The `VIEWS_PER_TEXEL` best views of a texel are stored. At the end an exposure gain
+per view and channel may be divided out; a texel's value is the mean of its views near their weighted median, the best ones weighted most:
 highlights, occluders and misaligned edges are rejected, detail stays as sharp as in the best photos.
 
 Weights after Callieri et al., *Masked photo blending*, Computers & Graphics 2008; robust fusion as a weighted median followed by one
@@ -22,7 +22,7 @@ from gsbake.geometry.cameras import Camera
 from gsbake.geometry.raycast import RayCaster
 from gsbake.kernels.threads import run_chunks
 from gsbake.texturing.gather_kernel import gather
-from gsbake.texturing.view_fusion import fuse, solve_gains
+from gsbake.texturing.view_fusion import fuse, log_samples
 
 Floats = NDArray[np.float32]
 
@@ -36,6 +36,10 @@ EDGE_MARGIN = 0.008
 EDGE_STEP = 0.015
 #: Photos are reduced to the size of texels that are at least so many pixels wide.
 FINER = 1.5
+#: Linear values from which a photo is clipped, and the weight of one that is only a lower bound.
+CLIPPED, BOUND_WEIGHT = 0.96, np.float32(0.01)
+#: A view whose gain is that many times the least is brighter.
+BRIGHTER = 1.05
 #: A texel may lie behind the depth map by this share of the object's diagonal.
 DEPTH_SLACK = 0.003
 
@@ -43,13 +47,12 @@ DEPTH_SLACK = 0.003
 @dataclass(frozen=True)
 class ProjectedTexture:
     """Fused views: `values` (n, c) float32; number of stored `views` (n,) of each texel (0: unobserved); `confidence` (n,) 0..1; `gains`
-    (views, c) divided out of the views; `explained`, the share of the views' differences that the gains explain."""
+    (views, c) divided out of the views."""
 
     values: Floats
     views: NDArray[np.int32]
     confidence: Floats
     gains: Floats
-    explained: float = 0.0
 
     @property
     def observed(self) -> NDArray[np.bool_]:
@@ -109,15 +112,24 @@ class ProjectionBlender:
         self._count += 1
         return sum(shown)
 
-    def result(self, solve_exposure: bool = False, known_gains: Floats | None = None) -> ProjectedTexture:
-        """Fuse the views added. `solve_exposure` first divides out a gain per view and channel (for photos, not for materials);
-        `known_gains` (views, c) are divided out as they are."""
-        channels = self._values.shape[2]
-        gains, explained = np.ones((max(self._count, 1), channels), np.float32) if known_gains is None else known_gains, 0.0
-        if solve_exposure and self._count > 1:
-            gains, explained = solve_gains(self._values, self._weights, self._view, self._count)
-        values, views, confidence = fuse(self._values, self._weights, self._view, gains)
-        return ProjectedTexture(values, views, confidence, gains, explained)
+    def result(self, gains: Floats | None = None) -> ProjectedTexture:
+        """Fuse the views added, their exposure `gains` (views, c) divided out.
+
+        What is clipped in a view that is brighter than the darkest is only a lower bound: it hardly weighs.
+        """
+        if gains is None:
+            return self._fused(np.ones((max(self._count, 1), self._values.shape[2]), np.float32), self._weights)
+        brighter = (gains > BRIGHTER * gains.min(0)).any(1)
+        bound = (self._values >= 65535 * CLIPPED**0.5).any(2) & brighter[np.maximum(self._view, 0)]
+        return self._fused(gains, np.where(bound, BOUND_WEIGHT * self._weights, self._weights))
+
+    def _fused(self, gains: Floats, weights: Floats) -> ProjectedTexture:
+        values, views, confidence = fuse(self._values, weights, self._view, gains)
+        return ProjectedTexture(values, views, confidence, gains)
+
+    def log_samples(self) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.int64]]:
+        """Logarithms of samples, their views and texels (`view_fusion.log_samples`)."""
+        return log_samples(self._values, self._weights, self._view)
 
     def samples(self, rows: NDArray[np.int64], gains: Floats) -> tuple[NDArray[np.float64], Floats, NDArray[np.int16]]:
         """Linear samples (m, keep, c) of the texels `rows` (m,), the views' `gains` (views, c) divided out, with their weights (m, keep)

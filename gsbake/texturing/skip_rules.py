@@ -8,32 +8,66 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsbake.capture.exposure import MAX_SPREAD
+from gsbake.monitor import Monitor
+from gsbake.texturing.exposure_agreement import Agreement
 from gsbake.texturing.normal_map import DenseSamples
+from gsbake.texturing.view_fusion import disagreement
 
-#: Gains between photos below this factor count as view dependence, not exposure: dividing them out would remove reflections.
-MAX_GAIN_SPREAD = 1.25
-#: So do gains that explain less than this share of the differences between photos: exposure scales all of a photo equally, reflections do
-#: not. With tie points a lower share is enough.
-MIN_EXPLAINED, MIN_EXPLAINED_WITH_TIE_POINTS = 0.35, 0.1
+#: Photos differ in exposure where parts of the surface have at least the first share of the variance of gains in common. The second where
+#: EXIF tells of their exposures: then what is left is light that moves with the camera or the object, unless it is nearly all.
+MIN_COMMON_SHARE, MIN_COMMON_SHARE_WRITTEN = 0.12, 0.7
+#: Exposures within this factor are one: cameras round what they write.
+ONE_EXPOSURE = 1.03
+#: Fewer pairs of parts, or fewer photos, say nothing.
+MIN_PAIRS, MIN_PHOTOS = 10, 20
 #: No normal map is needed where normals deviate by less than this angle (degrees) at this share of the texels.
 MAX_NORMAL_ANGLE, NORMAL_QUANTILE = 2.0, 0.95
 
 
-def constant_exposure(gains: NDArray[Any], explained: float, tie_point_spread: float | None = None) -> tuple[bool, str]:
-    """Whether all photos have one exposure, and the evidence.
+def believed_exposures(
+    written: NDArray[np.float64] | None, logs: NDArray[np.float64], view: NDArray[np.int64], monitor: Monitor
+) -> tuple[NDArray[np.float64] | None, str]:
+    """The exposures to divide out by EXIF, None where they are equal or not known, and what EXIF says, "" where it is not believed.
 
-    `gains` (photos, channels; 1 = none) are solved on the surface; `explained` is the share of the photos' differences there that they
-    explain; `tie_point_spread` is the factor within which nine tenths of the photos agree at tie points (`capture.exposure`).
+    `written` are logarithms (photos,) or None, `logs` and `view` samples of the surface (`view_fusion.log_samples`). Exposures are believed
+    with which photos differ less: photos that were edited since have others, as have those whose light changed.
     """
-    spread = float(np.exp(np.abs(np.log(gains)).max()))
-    needed = MIN_EXPLAINED if tie_point_spread is None else MIN_EXPLAINED_WITH_TIE_POINTS
-    evidence = f"gains on the surface up to {spread:.2f}x, threshold {MAX_GAIN_SPREAD:g}x"
-    if spread >= MAX_GAIN_SPREAD:
-        evidence += f"; they explain {100 * explained:.0f} % of the differences, threshold {100 * needed:g} %"
-    if tie_point_spread is not None:
-        evidence += f"; 90 % of tie points agree within {tie_point_spread:.2f}x, threshold {MAX_SPREAD:g}x"
-    agreeing = tie_point_spread is not None and tie_point_spread < MAX_SPREAD
-    return spread < MAX_GAIN_SPREAD or explained < needed or agreeing, evidence
+    if written is None or len(logs) == 0:
+        return None, ""
+    spread = float(np.exp(np.ptp(written)))
+    if spread < ONE_EXPOSURE:
+        return None, "EXIF gives all photos one exposure"
+    gains = np.exp(written)[:, None]
+    before, after = disagreement(logs, view, np.ones_like(gains)), disagreement(logs, view, gains)
+    differ = f"photos differ by {100 * np.expm1(after):.0f} % on the surface with them, by {100 * np.expm1(before):.0f} % without"
+    if after < before:
+        return written, f"EXIF gives exposures within {spread:.1f}x: {differ}"
+    monitor.decide("exposures by EXIF", "not used", f"within {spread:.1f}x, but {differ}")
+    return None, ""
+
+
+def constant_exposure(
+    agreement: Agreement | None, photos: int, tie_point_spread: float | None = None, written: str = ""
+) -> tuple[bool, str]:
+    """Whether all `photos` have one exposure, and the evidence.
+
+    `agreement` is that of their gains on the surface, `tie_point_spread` the factor within which nine tenths of them agree at tie points
+    (`capture.exposure`), `written` says what EXIF knows of the exposures, which is divided out.
+    """
+    needed = MIN_COMMON_SHARE_WRITTEN if written else MIN_COMMON_SHARE
+    evidence = [written] if written else []
+    differ = agreement is not None and agreement.pairs >= MIN_PAIRS and photos >= MIN_PHOTOS and agreement.share >= needed
+    if agreement is None:
+        evidence.append("no parts of the surface that face different ways can be compared")
+    else:
+        common = (
+            f"{100 * max(agreement.share, 0):.0f} ± {100 * agreement.error:.0f} % of the gains' variance is common to parts of the surface"
+        )
+        evidence.append(f"{common} that face different ways ({agreement.pairs} pairs of {photos} photos), threshold {100 * needed:.0f} %")
+    if tie_point_spread is not None and not written:
+        evidence.append(f"90 % of the photos agree within {tie_point_spread:.2f}x at tie points, threshold {MAX_SPREAD:g}x")
+        differ &= tie_point_spread >= MAX_SPREAD
+    return not differ, "; ".join(evidence)
 
 
 def normals_agree(detail: DenseSamples, normal: NDArray[Any]) -> tuple[bool, str]:

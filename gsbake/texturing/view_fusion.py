@@ -46,9 +46,7 @@ def _median(value: NDArray[np.float64], weight: NDArray[np.float64], count: int,
     return value[order[count - 1]]
 
 
-@kernel(
-    "i8, i8, u2[:, :, ::1], f4[:, ::1], i2[:, ::1], f4[:, ::1], f4[:, ::1], i4[::1], f4[::1]", nogil=True, error_model="numpy"
-)
+@kernel("i8, i8, u2[:, :, ::1], f4[:, ::1], i2[:, ::1], f4[:, ::1], f4[:, ::1], i4[::1], f4[::1]", nogil=True, error_model="numpy")
 def _fuse(
     lo: int, hi: int, values: Codes, weights: Floats, views: NDArray[np.int16], gains: Floats, out: Floats, view_count: NDArray[np.int32],
     confidence: Floats,
@@ -102,26 +100,34 @@ def fuse(values: Codes, weights: Floats, views: NDArray[np.int16], gains: Floats
     return out, view_count, confidence
 
 
-def solve_gains(values: Codes, weights: Floats, views: NDArray[np.int16], count: int) -> tuple[Floats, float]:
-    """Gain (count, c) of each view relative to the others, with geometric mean 1, from texels that several views share; and the share of
-    the views' differences there (mean absolute logarithm) that the gains explain.
+def log_samples(
+    values: Codes, weights: Floats, views: NDArray[np.int16]
+) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.int64]]:
+    """Logarithms (m, keep, c) of linear samples of some GAIN_TEXELS texels, the views (m, keep) they are from, and the texels (m,).
 
-    Alternates between each texel's weighted median and each view's median ratio to it, in logarithms.
+    NaN is what is clipped or dark; texels are those that three or more views show otherwise.
+
+    `values` (n, keep, c), `weights` (n, keep) and `views` (n, keep) are those of `fuse`.
     """
-    channels = values.shape[2]
     shared = np.flatnonzero((weights > 0).sum(1) >= 3)
     chosen = shared[:: max(1, len(shared) // GAIN_TEXELS)]
-    gains = np.zeros((count, channels))
-    if len(chosen) < 100:
-        return np.ones((count, channels), np.float32), 0.0
     linear = (values[chosen] / 65535.0) ** 2
     usable = (weights[chosen] > 0) & (linear > 0.004).all(2) & (linear < 0.96).all(2)
     logs = np.where(usable[..., None], np.log(np.maximum(linear, 1e-4)), np.nan)
-    view = np.maximum(views[chosen], 0)
     enough = usable.sum(1) >= 3
-    logs, usable, view = logs[enough], usable[enough], view[enough]
+    return logs[enough], np.maximum(views[chosen[enough]], 0).astype(np.int64), chosen[enough]
+
+
+def solve_gains(logs: NDArray[np.float64], view: NDArray[np.int64], count: int) -> Floats:
+    """Gain (count, c) of each view relative to the others, with geometric mean 1, from samples `logs` (n, keep, c) of the views `view`
+    (n, keep), as `log_samples` makes them.
+
+    Alternates between each texel's median and each view's median ratio to it, in logarithms.
+    """
+    gains = np.zeros((count, logs.shape[2]))
     if len(logs) < 100:
-        return np.ones((count, channels), np.float32), 0.0
+        return np.ones(gains.shape, np.float32)
+    usable = np.isfinite(logs[..., 0])
     for _ in range(GAIN_ROUNDS):
         centre = np.nanmedian(logs - gains[view], axis=1, keepdims=True)
         ratio = logs - centre
@@ -131,10 +137,10 @@ def solve_gains(values: Codes, weights: Floats, views: NDArray[np.int16], count:
             if len(mine):
                 gains[v] = np.median(mine, axis=0) * len(mine) / (len(mine) + 50)
         gains -= gains.mean(0)
+    return np.exp(np.clip(gains, -1.5, 1.5)).astype(np.float32)
 
-    def difference(logs: NDArray[np.float64]) -> float:
-        return float(np.nanmean(np.abs(logs - np.nanmedian(logs, axis=1, keepdims=True))))
 
-    gains = np.clip(gains, -1.5, 1.5)
-    explained = 1 - difference(logs - gains[view]) / max(difference(logs), 1e-9)
-    return np.exp(gains).astype(np.float32), max(0.0, explained)
+def disagreement(logs: NDArray[np.float64], view: NDArray[np.int64], gains: NDArray[np.floating]) -> float:
+    """Mean absolute deviation of the samples `logs` (n, keep, c) from their texel's median, `gains` (views, c) divided out."""
+    equal = logs - np.log(gains)[view]
+    return float(np.nanmean(np.abs(equal - np.nanmedian(equal, axis=1, keepdims=True))))

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gsbake.capture.exposure import MIN_POINTS, TiePointExposure
+from gsbake.capture.exposure import MIN_POINTS, TiePointExposure, written_exposures
 from gsbake.capture.poses.colmap_model import read_tracks
 from gsbake.geometry.cameras import Camera
 from gsbake.imaging.srgb import decode_bytes, encode_bytes
@@ -37,6 +37,20 @@ def tie_points(gain: np.ndarray, specular_share: float = 0.0, count: int = POINT
         full[: image.shape[0], : image.shape[1]] = image
         tie_point_exposure.add(camera, decode_bytes(encode_bytes(np.repeat(np.clip(full, 0, 1)[..., None], 3, 2))))
     return tie_point_exposure
+
+
+def entry(exposure: float | None, **other: object) -> dict[str, object]:
+    return {"light_exposure": exposure, "flash": False, "camera_model": "Maker One 50 mm", "camera_body": None, **other}
+
+
+def test_written_exposures_are_relative() -> None:
+    found = written_exposures([entry(0.1), entry(0.4), entry(0.2)])
+    assert found == pytest.approx([-np.log(2), np.log(2), 0])
+
+
+@pytest.mark.parametrize("other", [entry(None), entry(0.1, flash=True), entry(0.1, camera_model="Maker Two"), entry(0.1, camera_body="1")])
+def test_exposures_that_cannot_be_compared_are_not_known(other: dict[str, object]) -> None:
+    assert written_exposures([entry(0.1), other]) is None and written_exposures([]) is None
 
 
 def test_equal_exposures_have_no_spread() -> None:

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 from PIL import Image
+from PIL.TiffImagePlugin import IFDRational
 
 from gsbake.capture.photos.quality import blur_effect, find_blurred, find_near_duplicates
 from gsbake.errors import BadInputError
@@ -154,6 +155,18 @@ def test_whether_a_flash_fired(tmp_path: Path, runner: Runner) -> None:
     _, done = runner.ingest(tmp_path)
     found = {e["name"]: e["flash"] for e in json.loads((done.out / "photos.json").read_text(encoding="utf-8"))["photos"]}
     assert found == {"fired": True, "off": False, "auto": False, "p0": None, "p1": None, "p2": None}
+
+
+def test_the_exposure_by_exif(tmp_path: Path, runner: Runner) -> None:
+    """1/50 s at f/4 and ISO 200 is as bright as 1/100 s at f/2 and ISO 100; without one of the three it is not known."""
+    folder = photos(tmp_path / "images", 3)
+    for k, (time, aperture, speed) in enumerate(((50, 4, 200), (100, 2, 100), (100, 2, None))):
+        exif = Image.Exif()
+        exif.get_ifd(0x8769).update({0x829A: IFDRational(1, time), 0x829D: IFDRational(aperture, 1)} | ({0x8827: speed} if speed else {}))
+        Image.fromarray(picture(20 + k)).save(folder / f"e{k}.jpg", exif=exif)
+    _, done = runner.ingest(tmp_path)
+    found = {e["name"]: e["light_exposure"] for e in json.loads((done.out / "photos.json").read_text(encoding="utf-8"))["photos"]}
+    assert found["e0"] == pytest.approx(0.25) and found["e1"] == pytest.approx(0.25) and found["e2"] is None and found["p0"] is None
 
 
 def test_photos_of_equal_names(tmp_path: Path, runner: Runner) -> None:

@@ -415,7 +415,17 @@ def test_gain_is_divided_out_of_linear_colour() -> None:
     one = np.ones((1, 3), np.float32)
     photo = Photo(np.zeros((1, 4), np.int32), np.full((1, 4), 0.25, np.float32), one, one, encode(np.array([[0.4, 0.2, 0.1]])),
                   np.ones(1, np.float32), np.zeros(1, np.int32), np.zeros(1, np.int64))  # fmt: skip
-    assert decode(photo.without_gain(np.array([2.0, 1.0, 0.5])).colour) == pytest.approx(np.array([[0.2, 0.2, 0.2]]), abs=1e-5)
+    equal = photo.without_gain(np.array([2.0, 1.0, 0.5]), np.array([0.5, 0.5, 0.5]))
+    assert decode(equal.colour) == pytest.approx(np.array([[0.2, 0.2, 0.2]]), abs=1e-5) and equal.weight == photo.weight
+
+
+@pytest.mark.parametrize(("gain", "weighs"), [(2.0, False), (0.5, True)])
+def test_what_is_clipped_in_a_brighter_photo_hardly_weighs(gain: float, weighs: bool) -> None:
+    one, colour = np.ones((2, 3), np.float32), encode(np.array([[1.0, 0.9, 0.9], [0.5, 0.5, 0.5]]))
+    photo = Photo(np.zeros((2, 4), np.int32), np.full((2, 4), 0.25, np.float32), one, one, colour, np.ones(2, np.float32),
+                  np.zeros(2, np.int32), np.arange(2))  # fmt: skip
+    weight = photo.without_gain(gain * np.ones(3), 0.5 * np.ones(3)).weight
+    assert weight[1] == 1 and (weight[0] == 1) == weighs and weight[0] > 0
 
 
 def test_coarse_texture_preserves_means_and_detail() -> None:

@@ -26,7 +26,7 @@ from gsbake.capture.photos.decode import (
     read_photo,
     to_working_size,
 )
-from gsbake.capture.photos.exif import camera_body, camera_key, flash_fired, focal_pixels, gps_position, written_size
+from gsbake.capture.photos.exif import camera_body, camera_key, flash_fired, focal_pixels, gps_position, light_exposure, written_size
 from gsbake.capture.photos.hdr import has_gain_map
 from gsbake.capture.photos.heic_and_raw import HEIC_SUFFIXES
 from gsbake.capture.photos.quality import Quality, measure_quality
@@ -140,6 +140,7 @@ def convert(what: Conversion) -> ConvertedPhoto:
         "written_size": written_size(photo.tags),
         "gain_map": "applied" if photo.gain_map else "not used" if has_gain_map(what.path) else None,
         "flash": flash_fired(photo.tags),
+        "light_exposure": light_exposure(photo.tags),
         "gps": gps_position(photo.tags),
         "blur": quality.blur,
         "exposure": quality.exposure,

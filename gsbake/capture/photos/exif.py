@@ -1,4 +1,4 @@
-"""Focal length in pixels, the flash, and the position by satellite navigation, from EXIF (CIPA DC-008, "Exif 2.32").
+"""Focal length in pixels, exposure, the flash, and the position by satellite navigation, from EXIF (CIPA DC-008, "Exif 2.32").
 
 The focal length only initialises structure from motion: photos get cropped and resized without an update of their EXIF.
 """
@@ -82,6 +82,14 @@ def camera_body(tags: Mapping[str, Any]) -> str | None:
     """A digest of the body's serial number, which tells two of one model apart and names none; None where EXIF has no number."""
     serial = str(tags.get("Exif:BodySerialNumber", "")).strip(" \0")
     return blake3(serial.encode("utf-8", "surrogatepass")).hexdigest()[:12] if serial.strip("0") else None
+
+
+def light_exposure(tags: Mapping[str, Any]) -> float | None:
+    """Factor from scene luminance to the values of a photo, up to a constant of its camera: time in seconds times ISO speed over the square
+    of the f-number; None where EXIF does not have all three."""
+    time, aperture = _number(tags, "ExposureTime"), _number(tags, "FNumber")
+    speed = _number(tags, "Exif:PhotographicSensitivity", "Exif:ISOSpeedRatings")
+    return None if time is None or aperture is None or speed is None else time * speed / aperture**2
 
 
 def flash_fired(tags: Mapping[str, Any]) -> bool | None:

@@ -26,6 +26,7 @@ _EXIF_TAGS = {
     0x920A: "Exif:FocalLength", 0xA405: "Exif:FocalLengthIn35mmFilm", 0xA20E: "Exif:FocalPlaneXResolution",
     0xA210: "Exif:FocalPlaneResolutionUnit", 0xA002: "Exif:PixelXDimension", 0xA003: "Exif:PixelYDimension",
     0xA431: "Exif:BodySerialNumber", 0x9209: "Exif:Flash",
+    0x829A: "ExposureTime", 0x829D: "FNumber", 0x8827: "Exif:PhotographicSensitivity",
 }  # fmt: skip
 _GPS_TAGS = {
     1: "GPS:LatitudeRef", 2: "GPS:Latitude", 3: "GPS:LongitudeRef", 4: "GPS:Longitude", 5: "GPS:AltitudeRef", 6: "GPS:Altitude",

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -47,6 +48,11 @@ class Originals:
     def close(self) -> None:
         """End the processes that decode; a later call starts them again."""
         self._processes.close()
+
+    def entries(self, names: Sequence[str]) -> list[dict[str, Any]]:
+        """What the ingest stage wrote of photos; nothing where it did not of all of them."""
+        found = [self._entries[name] for name in names if name in self._entries]
+        return found if len(found) == len(names) else []
 
     def has(self, name: str) -> bool:
         """Whether there is more of a photo than its working photo."""
