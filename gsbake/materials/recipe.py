@@ -1,8 +1,8 @@
 """The recipe of the material fit: all its passes in order, and those among gradient steps.
 
-Short trials from several starts run on the coarsest level, where a step costs a sixteenth; they choose a start, and nothing else of them
-is used. The fit from it, with all searches (light, metals, emissive regions), runs on the coarse level, where a step costs a quarter. The
-fine level continues from the result for a few steps: it sharpens base colours and the edges of metals. Shares are those of
+Fits from several starts run on the coarsest level, where a step costs a sixteenth; they choose a start, and nothing else of them is used.
+The fit from it, with all searches (light, metals, emissive regions), runs on the coarse level, where a step costs a quarter. The fine
+level continues from the result for a few steps: it sharpens base colours and the edges of metals. Shares are those of
 `bake.fit_iterations`; among gradient steps `at` are shares of these. A pass that is left out by its name is left out wherever it stands
 (`benchmarks.ablation`).
 """
@@ -37,6 +37,16 @@ COARSE = Steps(
         Pass("metal-search", MetalSearch(), at=(0.3, 0.55, 0.8)),
     ),
 )
+#: A fit that is compared with those from other starts: as many steps as a sharp light takes.
+START = Steps(
+    0.9, sparsity=False, photos_per_light=2,
+    passes=(
+        Pass("light-scaling", LightScaling(), at=(0.25,)),
+        Pass("emission", EmissionSearch(), at=(0.6,)),
+        Pass("light-search", LightSearch(), at=(0.5, 0.65, 0.8)),
+        Pass("metal-search", MetalSearch(), at=(0.15, 0.35, 0.6, 0.8)),
+    ),
+)  # fmt: skip
 #: Texels and light adapt to a change; slowly, so that noise of single photos does not decide.
 ADAPT = Steps(0.15, rate=0.3, sparsity=False)
 #: The same to another kind, in many trials.
@@ -54,7 +64,7 @@ def coarsest(steps: Steps) -> Steps:
     return replace(steps, share=0.6 * steps.share, photos_per_light=2, sparsity=False)
 
 
-_STARTS = StartComparison(coarsest(TRIAL), coarsest(COARSE))
+_STARTS = StartComparison(START)
 #: The fit.
 FIT = (
     # On the coarsest level.

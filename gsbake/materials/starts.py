@@ -2,10 +2,10 @@
 
 Gradient steps find the optimum near their start. A surface that starts too rough cannot localise light, and its reflections end up in base
 colour; one that starts dielectric explains a metal's reflections by a diffuse base colour under a light of their colour, and stays there.
-So short fits on the coarsest level, from all-dielectric and all-metal starts of several roughnesses, are compared on photos that they were
-not fitted to. On the way texels are decided one by one between metal and dielectric, so either start can end as any mixture. Those close to
-the best are continued with all searches, and compared again. What is used of them is the start that won: the fit itself starts there anew,
-on a finer level.
+So fits on the coarsest level, from all-dielectric and all-metal starts of several roughnesses, are compared on photos that they were not
+fitted to. None is left out early: a smooth light fits in a few steps, and the sharp one that glaze and polish call for in hundreds, so
+that after few steps the roughest start is ahead on smooth objects too. On the way texels are decided one by one between metal and
+dielectric, so either start can end as any mixture. What is used is the start that won: the fit itself starts there anew, on a finer level.
 
 They are compared by a robust error: a sharp reflection a few pixels off counts twice in the squared error, where it is and where it should
 be, so that the PSNR prefers materials that are too rough. Fits that started with another roughness often explain the photos as well, by a
@@ -38,8 +38,6 @@ Key = TypeVar("Key")
 Start = tuple[float, float]
 #: States by their start.
 Trials = dict[Start, State]
-#: Fits all states further.
-RunAll = Callable[[Trials], Trials]
 
 #: What a light does, in words.
 MOTIONS: dict[Motion, str] = {
@@ -49,21 +47,17 @@ MOTIONS: dict[Motion, str] = {
 
 @dataclass(frozen=True)
 class StartComparison(Rule):
-    """Trials from several starts by the `trial` steps; the best continued by the `full` ones; and the best of these."""
+    """Fits from several starts by the `steps`, and the best of them."""
 
-    trial: Steps
-    full: Steps
+    steps: Steps
     #: Compared starts: metallic and roughness.
-    dielectric_starts: tuple[Start, ...] = ((0.05, 0.2), (0.05, 0.45), (0.05, 0.8))
+    dielectric_starts: tuple[Start, ...] = ((0.05, 0.12), (0.05, 0.25), (0.05, 0.45), (0.05, 0.8))
     metal_starts: tuple[Start, ...] = ((0.9, 0.2), (0.9, 0.45))
     #: Start of a diffuse object, and without validation photos.
     diffuse_start: Start = (0.05, 0.8)
     default_start: Start = (0.05, 0.45)
     #: Without validation photos every so many photos are held out while metal is compared with dielectric.
     kind_holdout: int = 4
-    #: Starts whose error is within this factor of the best one are continued as well, at most so many in all.
-    candidate_factor: float = 1.3
-    candidates: int = 3
     #: A metallic start must have less error than the best dielectric one, by this share; by more where the light moves, as such a light is
     #: an approximation, to whose errors rough metal adapts.
     metal_margin: float = 0.04
@@ -78,12 +72,12 @@ class StartComparison(Rule):
         """The same with the chosen start and the evidence."""
 
         def tried(level: Level, starts: Sequence[Start]) -> Trials:
-            return descend_all(started(scene, level, starts), self.trial, scene, "trial fits")
+            return descend_all(started(scene, level, starts), self.steps, scene, "trial fits")
 
         starts, reason = self.compared(state.level, scene.diffuse, tried)
         if len(starts) == 1:
             return replace(state, chosen_start=starts[0], evidence=reason)
-        best = self.best(tried(state.level, starts), lambda chosen: descend_all(chosen, self.full, scene, "trial fits"))
+        best = self.best(tried(state.level, starts))
         return replace(state, chosen_start=best.chosen_start, evidence=best.evidence)
 
     def compared(self, level: Level, diffuse: bool, tried: Callable[[Level, Sequence[Start]], Trials]) -> tuple[tuple[Start, ...], str]:
@@ -103,25 +97,15 @@ class StartComparison(Rule):
         reason = f"no validation photos; by every {self.kind_holdout}th photo, fitted afterwards: {_percent(errors)}"
         return (metal if clear else self.default_start,), reason
 
-    def best(self, trials: Trials, further: RunAll) -> State:
-        """The state with the least validation error of those that continue the best of the `trials` by `further`, with the evidence."""
+    def best(self, trials: Trials) -> State:
+        """The state with the least validation error of the `trials`, with the evidence."""
         errors = {start: state.error for start, state in trials.items()}
-        evidence = _percent(errors)
-        found = further({start: trials[start] for start in self.close(errors)})
-        continued = {start: state.error for start, state in found.items()}
-        weighed = {start: error * _prior_factor(found[start]) for start, error in continued.items()}
+        weighed = {start: error * _prior_factor(trials[start]) for start, error in errors.items()}
         kinds = [[start for start in weighed if (start in self.metal_starts) == metal] for metal in (False, True)]
         finalists = [min(kind, key=lambda start: weighed[start]) for kind in kinds if kind]
-        margin = self._margin(next(iter(found.values())).level)
-        best = min(finalists, key=lambda start: continued[start] * (1 if start in self.metal_starts else 1 - margin))
-        if len(continued) > 1:
-            evidence += f"; continued: {_percent(continued)}; with the prior of the light: {_percent(weighed)}"
-        return replace(found[best], chosen_start=best, evidence=evidence)
-
-    def close(self, errors: Mapping[Start, float]) -> list[Start]:
-        """The best starts by the `errors` of their trials."""
-        order = sorted(errors, key=lambda start: errors[start])
-        return [start for start in order if errors[start] <= self.candidate_factor * errors[order[0]]][: self.candidates]
+        margin = self._margin(next(iter(trials.values())).level)
+        best = min(finalists, key=lambda start: errors[start] * (1 if start in self.metal_starts else 1 - margin))
+        return replace(trials[best], chosen_start=best, evidence=f"{_percent(errors)}; with the prior of the light: {_percent(weighed)}")
 
     def _margin(self, level: Level) -> float:
         """Share by which a metallic start must have less error than a dielectric one."""

@@ -23,7 +23,7 @@ from gsbake.materials.descent import Steps, descend
 from gsbake.materials.levels import FineLevel, PureMetals
 from gsbake.materials.passes import Priors, Scene
 from gsbake.materials.photo import Photo, PhotoReader, coarse_texels, texel_weight
-from gsbake.materials.recipe import COARSE, TRIAL
+from gsbake.materials.recipe import COARSE, START
 from gsbake.materials.searches import LightInterval
 from gsbake.materials.starts import ChosenStart, Start, StartComparison, Trials, descend_all, started
 from gsbake.materials.state import Finer, Level, State
@@ -257,16 +257,16 @@ def test_normal_offsets_reduce_normal_error(glossy: Sphere) -> None:
 
 
 def trial_errors(scene: Sphere) -> dict[tuple[float, float], float]:
-    starts = StartComparison(TRIAL, COARSE).starts
-    trials = descend_all(started(SCENE, scene.start(0.2, held_out=2).level, starts), TRIAL, SCENE, "trials")
+    starts = StartComparison(START).starts
+    trials = descend_all(started(SCENE, scene.start(0.2, held_out=2).level, starts), START, SCENE, "trials")
     return {start: state.error for start, state in trials.items()}
 
 
 @pytest.mark.slow
 def test_trials_find_the_roughness(glossy: Sphere) -> None:
     smooth, rough = trial_errors(glossy), trial_errors(Sphere(0.85))
-    dielectric = [(0.05, r) for r in (0.2, 0.45, 0.8)]
-    assert min(dielectric, key=lambda k: smooth[k]) == (0.05, 0.2)
+    dielectric = StartComparison(START).dielectric_starts
+    assert min(dielectric, key=lambda k: smooth[k]) == (0.05, 0.25)
     assert min(dielectric, key=lambda k: rough[k]) == (0.05, 0.8)
 
 
@@ -445,10 +445,10 @@ def test_coarse_texture_preserves_means_and_detail() -> None:
 @pytest.mark.parametrize(("roughness", "metallic"), [(0.35, 0.0), slow(0.15, 1.0)])
 def test_a_few_photos_tell_a_metal_from_a_dielectric(roughness: float, metallic: float) -> None:
     """The metal is smooth: the search for metals turns a rough one from the dielectric start too, and neither start is clearly better."""
-    scene, comparison = Sphere(roughness, reference=True, metallic=metallic), StartComparison(TRIAL, COARSE)
+    scene, comparison = Sphere(roughness, reference=True, metallic=metallic), StartComparison(START)
 
     def tried(level: Level, starts: Sequence[Start]) -> Trials:
-        return descend_all(started(SCENE, level, starts), TRIAL, SCENE, "trials")
+        return descend_all(started(SCENE, level, starts), START, SCENE, "trials")
 
     starts, _ = comparison.compared(scene.start(0.2).level, False, tried)
     assert starts in ([(start,) for start in comparison.metal_starts] if metallic else [(comparison.default_start,)])

@@ -12,13 +12,14 @@ import pytest
 from gsbake.materials import starts as starts_module
 from gsbake.materials.light_intensity import RADIANCE, IntensityPrior
 from gsbake.materials.passes import Scene
-from gsbake.materials.recipe import COARSE, TRIAL
+from gsbake.materials.recipe import START
 from gsbake.materials.starts import Start, StartComparison, Trials, started
 from gsbake.materials.state import Level
 from tests.materials.test_fit import WEAK_PRIORS, Sphere
 
-COMPARISON = StartComparison(TRIAL, COARSE)
+COMPARISON = StartComparison(START)
 STARTS, METAL_STARTS = COMPARISON.starts, COMPARISON.metal_starts
+DIELECTRIC, OTHER, METAL = STARTS[0], STARTS[1], METAL_STARTS[0]
 METAL_MARGIN, MOVING_METAL_MARGIN = COMPARISON.metal_margin, COMPARISON.moving_metal_margin
 
 
@@ -60,28 +61,20 @@ def level(held_out: bool = True, photos: int = 1, to_light: Any = None) -> Level
     return Level(surface, fitted, [fitted[0]] if held_out else [])
 
 
-def chosen(
-    trial_errors: dict[Start, float], full_errors: dict[Start, float], radiance: dict[Start, float] | None = None, moving: bool = False
-) -> tuple[Any, list[Start]]:
-    """The chosen fit, and the starts that were continued."""
-    runs: list[Start] = []
-
-    def further(trials: Any) -> Any:
-        runs.extend(trials)
-        light = radiance or {}
-        return {s: Fit(full_errors.get(s, 1.0), light.get(s, RADIANCE[0]), Light(moving)) for s in trials}
-
-    trials: Any = {start: Fit(error) for start, error in trial_errors.items()}
-    return COMPARISON.best(trials, further), runs
+def chosen(errors: dict[Start, float], radiance: dict[Start, float] | None = None, moving: bool = False) -> Any:
+    """The chosen fit of those with these errors."""
+    light = radiance or {}
+    trials: Any = {start: Fit(error, light.get(start, RADIANCE[0]), Light(moving)) for start, error in errors.items()}
+    return COMPARISON.best(trials)
 
 
 def never(level: Level, starts: Sequence[Start]) -> Trials:
     raise AssertionError("nothing is tried")
 
 
-def test_all_starts_are_tried_without_searches_for_the_light() -> None:
+def test_all_starts_are_tried() -> None:
     assert COMPARISON.compared(level(), False, never) == (STARTS, "")
-    assert [one.name for one in TRIAL.passes] == ["light-scaling", "metal-search"] and not TRIAL.sparsity and not TRIAL.normals
+    assert not START.sparsity and not START.normals
     assert {m > 0.5 for m, _ in STARTS} == {True, False} and all(m > 0.5 for m, _ in METAL_STARTS)
 
 
@@ -112,7 +105,7 @@ def kind_by_few_photos(metal_error: float, moves: bool = False, smooth_error: fl
     """The start chosen without validation photos, where metal of roughness .45 has `metal_error`, the default dielectric 1 and a smooth one
     `smooth_error`, with the number of photos that trials were fitted to and compared on."""
     counts: list[tuple[int, int]] = []
-    errors = {STARTS[0]: smooth_error, COMPARISON.default_start: 1.0, STARTS[2]: 1.4, METAL_STARTS[0]: 1.5, METAL_STARTS[1]: metal_error}
+    errors = dict.fromkeys(STARTS, 1.5) | {STARTS[0]: smooth_error, COMPARISON.default_start: 1.0, METAL_STARTS[1]: metal_error}
 
     def tried(level: Level, starts: Sequence[Start]) -> Any:
         assert not {*map(id, level.photos)} & {*map(id, level.validation)}
@@ -134,39 +127,25 @@ def test_few_photos_distinguish_metal_from_dielectric_by_photos_held_out() -> No
     assert kind_by_few_photos(1 - 2 * MOVING_METAL_MARGIN, moves=True)[0] == METAL_STARTS[1]
 
 
-def test_close_starts_are_continued_and_compared() -> None:
-    near = 0.02 * (1 + COMPARISON.candidate_factor) / 2
-    choice, runs = chosen({STARTS[0]: 0.02, STARTS[3]: near, STARTS[1]: 0.05}, {STARTS[0]: 0.018, STARTS[3]: 0.01})
-    assert choice.chosen_start == STARTS[3] and len(runs) == 2
-    assert "continued: 1.80% error" in choice.evidence and "2.00% error from metallic 0.05 roughness 0.2" in choice.evidence
-
-
-def test_only_a_clear_winner_is_continued() -> None:
-    choice, runs = chosen({STARTS[0]: 0.021, STARTS[1]: 0.022, STARTS[3]: 0.02 / COMPARISON.candidate_factor}, {STARTS[3]: 0.3})
-    assert choice.chosen_start == STARTS[3] and len(runs) == 1
+def test_the_least_error_wins() -> None:
+    choice = chosen({DIELECTRIC: 0.02, OTHER: 0.018, METAL: 0.03})
+    assert choice.chosen_start == OTHER and "2.00% error from metallic 0.05 roughness 0.12, 1.80% error" in choice.evidence
 
 
 def test_a_metal_must_be_clearly_better() -> None:
-    trials = {STARTS[0]: 0.02, STARTS[3]: 0.02}
-    assert chosen(trials, {STARTS[0]: 0.02, STARTS[3]: 0.02 * (1 - METAL_MARGIN / 2)})[0].chosen_start[0] < 0.5
-    assert chosen(trials, {STARTS[0]: 0.02, STARTS[3]: 0.02 * (1 - METAL_MARGIN * 2)})[0].chosen_start[0] > 0.5
+    assert chosen({DIELECTRIC: 0.02, METAL: 0.02 * (1 - METAL_MARGIN / 2)}).chosen_start == DIELECTRIC
+    assert chosen({DIELECTRIC: 0.02, METAL: 0.02 * (1 - METAL_MARGIN * 2)}).chosen_start == METAL
 
 
 def test_a_metal_under_a_moving_light_must_be_better_still() -> None:
-    trials, errors = {STARTS[0]: 0.02, STARTS[3]: 0.02}, {STARTS[0]: 0.02, STARTS[3]: 0.02 * (1 - METAL_MARGIN * 2)}
-    assert chosen(trials, errors, moving=True)[0].chosen_start[0] < 0.5
-    assert chosen(trials, errors | {STARTS[3]: 0.02 * (1 - MOVING_METAL_MARGIN * 1.1)}, moving=True)[0].chosen_start[0] > 0.5
+    errors = {DIELECTRIC: 0.02, METAL: 0.02 * (1 - METAL_MARGIN * 2)}
+    assert chosen(errors, moving=True).chosen_start == DIELECTRIC
+    assert chosen(errors | {METAL: 0.02 * (1 - MOVING_METAL_MARGIN * 1.1)}, moving=True).chosen_start == METAL
 
 
 def test_the_prior_of_the_light_decides_between_equal_fits() -> None:
     """A light three times as bright as usual loses by little error and wins by much."""
-    trials, bright = {STARTS[0]: 0.02, STARTS[1]: 0.02}, {STARTS[0]: 3 * RADIANCE[0]}
-    assert chosen(trials, {STARTS[0]: 0.02, STARTS[1]: 0.0202}, bright)[0].chosen_start[1] == STARTS[1][1]
-    assert chosen(trials, {STARTS[0]: 0.014, STARTS[1]: 0.0202}, bright)[0].chosen_start[1] == STARTS[0][1]
-    kinds = {STARTS[0]: 0.02, STARTS[3]: 0.02}
-    assert chosen(kinds, {STARTS[0]: 0.02, STARTS[3]: 0.0202}, bright)[0].chosen_start[0] < 0.5  # not between metal and dielectric
-
-
-def test_the_number_of_candidates_is_bounded() -> None:
-    errors = {start: 0.02 + 1e-4 * k for k, start in enumerate(STARTS)}
-    assert COMPARISON.close(errors) == list(STARTS[: COMPARISON.candidates])
+    bright = {DIELECTRIC: 3 * RADIANCE[0]}
+    assert chosen({DIELECTRIC: 0.02, OTHER: 0.0202}, bright).chosen_start == OTHER
+    assert chosen({DIELECTRIC: 0.014, OTHER: 0.0202}, bright).chosen_start == DIELECTRIC
+    assert chosen({DIELECTRIC: 0.02, METAL: 0.0202}, bright).chosen_start == DIELECTRIC  # not between metal and dielectric
