@@ -18,7 +18,7 @@ def run(ctx: Context) -> dict[str, Any]:
 
 STAGE = Stage(
     name="ingest",
-    version=9,
+    version=10,
     title="Photos",
     run=run,
     summary="{photos} photos, {masks} masks, {skipped} skipped",

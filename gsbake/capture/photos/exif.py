@@ -15,6 +15,8 @@ from blake3 import blake3
 FULL_FRAME_DIAGONAL = math.hypot(36.0, 24.0)
 #: Aspect ratios of full sensors; a photo of any other aspect ratio was cropped.
 SENSOR_ASPECTS = (4 / 3, 3 / 2, 16 / 9)
+#: What EXIF has for this ISO speed and all higher ones.
+MAX_SPEED = 65535
 _UNIT_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 
 
@@ -86,10 +88,13 @@ def camera_body(tags: Mapping[str, Any]) -> str | None:
 
 def light_exposure(tags: Mapping[str, Any]) -> float | None:
     """Factor from scene luminance to the values of a photo, up to a constant of its camera: time in seconds times ISO speed over the square
-    of the f-number; None where EXIF does not have all three."""
+    of the f-number; None where EXIF does not have all three, or has numbers of no camera."""
     time, aperture = _number(tags, "ExposureTime"), _number(tags, "FNumber")
     speed = _number(tags, "Exif:PhotographicSensitivity", "Exif:ISOSpeedRatings")
-    return None if time is None or aperture is None or speed is None else time * speed / aperture**2
+    if time is None or aperture is None or speed is None or speed >= MAX_SPEED:
+        return None
+    value = time * speed / aperture / aperture
+    return value if 0 < value < math.inf else None
 
 
 def flash_fired(tags: Mapping[str, Any]) -> bool | None:

@@ -17,7 +17,7 @@ from gsbake.capture.photos.decode import (
     to_working_size,
     working_size,
 )
-from gsbake.capture.photos.exif import camera_key, focal_pixels
+from gsbake.capture.photos.exif import camera_key, focal_pixels, light_exposure
 from gsbake.imaging.srgb import decode_bytes, encode_bytes
 
 
@@ -172,3 +172,22 @@ def test_focal_from_exif() -> None:
     assert focal_pixels({"Exif:FocalLength": 55.0}, 1200, 800) is None
     assert focal_pixels({"Exif:FocalLengthIn35mmFilm": float("nan")}, 1200, 800) is None
     assert camera_key({"Make": "Canon", "Model": "600D ", "Exif:FocalLength": 46.0}) == "Canon 600D 46 mm"
+
+
+EXPOSURE = {"ExposureTime": 0.01, "FNumber": 2.0, "Exif:PhotographicSensitivity": 400}
+
+
+def test_exposure_by_the_older_name_of_the_speed() -> None:
+    older = {**EXPOSURE, "Exif:PhotographicSensitivity": 0, "Exif:ISOSpeedRatings": 400}
+    assert light_exposure(EXPOSURE) == pytest.approx(1) and light_exposure(older) == pytest.approx(1)
+
+
+@pytest.mark.parametrize(
+    "other",
+    [{"FNumber": value} for value in (0, -2.0, "f/2", 1e300, 1e-300)]
+    + [{"ExposureTime": value} for value in (0.0, -0.01, "1/100", float("nan"), float("inf"), 1e307)]
+    + [{"Exif:PhotographicSensitivity": value} for value in (0, (400, 0), 65535)],
+)
+def test_strange_exposures_are_not_known(other: dict[str, object]) -> None:
+    """65535 is what EXIF has for all higher speeds."""
+    assert light_exposure(EXPOSURE | other) is None
