@@ -29,7 +29,7 @@ FIT_KERNELS = (
 
 STAGE = Stage(
     name="bake",
-    version=65,
+    version=66,
     title="Textures",
     run=run,
     summary="{charts} charts, {texels} texels, {fit_psnr:dB} on test photos",

@@ -120,10 +120,11 @@ class Photo:
 
         What is clipped in a brighter photo is only a lower bound: it hardly weighs.
         """
-        if np.allclose(gain, 1):
+        brighter = bool((gain > BRIGHTER * least).any())
+        if np.allclose(gain, 1) and not brighter:
             return self
         linear, weight = decode(self.colour), self.weight
-        if (gain > BRIGHTER * least).any():
+        if brighter:
             weight = np.where((linear >= CLIPPED).any(1), BOUND_WEIGHT * weight, weight)
         return replace(self, colour=encode(linear / np.asarray(gain, np.float32)), weight=weight)
 

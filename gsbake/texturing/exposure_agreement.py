@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from gsbake.surfels.initialisation import fibonacci_sphere
-from gsbake.texturing.view_fusion import solve_gains
+from gsbake.texturing.view_fusion import MIN_TEXELS, solve_gains
 
 Doubles = NDArray[np.float64]
 
@@ -49,12 +49,16 @@ def exposure_agreement(
     `logs` (n, keep) are logarithms of the brightness of surface points at `position` (n, 3), which have the unit `normal` (n, 3), in the
     photos `view` (n, keep), NaN where there is none. `centres` (photos, 3) are those of the cameras.
     """
+    if len(position) < MIN_TEXELS:
+        return None
     inner = ~_near_edges(np.asarray(position, np.float64), np.asarray(normal, np.float64))
     cell = np.where(inner, (normal @ fibonacci_sphere(DIRECTIONS).T).argmax(1), -1)
     gains = np.full((DIRECTIONS, len(centres)), np.nan)
     facing = np.zeros((DIRECTIONS, 3))
     for k in range(DIRECTIONS):
         mine = cell == k
+        if mine.sum() < MIN_TEXELS:
+            continue
         seen = np.bincount(view[mine][np.isfinite(logs[mine])], minlength=len(centres))
         solved = np.log(solve_gains(logs[mine][..., None], view[mine], len(centres))[:, 0])
         gains[k] = np.where(seen >= MIN_SAMPLES, solved, np.nan)

@@ -21,6 +21,8 @@ NOISE_FLOOR = 0.02
 SHARPNESS = 2.0
 #: Texels used to solve for the gains.
 GAIN_TEXELS = 30_000
+#: Fewer texels tell no gains.
+MIN_TEXELS = 100
 #: Rounds of the gain solver.
 GAIN_ROUNDS = 12
 
@@ -120,12 +122,12 @@ def log_samples(
 
 def solve_gains(logs: NDArray[np.float64], view: NDArray[np.int64], count: int) -> Floats:
     """Gain (count, c) of each view relative to the others, with geometric mean 1, from samples `logs` (n, keep, c) of the views `view`
-    (n, keep), as `log_samples` makes them.
+    (n, keep), as `log_samples` makes them; 1 where fewer than MIN_TEXELS tell of them.
 
     Alternates between each texel's median and each view's median ratio to it, in logarithms.
     """
     gains = np.zeros((count, logs.shape[2]))
-    if len(logs) < 100:
+    if len(logs) < MIN_TEXELS:
         return np.ones(gains.shape, np.float32)
     usable = np.isfinite(logs[..., 0])
     for _ in range(GAIN_ROUNDS):

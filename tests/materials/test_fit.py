@@ -419,7 +419,7 @@ def test_gain_is_divided_out_of_linear_colour() -> None:
     assert decode(equal.colour) == pytest.approx(np.array([[0.2, 0.2, 0.2]]), abs=1e-5) and equal.weight == photo.weight
 
 
-@pytest.mark.parametrize(("gain", "weighs"), [(2.0, False), (0.5, True)])
+@pytest.mark.parametrize(("gain", "weighs"), [(2.0, False), (1.0, False), (0.5, True)])
 def test_what_is_clipped_in_a_brighter_photo_hardly_weighs(gain: float, weighs: bool) -> None:
     one, colour = np.ones((2, 3), np.float32), encode(np.array([[1.0, 0.9, 0.9], [0.5, 0.5, 0.5]]))
     photo = Photo(np.zeros((2, 4), np.int32), np.full((2, 4), 0.25, np.float32), one, one, colour, np.ones(2, np.float32),

@@ -7,6 +7,7 @@ import pytest
 
 from gsbake.surfels.initialisation import fibonacci_sphere
 from gsbake.texturing.exposure_agreement import DIRECTIONS, exposure_agreement
+from gsbake.texturing.view_fusion import MIN_TEXELS
 
 PHOTOS, POINTS = 30, 6000
 
@@ -60,3 +61,22 @@ def test_a_sheet_has_no_parts_to_compare() -> None:
     """Both sides of a sheet are never seen together."""
     sheet = np.where(fibonacci_sphere(POINTS)[:, 2:] > 0, [0.0, 0.0, 1.0], [0.0, 0.0, -1.0])
     assert exposure_agreement(*samples(0.35, 0.5, normal=sheet)) is None
+
+
+def test_cells_of_few_points_say_nothing() -> None:
+    """Too few to solve gains from: these are unknown, not equal."""
+    logs, view, position, normal, centres = samples(0.35, 0.0)
+    cell = (normal @ fibonacci_sphere(DIRECTIONS).T).argmax(1)
+    few = np.zeros(POINTS, bool)
+    for k in range(0, DIRECTIONS, 2):
+        few[np.flatnonzero(cell == k)[: MIN_TEXELS - 1]] = True
+    with_few, without = (
+        exposure_agreement(logs[kept], view[kept], position[kept], normal[kept], centres) for kept in (few | (cell % 2 == 1), cell % 2 == 1)
+    )
+    assert with_few is not None and without is not None
+    assert with_few.share == pytest.approx(without.share, abs=0.02) and with_few.pairs == without.pairs
+
+
+def test_no_points_say_nothing() -> None:
+    logs, view, position, normal, centres = samples(0.35, 0.0)
+    assert exposure_agreement(logs[:0], view[:0], position[:0], normal[:0], centres) is None
