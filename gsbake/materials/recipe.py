@@ -59,7 +59,7 @@ FINE = Steps(0.25, normals=True, passes=(Pass("metal-search", MetalSearch(), at=
 
 
 def coarsest(steps: Steps) -> Steps:
-    """The same on the coarsest level: fewer, as only the order of the starts counts, with one step of the light, which takes most of the
+    """The same on the coarsest level: fewer, as only the order of the motions counts, with one step of the light, which takes most of the
     time there, for two photos, and without the sparsity prior, whose means take as long as the steps between."""
     return replace(steps, share=0.6 * steps.share, photos_per_light=2, sparsity=False)
 

@@ -3,8 +3,8 @@
 Gradient steps find the optimum near their start. A surface that starts too rough cannot localise light, and its reflections end up in base
 colour; one that starts dielectric explains a metal's reflections by a diffuse base colour under a light of their colour, and stays there.
 So fits on the coarsest level, from all-dielectric and all-metal starts of several roughnesses, are compared on photos that they were not
-fitted to. None is left out early: a smooth light fits in a few steps, and the sharp one that glaze and polish call for in hundreds, so
-that after few steps the roughest start is ahead on smooth objects too. On the way texels are decided one by one between metal and
+fitted to. None is left out early: a smooth light fits in a few steps, and the sharp one that glaze calls for in hundreds, so that
+after few steps the roughest start is ahead on smooth objects too. On the way texels are decided one by one between metal and
 dielectric, so either start can end as any mixture. What is used is the start that won: the fit itself starts there anew, on a finer level.
 
 They are compared by a robust error: a sharp reflection a few pixels off counts twice in the squared error, where it is and where it should
