@@ -56,14 +56,16 @@ def constant_exposure(
     """
     needed = MIN_COMMON_SHARE_WRITTEN if written else MIN_COMMON_SHARE
     evidence = [written] if written else []
-    differ = agreement is not None and agreement.pairs >= MIN_PAIRS and photos >= MIN_PHOTOS and agreement.share >= needed
+    enough = agreement is not None and agreement.pairs >= MIN_PAIRS and photos >= MIN_PHOTOS
+    differ = agreement is not None and enough and agreement.share >= needed
     if agreement is None:
         evidence.append("no parts of the surface that face different ways can be compared")
     else:
         common = (
             f"{100 * max(agreement.share, 0):.0f} ± {100 * agreement.error:.0f} % of the gains' variance is common to parts of the surface"
         )
-        evidence.append(f"{common} that face different ways ({agreement.pairs} pairs of {photos} photos), threshold {100 * needed:.0f} %")
+        threshold = f"threshold {100 * needed:.0f} %" if enough else f"too few to tell (at least {MIN_PAIRS} and {MIN_PHOTOS})"
+        evidence.append(f"{common} that face different ways ({agreement.pairs} pairs of {photos} photos), {threshold}")
     if tie_point_spread is not None and not written:
         evidence.append(f"90 % of the photos agree within {tie_point_spread:.2f}x at tie points, threshold {MAX_SPREAD:g}x")
         differ &= tie_point_spread >= MAX_SPREAD

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import trimesh
 
 from gsbake.geometry.cameras import Camera
 from gsbake.geometry.raycast import RayCaster
+from gsbake.monitor import SILENT, Rule
+from gsbake.texturing.photo_projection import _exposure_gains
 from gsbake.texturing.projection import ProjectionBlender, edge_weights, mask_weights
 from gsbake.texturing.view_fusion import solve_gains
 from tests.support.cameras import look_at
@@ -69,6 +73,35 @@ def test_highlights_and_exposure_gains_are_removed(sphere: RayCaster) -> None:
     assert np.median(error) < 0.004 and np.quantile(error, 0.98) < 0.015
     plain = blender.result()
     assert np.median(np.abs(plain.values - texture(p)).max(1)) > 0.01
+
+
+def gains_of(sphere: RayCaster, exposures: np.ndarray, written: np.ndarray | None, rule: Rule) -> np.ndarray | None:
+    """The gains that are divided out of photos of a sphere with these `exposures` (photos,), `written` in EXIF."""
+    p, cameras = points(), [camera(d) for d in directions(len(exposures))]
+    blender, surface = ProjectionBlender(p, p, sphere, 3, 0.02), SimpleNamespace(texel_position=p, texel_normal=p)
+    for view, exposure in zip(cameras, exposures, strict=True):
+        blender.add(view, photo(view, gain=exposure))
+    return _exposure_gains(blender, surface, cameras, None if written is None else np.log(written), None, rule, SILENT)
+
+
+@pytest.mark.parametrize("rule", ["auto", "keep"])
+def test_exposures_by_exif_are_divided_out_and_others_solved(sphere: RayCaster, rule: Rule) -> None:
+    exposures = np.exp(np.random.default_rng(2).uniform(-0.4, 0.4, 20))
+    exposures /= np.exp(np.log(exposures).mean())
+    written, solved = gains_of(sphere, exposures, exposures, rule), gains_of(sphere, exposures, None, rule)
+    assert written is not None and written == pytest.approx(np.tile(exposures[:, None], 3), rel=1e-6)
+    assert solved is not None and solved == pytest.approx(np.tile(exposures[:, None], 3), rel=0.1)
+    # edited since: what EXIF has is not in the photos
+    assert gains_of(sphere, exposures, exposures[::-1], rule) == pytest.approx(solved)
+
+
+@pytest.mark.parametrize("count", [1, 2, 19])
+@pytest.mark.parametrize("written", [True, False])
+def test_few_photos_have_one_exposure_unless_they_are_to_be_equalised(sphere: RayCaster, count: int, written: bool) -> None:
+    equal, exposures = np.ones(count), np.linspace(0.7, 1.3, count)
+    assert gains_of(sphere, exposures, equal if written else None, "auto") is None
+    kept = gains_of(sphere, exposures, equal if written else None, "keep")
+    assert kept is not None and (np.ptp(kept) > 0.2) == (count == 19)
 
 
 def test_what_is_clipped_in_bright_photos_is_a_lower_bound(sphere: RayCaster) -> None:

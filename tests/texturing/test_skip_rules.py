@@ -49,6 +49,8 @@ def test_few_photos_and_few_parts_say_nothing() -> None:
     assert not constant_exposure(common, MIN_PHOTOS)[0] and constant_exposure(common, MIN_PHOTOS - 1)[0]
     assert constant_exposure(replace(common, pairs=MIN_PAIRS - 1), MIN_PHOTOS)[0]
     assert constant_exposure(None, MIN_PHOTOS)[0]
+    enough, few = (constant_exposure(common, count)[1] for count in (MIN_PHOTOS, MIN_PHOTOS - 1))
+    assert enough.endswith(f"threshold {100 * MIN_COMMON_SHARE:.0f} %") and "too few to tell" in few and "threshold" not in few
 
 
 @pytest.mark.parametrize(("spread", "constant"), [(MAX_SPREAD - 0.02, True), (MAX_SPREAD + 0.02, False), (None, False)])
