@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 import pytest
 from PIL import Image
+from PIL.TiffImagePlugin import IFDRational
 
 from gsbake.capture import full_photos
 from gsbake.capture.full_photos import FullPhotos
@@ -97,6 +98,28 @@ def test_undistortion_at_full_size_agrees_with_the_working_photo(tmp_path: Path,
             both = cv2.resize(view.mask, size, interpolation=cv2.INTER_AREA).astype(int) - working.mask
             assert np.abs(both).mean() < 1.0
             assert ((view.mask > 10) & (view.mask < 245)).mean() < 0.02  # sharper than an enlarged one
+
+
+def test_exposures_by_exif_are_those_of_the_cameras_in_order(tmp_path: Path, runner: Runner) -> None:
+    """Folders of before the field was written, and photos of which one has none, have no exposures."""
+    capture(tmp_path, "jpg")
+    for k, time in enumerate((50, 100, 200, 100)):
+        exif = Image.Exif()
+        exif.get_ifd(0x8769).update({0x829A: IFDRational(1, time), 0x829D: IFDRational(4, 1), 0x8827: 200})
+        Image.fromarray(picture(k)).save(tmp_path / "images" / f"p{k}.jpg", exif=exif)
+    ingest, poses = prepared(tmp_path, runner)
+    with FullPhotos(ingest, poses) as photos:
+        expected = {"p0": np.log(2), "p1": 0.0, "p2": -np.log(2), "p3": 0.0}
+        assert photos.written_exposures() == pytest.approx([expected[c.name] for c in photos.posed.cameras.cameras], abs=1e-6)
+    with FullPhotos(None, poses) as photos:
+        assert photos.written_exposures() is None
+    listing = json.loads((ingest / "photos.json").read_text(encoding="utf-8"))
+    for kept in (3, 0):
+        for entry in listing["photos"][kept:]:
+            entry.pop("light_exposure", None)
+        (ingest / "photos.json").write_text(json.dumps(listing), encoding="utf-8")
+        with FullPhotos(ingest, poses) as photos:
+            assert photos.written_exposures() is None
 
 
 def test_a_level_in_between(tmp_path: Path, runner: Runner) -> None:
