@@ -10,8 +10,9 @@ simultaneous iterations (SIRT), within [0, 1] and near the initial values where 
 
 Holes are at the same places in all photos, unexplained reflections are not. So the problem is solved with each half of the photos; where
 their mean has dark texels beside bright ones and both show the same pattern, the metal is perforated. The halves start without detail:
-what pixels do not determine would stay in both, and agree. Other metal keeps its fitted values, which have less noise. So do dielectrics:
-their photos depend on diffuse shading, which the fit at pixel size determines as well, and residual reflections would become stains.
+what pixels do not determine would stay in both, and agree. They are compared where both have pixels. Other metal keeps its fitted values,
+which have less noise. So do dielectrics: their photos depend on diffuse shading, which the fit at pixel size determines as well, and
+residual reflections would become stains.
 
 Perforated metal is solved once more with a binary prior: one metal, and holes. From step to step every texel is drawn, finally as strongly
 as by the pixels, to metal or to black: the brightest texels to metal, as many as the local mean brightness implies (a threshold at half the
@@ -144,25 +145,23 @@ def superresolved(maps: Materials, texels: Texels, region: NDArray[np.bool_], ph
     the room. The rest of the perforated metal has metallic 1.
     """
 
-    def solved(
-        chosen: NDArray[np.bool_], start: Floats, some: slice = slice(None), prior: Callable[[Floats], Floats] | None = None
-    ) -> Floats:
-        return _with_local_hue(_solve(_photo_systems(photos, chosen)[some], start, prior), texels, chosen)
-
     def prior(base: Floats) -> Floats:
         return _metal_or_black(base, texels, perforated)
 
     if not region.any():
         return maps
     even = _local_mean(maps.base_color[region], texels, region, OPTIONS.detail_radius)
-    halves = [solved(region, even, slice(first, None, 2)) for first in range(2)]
+    systems = _photo_systems(photos, region)
+    parts = [systems[first::2] for first in range(2)]
+    halves = [_with_local_hue(_solve(part, even), texels, region) for part in parts]
     both = np.asarray((halves[0] + halves[1]) / 2, np.float32)
     dark = both.mean(1) < np.maximum(OPTIONS.dark * _metal_colour(both, texels, region).mean(1), MIN_METAL_ALBEDO)
     perforated = region.copy()
-    perforated[region] = _has_holes(texels, region, dark) & _correlated(texels, region, *(half.mean(1) for half in halves))
+    shown = np.logical_and(*(_shown(part, len(even)) for part in parts))
+    perforated[region] = _has_holes(texels, region, dark) & _correlated(texels, region, shown, *(half.mean(1) for half in halves))
     if not perforated.any():
         return maps
-    base = solved(perforated, maps.base_color[perforated], prior=prior)
+    base = _with_local_hue(_solve(_photo_systems(photos, perforated), maps.base_color[perforated], prior), texels, perforated)
     metal = _metal_colour(base, texels, perforated).mean(1)
     hole = base.mean(1) < np.maximum(OPTIONS.hole_threshold * metal, MIN_METAL_ALBEDO)
     out = maps.copied()
@@ -179,11 +178,12 @@ def _has_holes(texels: Texels, region: NDArray[np.bool_], hole: NDArray[np.bool_
     return np.asarray((share > OPTIONS.hole_share[0]) & (share < OPTIONS.hole_share[1]))
 
 
-def _correlated(texels: Texels, region: NDArray[np.bool_], first: Floats, second: Floats) -> NDArray[np.bool_]:
-    """Where (t,) in `region` (n,) the detail of two brightnesses (t,) is locally correlated."""
+def _correlated(texels: Texels, region: NDArray[np.bool_], shown: NDArray[np.bool_], first: Floats, second: Floats) -> NDArray[np.bool_]:
+    """Where (t,) in `region` (n,) the detail of two brightnesses (t,) is locally correlated, over texels that are `shown` (t,) in both."""
     both = np.stack([first, second], 1)
     a, b = (both - _local_mean(both, texels, region, OPTIONS.detail_radius)).T
-    covariance, variance_a, variance_b = _local_mean(np.stack([a * b, a * a, b * b], 1), texels, region, OPTIONS.local_radius).T
+    products = _local_mean(np.stack([a * b, a * a, b * b], 1), texels, region, OPTIONS.local_radius, shown.astype(np.float32))
+    covariance, variance_a, variance_b = products.T
     return np.asarray(covariance > OPTIONS.min_correlation * np.sqrt(variance_a * variance_b))
 
 
@@ -292,6 +292,14 @@ def _photo_systems(photos: Sequence[MetalPixels], region: NDArray[np.bool_]) -> 
         weight = unclipped_weights(photo.samples)[used]
         systems.append(_PhotoSystem(mean, photo.column[used], photo.row[used], photo.samples.colour[used], weight, shading))
     return systems
+
+
+def _shown(systems: Sequence[_PhotoSystem], texels: int) -> NDArray[np.bool_]:
+    """Which of the `texels` texels pixels of some photo show."""
+    shown = np.zeros(texels, bool)
+    for system in systems:
+        shown[system.mean.indices] = True
+    return shown
 
 
 def _solve(systems: Sequence[_PhotoSystem], initial: Floats, prior: Callable[[Floats], Floats] | None = None) -> Floats:

@@ -155,6 +155,16 @@ def test_detail_that_photos_do_not_determine_is_no_pattern() -> None:
     np.testing.assert_array_equal(solved(values, texels, np.ones(len(texels), bool), photos(even, noise=0.01, grids=1)), values)
 
 
+def test_dark_patches_that_no_photo_shows_are_no_holes() -> None:
+    """Larger than the smoothing of the start: both halves keep them, and agree."""
+    texels, patch = full_texture(), ((np.arange(SIZE**2) // SIZE // 8) % 2 == 0) & ((COLUMN // 8) % 2 == 0)
+    values = np.tile(np.array([0.9, 0.9, 0.9, 0.2, 0.8], np.float32), (len(texels), 1))
+    values[patch, :3] = 0.05
+    even, region = np.full((len(texels), 3), 0.6, np.float32), np.ones(len(texels), bool)
+    for seen in ([], photos(even, count=1)):
+        np.testing.assert_array_equal(solved(values, texels, region, seen), values)
+
+
 def test_binary_prior_reduces_noise() -> None:
     texels = full_texture()
     all_texels = np.ones(len(texels), bool)
@@ -207,8 +217,8 @@ def test_pattern_must_be_in_both_halves() -> None:
     rng = np.random.default_rng(7)
     same, one, other = rng.uniform(0.2, 0.8, (3, len(texels))).astype(np.float32)
     all_texels = np.ones(len(texels), bool)
-    assert _correlated(texels, all_texels, 0.6 * same + 0.4 * one, 0.6 * same + 0.4 * other).all()
-    assert not _correlated(texels, all_texels, one, other).any()
+    assert _correlated(texels, all_texels, all_texels, 0.6 * same + 0.4 * one, 0.6 * same + 0.4 * other).all()
+    assert not _correlated(texels, all_texels, all_texels, one, other).any()
 
 
 @pytest.mark.parametrize(("share", "region"), [(0.6, True), (0.1, False)])
