@@ -353,7 +353,7 @@ class Skip(Section):
     pose_refinement: Rule = Field("auto", description="Refining poses during training, where structure from motion solved them, matched features do not contradict them, or held-out PSNR does not improve.")
     exposure_refinement: Rule = Field("auto", description="Learning exposure gains during training, where photos agree at their tie points, these are too few, or held-out PSNR does not improve.")
     empty_cells: Rule = Field("auto", description="Voxels far from the surface.")
-    exposure_equalisation: Rule = Field("auto", description="Dividing out exposure gains, where the photos agree in brightness on the surface.")
+    exposure_equalisation: Rule = Field("auto", description="Dividing out exposure gains, where parts of the surface that face different ways do not share them, and EXIF tells no others. skip: those of EXIF too.")
     normal_map: Rule = Field("auto", description="The normal map, where the low-poly mesh has the normals of the dense one.")
     metallic_map: Rule = Field("auto", description="The metallic map, where no texel is metallic and held-out PSNR does not need it.")
     roughness_map: Rule = Field("auto", description="The roughness map, where one value fits held-out photos as well.")
