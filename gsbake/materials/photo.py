@@ -26,9 +26,10 @@ from gsbake.geometry.raycast import RayCaster
 from gsbake.imaging.srgb import decode, encode
 from gsbake.materials.fit_kernel import interpolate_taps
 from gsbake.shading.reflections import trace_reflections
-from gsbake.texturing.projection import BOUND_WEIGHT, BRIGHTER, CLIPPED, edge_weights
+from gsbake.texturing.projection import BOUND_WEIGHT, BRIGHTER, edge_weights
 from gsbake.texturing.resampling import CoarseTexture
 from gsbake.texturing.texels import Texels
+from gsbake.texturing.view_fusion import CLIPPED
 
 Floats = NDArray[np.float32]
 Doubles = NDArray[np.float64]

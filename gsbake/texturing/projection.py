@@ -22,7 +22,7 @@ from gsbake.geometry.cameras import Camera
 from gsbake.geometry.raycast import RayCaster
 from gsbake.kernels.threads import run_chunks
 from gsbake.texturing.gather_kernel import gather
-from gsbake.texturing.view_fusion import fuse, log_samples
+from gsbake.texturing.view_fusion import CLIPPED, fuse, log_samples
 
 Floats = NDArray[np.float32]
 
@@ -36,8 +36,8 @@ EDGE_MARGIN = 0.008
 EDGE_STEP = 0.015
 #: Photos are reduced to the size of texels that are at least so many pixels wide.
 FINER = 1.5
-#: Linear values from which a photo is clipped, and the weight of one that is only a lower bound.
-CLIPPED, BOUND_WEIGHT = 0.96, np.float32(0.01)
+#: Weight of a clipped value that is only a lower bound.
+BOUND_WEIGHT = np.float32(0.01)
 #: A view whose gain is that many times the least is brighter.
 BRIGHTER = 1.05
 #: A texel may lie behind the depth map by this share of the object's diagonal.
@@ -117,13 +117,11 @@ class ProjectionBlender:
 
         What is clipped in a view that is brighter than the darkest is only a lower bound: it hardly weighs.
         """
-        if gains is None:
-            return self._fused(np.ones((max(self._count, 1), self._values.shape[2]), np.float32), self._weights)
-        brighter = (gains > BRIGHTER * gains.min(0)).any(1)
-        bound = (self._values >= 65535 * CLIPPED**0.5).any(2) & brighter[np.maximum(self._view, 0)]
-        return self._fused(gains, np.where(bound, BOUND_WEIGHT * self._weights, self._weights))
-
-    def _fused(self, gains: Floats, weights: Floats) -> ProjectedTexture:
+        gains = np.ones((max(self._count, 1), self._values.shape[2]), np.float32) if gains is None else gains
+        weights, brighter = self._weights, (gains > BRIGHTER * gains.min(0)).any(1)
+        if brighter.any():
+            bound = (self._values >= 65535 * CLIPPED**0.5).any(2) & brighter[np.maximum(self._view, 0)]
+            weights = np.where(bound, BOUND_WEIGHT * weights, weights)
         values, views, confidence = fuse(self._values, weights, self._view, gains)
         return ProjectedTexture(values, views, confidence, gains)
 

@@ -23,6 +23,8 @@ SHARPNESS = 2.0
 GAIN_TEXELS = 30_000
 #: Fewer texels tell no gains.
 MIN_TEXELS = 100
+#: Linear values from which a photo is clipped.
+CLIPPED = 0.96
 #: Rounds of the gain solver.
 GAIN_ROUNDS = 12
 
@@ -114,7 +116,7 @@ def log_samples(
     shared = np.flatnonzero((weights > 0).sum(1) >= 3)
     chosen = shared[:: max(1, len(shared) // GAIN_TEXELS)]
     linear = (values[chosen] / 65535.0) ** 2
-    usable = (weights[chosen] > 0) & (linear > 0.004).all(2) & (linear < 0.96).all(2)
+    usable = (weights[chosen] > 0) & (linear > 0.004).all(2) & (linear < CLIPPED).all(2)
     logs = np.where(usable[..., None], np.log(np.maximum(linear, 1e-4)), np.nan)
     enough = usable.sum(1) >= 3
     return logs[enough], np.maximum(views[chosen[enough]], 0).astype(np.int64), chosen[enough]
